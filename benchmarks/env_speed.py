@@ -20,13 +20,18 @@ step has four physics steps of 5 ms. Rows of a task:
 - panda-gym with its own scene and observation, joint control and the same physics steps: one
   environment in one process, and one in each of two processes (Gymnasium's vector environments).
 
+Then one environment of `gymnasium.make` at a time, in one thread and CPU time (`--only single`
+measures these alone): panda-gym with its own episodes of 50 steps and with morphgen's of 300, in
+which random actions bring the arm to its limits and into contacts more often, and morphgen's
+environment with each simulator.
+
 Then reach of the ten arm3 of `interpolation/arm3/reach`, on which agents train, with 160 and 4,096
 environments (`--only arm3` measures these alone): MuJoCo in one thread, the same in a scene without
 contacts, and the simulator `kinematic`. These rows have one thread and count CPU time.
 
 Every round measures all rows in turn, so that other load on the machine affects all rows. The
 figures are medians over the rounds. "of first" is the ratio to the first row of the same case: raw
-PyBullet, or MuJoCo for the ten arm3.
+PyBullet, panda-gym for single environments, or MuJoCo for the ten arm3.
 
 panda-gym comes with `pip install morphgen[bench]`; without it its rows are missing.
 """
@@ -48,6 +53,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pybullet
 import torch
@@ -73,6 +79,8 @@ RAW = "raw PyBullet"
 TEN_ARMS = "interpolation/arm3/reach"
 """Split whose ten robots to train on are stepped together."""
 TEN_ARMS_ENVS = (160, 4096)
+SINGLE_EPISODES = 3
+"""Number of episodes of different actions that rows of single environments repeat."""
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 EPISODE = ReachConfig.max_episode_steps
 """Episode length [control steps]; every row runs whole episodes."""
@@ -98,6 +106,7 @@ def main() -> int:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = [row for case in CASES for row in _rows(*case, args.envs)]
+    rows += [row for case in CASES for row in _single_rows(*case)]
     rows += [row for envs in TEN_ARMS_ENVS for row in _ten_arms_rows(envs)]
     rows = [row for row in rows if args.only in row.case]
     if not rows:
@@ -160,6 +169,39 @@ def _rows(task: str, robot: str, peer: str, envs: int) -> list[Row]:
             name = f"panda-gym, {count} process" + ("es" if count > 1 else "")
             rows.append(Row(case, name, partial(_peer, peer, count)))
     return rows
+
+
+def _single_rows(task: str, robot: str, peer: str) -> list[Row]:
+    if not peer:
+        return []
+    case = f"single {task} {robot}"
+    makes = {}
+    if find_spec("panda_gym") is not None:
+        makes["panda-gym"] = partial(_panda, peer)
+        makes[f"panda-gym, episodes of {EPISODE} steps"] = partial(_panda, peer, EPISODE)
+    for name, sim in (("PyBullet", "pybullet"), ("MuJoCo", "mujoco")):
+        env_id = f"morphgen.tasks.gym_env:morphgen/{task.capitalize()}-v0"
+        makes[f"morphgen, {name}"] = partial(gymnasium.make, env_id, robot=robot, sim=sim)
+    return [Row(case, name, partial(_single, make)) for name, make in makes.items()]
+
+
+def _single(make: Callable[[], Any], seconds: float) -> float:
+    """Return the steps per second of CPU time of one Gymnasium environment, with its resets."""
+    with closing(make()) as env:
+        rng = np.random.default_rng(0)
+        shape = SINGLE_EPISODES, EPISODE, *env.action_space.shape
+        episodes = rng.uniform(-1, 1, shape).astype(np.float32)
+        env.reset(seed=0)
+        start, rounds = 0.0, -1
+        while rounds < 1 or time.process_time() - start < seconds:
+            for action in episodes.reshape(-1, *shape[2:]):
+                *_, terminated, truncated, _ = env.step(action)
+                if terminated or truncated:
+                    env.reset()
+            rounds += 1
+            if rounds == 0:  # the first round warms up
+                start = time.process_time()
+        return rounds * SINGLE_EPISODES * EPISODE / (time.process_time() - start)
 
 
 def _ten_arms_rows(envs: int) -> list[Row]:
@@ -247,8 +289,6 @@ def _twice(
 
 def _peer(name: str, count: int, seconds: float) -> float:
     """Return the steps per second of panda-gym, with the control period of morphgen."""
-    import gymnasium
-
     make = [partial(_panda, name)] * count
     vector = gymnasium.vector.SyncVectorEnv if count == 1 else gymnasium.vector.AsyncVectorEnv
     with closing(vector(make)) as envs:
@@ -264,12 +304,17 @@ def _peer(name: str, count: int, seconds: float) -> float:
         return steps * count / (time.perf_counter() - start)
 
 
-def _panda(name: str) -> Any:  # noqa: ANN401 - gymnasium's environments have no types here
-    import gymnasium
+def _panda(name: str, steps: int | None = None) -> Any:  # noqa: ANN401 - its environments are untyped
+    """Return an environment of panda-gym with the control period of morphgen.
+
+    Args:
+        name: Name of the environment.
+        steps: Time limit of episodes [control steps]; None for its own.
+    """
     import panda_gym
 
     assert panda_gym is not None
-    env = gymnasium.make(name)
+    env = gymnasium.make(name, max_episode_steps=steps)
     sim = env.get_wrapper_attr("sim")
     sim.n_substeps, sim.timestep = SUBSTEPS, TIMESTEP
     sim.physics_client.setTimeStep(TIMESTEP)

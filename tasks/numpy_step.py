@@ -32,7 +32,6 @@ Float32 = NDArray[np.float32]
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
 """Observation, reward, whether terminated, whether truncated, and info, as of Gymnasium."""
 _BINS = np.array(BINS, np.float32)
-_PERIOD = np.float32(CONTROL_PERIOD)
 
 
 def numpy_stepper(
@@ -196,8 +195,8 @@ class NumpyStepper:
         values: list[Any] = [
             np.array(self._tool_position(q), np.float32),
             self._block_pose,
-            np.float32(violation),
-            np.float32(sum(change)) / _PERIOD,
+            violation,
+            sum(change) / CONTROL_PERIOD,
             np.bool_(diverged),
         ]
         return TaskState(*values)

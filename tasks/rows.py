@@ -33,11 +33,13 @@ def row_norms(vectors: torch.Tensor) -> torch.Tensor:
     return np.float32(math.sqrt(exact.dot(exact)))
 
 
-def choose(condition: torch.Tensor, value: float, otherwise: torch.Tensor) -> torch.Tensor:
+def choose(
+    condition: torch.Tensor, value: float, otherwise: torch.Tensor | float = 0.0
+) -> torch.Tensor:
     """Return a value in the rows where a condition holds, and other values elsewhere, (n,)."""
     if isinstance(condition, torch.Tensor):
         return torch.where(condition, value, otherwise)
-    return np.float32(value) if condition else otherwise
+    return value if condition else otherwise
 
 
 def positive_part(values: torch.Tensor) -> torch.Tensor:

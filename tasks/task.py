@@ -203,8 +203,8 @@ class NumpyRow:
     """The formulas of one environment of a task in NumPy."""
 
     evaluate: Callable[[TaskState], StepResult]
-    """``TaskEnvs.evaluate`` of a state whose values are NumPy numbers or vectors, float32 or bool:
-    those of ``TaskState`` without the axis of rows. The result has NumPy numbers, too."""
+    """``TaskEnvs.evaluate`` of a state whose values are vectors and bools of NumPy and numbers:
+    those of ``TaskState`` without the axis of rows. The result has numbers, too."""
     observe: Callable[[NDArray[np.float32]], dict[str, NDArray[np.float32]]]
     """``TaskEnvs.observe`` of the pose of the block, shape (7,), in arrays that the caller owns."""
 

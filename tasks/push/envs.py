@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.rows import goal_choices, padded_rows, positive_part, row_norms
+from morphgen.tasks.rows import choose, goal_choices, padded_rows, positive_part, row_norms
 from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
 
 GAP = 0.05
@@ -129,7 +129,7 @@ def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> S
         success=success,
         terminated=success & ~state.diverged,
         distance=to_go,
-        score=1.0 * success,
+        score=choose(success, 1.0),
         terms=push_terms(config, to_go, approach, state.limit_violation, success),
     )
 
@@ -154,7 +154,7 @@ def push_terms(
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "distance": -config.distance_weight * to_go,
         "approach": -config.approach_weight * approach,
-        "success": config.success_weight * success,
+        "success": choose(success, config.success_weight),
     }
 
 

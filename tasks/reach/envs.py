@@ -114,7 +114,7 @@ def evaluate_reach(
     distance = row_norms(state.tool - goal[..., :3])
     return StepResult(
         success=is_near(config, distance, angle) & ~state.diverged,
-        terminated=state.diverged & False,  # an episode lasts until its time limit
+        terminated=state.diverged & ~state.diverged,  # never: an episode lasts until its limit
         distance=distance,
         score=anybody_score(config, distance, angle),
         terms=reach_terms(config, distance, state.limit_violation, state.acceleration, angle),
@@ -156,7 +156,7 @@ def reach_terms(
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "joint_acceleration": -config.joint_acceleration_weight * acceleration,
         "distance": -config.distance_weight * distance,
-        "near": config.near_weight * is_near(config, distance, angle),
+        "near": choose(is_near(config, distance, angle), config.near_weight),
     }
     if angle is not None:
         terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle

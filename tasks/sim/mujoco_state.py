@@ -111,7 +111,7 @@ class MujocoState:
         if self._has_blocks:
             self._exact_pose = self._positions.flat[self._pose_at]
             quaternion = self._exact_pose[:, 3:]
-            quaternion[quaternion[:, 0] < 0] *= -1
+            quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
             self._block_pose[:] = self._exact_pose
 
     def faults(self) -> dict[int, str]:
