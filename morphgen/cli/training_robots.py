@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from morphgen.cli.command import Option, number, option, repeated
 from morphgen.cli.options import reject_idle
-from morphgen.cli.progress import bar
+from morphgen.cli.progress import TrainingProgress
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.tasks.registry import TASKS
 
@@ -158,8 +159,8 @@ def draw_robots(
     from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.rl.drawn_robots import draw
 
-    with bar(args, "drawing robots and their goals") as update:
-        robots = draw(source, config, jobs=args.workers, progress=update)
+    with closing(TrainingProgress()) as display:
+        robots = draw(source, config, jobs=args.workers, progress=display.goal_sets)
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
