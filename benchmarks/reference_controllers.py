@@ -69,7 +69,7 @@ class Measuring:
         spec = member_spec(replace(member, obstacles=self.obstacles), self.library, config)
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
-            with closing(batch_from_specs([spec], self.envs, sim=sim)) as batch:
+            with closing(batch_from_specs([spec], self.envs, sim=sim, layouts="eval")) as batch:
                 for name in baselines_for(member.task):
                     if name == "zero":
                         continue

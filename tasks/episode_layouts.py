@@ -70,7 +70,7 @@ class EpisodeLayouts:
             envs: Environments whose episodes begin.
             random: Random number generator of every environment.
         """
-        for env in envs:
+        for env in envs if self.any else ():
             if self.current[env] is not None:
                 choices = self._choices[env]
                 self._set(env, choices[int(random[env].integers(len(choices)))])

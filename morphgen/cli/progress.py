@@ -153,13 +153,16 @@ class TrainingProgress:
         self._shown = ExitStack()
         self._shown.enter_context(status(argparse.Namespace(), "preparing"))
         self._goal_bar: Bar | None = None
-        self._last_line = time.monotonic()
+        self._last_line: float | None = None
 
     def goal_sets(self, done: int, total: int) -> None:
         """Show how many of the robots have their goal set."""
         if not sys.stderr.isatty():
-            if done < total and time.monotonic() - self._last_line > GOAL_LINE_INTERVAL:
-                self._last_line = time.monotonic()
+            now = time.monotonic()
+            if self._last_line is None:
+                self._last_line = now
+            if done < total and now - self._last_line > GOAL_LINE_INTERVAL:
+                self._last_line = now
                 print(f"goal sets: {done} of {total} robots", file=sys.stderr, flush=True)
             return
         if self._goal_bar is None:
