@@ -147,6 +147,8 @@ class NumpyStepper:
             "diverged": diverged,
             "terms": terms,
         }
+        if result.angle is not None:
+            info["angle"] = float(result.angle)
         truncated = (steps >= self._max_episode_steps or diverged) and not terminated
         return observation, sum(terms.values()), terminated, truncated, info
 
