@@ -101,8 +101,10 @@ class NumpyStepper:
         self._link_of_joint = tables.link_of_joint[0].numpy()
         self._max_step = tables.max_step[0].numpy()
         self._tokens, self._tool_position = _Tokens(tables), FramePosition(tables.robots[0])
+        joint = tables.joint_of_link[0, : len(tables.robots[0].links)].numpy()
+        self._joint_of_link, self._has_joint = np.maximum(joint, 0), joint >= 0
         self._constant: NumpyObservation = {}
-        self._has_requested = False
+        self._requested: Callable[[], NumpyObservation] = dict
 
     def begin(self, observation: NumpyObservation) -> None:
         """Begin an episode that the batch has begun.
@@ -110,10 +112,18 @@ class NumpyStepper:
         Args:
             observation: The environment's first observation in it.
         """
-        requested = self._unpadded(self._batch.requested_entries())
+        requested = self._unpadded(self._batch.requested_entries()).keys()
         changing = {"tokens", *self._row.observe(self._block_pose), *requested}
         self._constant = {k: v.copy() for k, v in observation.items() if k not in changing}
-        self._has_requested = bool(requested)
+        in_numpy: dict[str, Callable[[], Float32]] = {
+            "velocity": lambda: self._qd[self._joint_of_link] * self._has_joint,
+            "previous_action": lambda: self._previous_action[self._links],
+            "tool": lambda: np.array(self._tool_position(self._q.tolist()), np.float32),
+        }
+        if requested <= in_numpy.keys():
+            self._requested = lambda: {name: in_numpy[name]() for name in requested}
+        else:
+            self._requested = lambda: self._unpadded(self._batch.requested_entries())
 
     def step(self, action: NDArray[Any]) -> EnvStep:
         """Act for one control step.
@@ -136,8 +146,7 @@ class NumpyStepper:
         observation = {"tokens": self._tokens(self._q), **self._row.observe(self._block_pose)}
         for name, values in self._constant.items():
             observation[name] = values.copy()
-        if self._has_requested:
-            observation |= self._unpadded(self._batch.requested_entries())
+        observation |= self._requested()
         terms = {name: float(term) for name, term in result.terms.items()}
         terminated = bool(result.terminated)
         info = {

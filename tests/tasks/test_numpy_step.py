@@ -174,6 +174,16 @@ def test_all_channels_equal_those_of_the_batch(make, task, in_numpy):
     run_both(env, batch, 2)
 
 
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_entries_in_numpy_equal_those_of_the_batch(make, task, monkeypatch):
+    env, batch = make(task, observe=ObservationConfig(*(True,) * 3))
+    env.reset(seed=0)
+    with monkeypatch.context() as patch:
+        patch.setattr(env.batch, "requested_entries", None)  # a step in NumPy does not call it
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    run_both(env, batch, 2)
+
+
 def test_points_replace_the_state(make):
     env, batch = make("push", observe=ObservationConfig(points=5, state=False), obstacles=True)
     run_both(env, batch, 2)
