@@ -3,6 +3,7 @@
 from morphgen.cli import (
     check,
     evaluate,
+    finetune,
     fit,
     goals,
     grammar,
@@ -36,7 +37,7 @@ COMMANDS: tuple[Command, ...] = (
     goals.goals,
     train.train,
     evaluate.evaluate,
-    train.finetune,
+    finetune.finetune,
     study.study,
     play.play,
     play.speed,

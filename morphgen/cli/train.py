@@ -1,30 +1,28 @@
-"""``morphgen train`` and ``morphgen finetune``: train an agent on the robots of a split, or one."""
+"""``morphgen train``: train an agent on the robots of a split, on one, or on drawn ones."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import status, training_progress
 from morphgen.cli.training_robots import (
     DRAWN_OPTIONS,
-    GOAL_SEED,
     SIDES,
     SPLIT_HELP,
     draw_robots,
     require_robots_for_options,
-    require_split_for_options,
     robots_to_draw,
     robots_to_train,
-    split_option,
 )
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
+from morphgen.rl.presets import PRESETS, preset_of
 from morphgen.tasks.registry import TASKS, default_simulator
 
 if TYPE_CHECKING:
@@ -60,13 +58,18 @@ def on_off(name: str, help: str, default: bool | None = None) -> Option:
     )
 
 
-def learning_options(num_steps: int, num_envs: int) -> tuple[Option, ...]:
-    """Return the options of all commands that train."""
+def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Option, ...]:
+    """Return the options of all commands that train; without defaults, a preset has them."""
+    preset = "" if num_steps else " (default: the preset's)"
     return (
         number(
-            "--steps", "number of control steps of all environments together", default=num_steps
+            "--steps",
+            f"number of control steps of all environments together{preset}",
+            default=num_steps,
         ),
-        number("--envs", "number of environments, which the robots share", default=num_envs),
+        number(
+            "--envs", f"number of environments, which the robots share{preset}", default=num_envs
+        ),
         opt.WORKERS,
         opt.DEVICE,
         repeated(
@@ -80,7 +83,13 @@ def learning_options(num_steps: int, num_envs: int) -> tuple[Option, ...]:
 
 
 TRAINING_OPTIONS = (
-    *learning_options(2_000_000, 128),
+    *learning_options(None, None),
+    option(
+        "--preset",
+        choices=list(PRESETS),
+        help="; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items())
+        + " (default: the agent's, fast for me-graph and paper for the agents of the paper)",
+    ),
     opt.sim_option(),
     number(
         "--goal-seed", "seed of all goals (default: as shipped with the split, else 0)", least=0
@@ -116,7 +125,7 @@ RESUME = flag("--resume", "continue the run in the output folder")
     option(
         "words", nargs="+", metavar="SPLIT", help=f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}"
     ),
-    option("--agent", default="me-tf", help=f"one of {', '.join(AGENTS)} (default: me-tf)"),
+    option("--agent", default="me-graph", help=f"one of {', '.join(AGENTS)} (default: me-graph)"),
     opt.SEED,
     option("--on", choices=SIDES, default="train", help="side of the split"),
     opt.OBSTACLES,
@@ -154,54 +163,11 @@ def train(args: argparse.Namespace) -> None:
     _require_used(config, args)
     name = _folder_name(source) + "-pose" * (args.goal == "pose")
     folder = args.out or Path("runs") / name / str(spec) / f"seed{args.seed}"
-    _train(folder, config, args)
+    run_training(folder, config, args)
 
 
-@command(
-    "finetune",
-    "train a policy further, by default on the test robots of its split",
-    option("checkpoint", type=Path, help="a checkpoint, or a run folder"),
-    split_option("other robots than those of the checkpoint's split"),
-    option("--on", choices=SIDES, default="test", help="side of the split"),
-    opt.OBSTACLES,
-    opt.SEED,
-    opt.sim_option("that of the training"),
-    GOAL_SEED,
-    opt.goal_option("that of the training"),
-    path_option(
-        "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
-    ),
-    RESUME,
-    *(
-        on_off(name, f"{help} (default: as the checkpoint's run)")
-        for name, help in NETWORK_SWITCHES.items()
-    ),
-    on_off(
-        "curriculum",
-        "push: move the target line from near to far again (default: it stays far)",
-        default=False,
-    ),
-    *learning_options(30_000, 16),
-    opt.LIBRARY,
-    details="The run begins with the networks of the checkpoint, and with a new optimiser and "
-    "schedule. Agent and hyperparameters are the checkpoint's unless given.",
-    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 30000",),
-)
-def finetune(args: argparse.Namespace) -> None:
-    """Train and print the path of the checkpoint."""
-    from morphgen.rl.training import checkpoint_files
-
-    require_split_for_options(args)
-    files = list(checkpoint_files(args.checkpoint))
-    if len(files) > 1:
-        raise TaskError(
-            f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
-        )
-    folder = args.out or files[0].parent / "finetuned" / f"{args.on}-seed{args.seed}"
-    _train(folder, _finetuning_config(files[0], args), args)
-
-
-def _train(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
+def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
+    """Train in a folder with a progress bar, and print the paths of the checkpoints."""
     from morphgen.rl.runs import CHECKPOINT
     from morphgen.rl.training import train
 
@@ -247,15 +213,19 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     from morphgen.rl.robot_source import tasks_of
     from morphgen.rl.runs import RunConfig
 
-    changes = {**parse_constants(args.set), "bf16": args.bf16, "compile": args.compile}
-    policy, ppo = configs_of(spec, tasks_of(source), changes, args.steps)
+    preset = preset_of(args.preset, spec.agent)
+    changes = {**preset.constants, **parse_constants(args.set)}
+    changes |= {"bf16": args.bf16, "compile": args.compile}
+    spec = replace(spec, switches={**preset.switches, **spec.switches})
+    steps = args.steps or preset.total_timesteps
+    policy, ppo = configs_of(spec, tasks_of(source), changes, steps)
     return RunConfig(
         source,
         policy,
         ppo,
         seed=args.seed,
         sim=args.sim or default_simulator(),
-        num_envs=args.envs,
+        num_envs=args.envs or preset.num_envs,
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,
         max_links=args.max_links or _max_links(source),
@@ -345,37 +315,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
         raise TaskError(
             "--set logit_scale: continuous actions have no logits; it is for --discrete"
         )
-
-
-def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
-    from morphgen.rl.agent_spec import parse_constants
-    from morphgen.rl.config import PPOConfig
-    from morphgen.rl.robot_source import other_side, tasks_of
-    from morphgen.rl.runs import read_checkpoint
-
-    initial, _ = read_checkpoint(file)
-    if args.words:
-        source = robots_to_train(args.words, args)
-    else:
-        source = other_side(initial.source, args.on)
-    changes: dict[str, Any] = parse_constants(args.set)
-    if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
-        raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
-    switches = {name: getattr(args, name) for name in NETWORK_SWITCHES}
-    changes |= {name: value for name, value in switches.items() if value is not None}
-    changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
-    return replace(
-        initial,
-        source=source,
-        ppo=replace(initial.ppo, **changes),
-        seed=args.seed,
-        sim=args.sim or initial.sim,
-        num_envs=args.envs,
-        device=args.device,
-        initial_checkpoint=str(file.resolve()),
-        slice_updates=0,
-        tasks=opt.with_goal(initial.tasks, args.goal, tasks_of(source)),
-    )
 
 
 def execution_config(args: argparse.Namespace) -> ExecutionConfig:

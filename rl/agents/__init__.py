@@ -55,6 +55,8 @@ class Agent:
     """Train one policy for each robot of a split, instead of one policy for all of them."""
     proprioceptive_only: bool = False
     """Hide the robot's morphology from the networks; joint positions stay visible."""
+    preset: str = "paper"
+    """Name of the preset that training begins with, in ``morphgen.rl.presets.PRESETS``."""
     channels: tuple[str, ...] = ()
     """Observation channels that the networks need, of ``morphgen.tasks.observation.CHANNELS``."""
 
@@ -73,7 +75,7 @@ class Agent:
 SE = Agent("se", "morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True)
 ME_MLP = Agent("me-mlp", "morphgen.rl.agents.mlp")
 ME_TF = Agent("me-tf", "morphgen.rl.agents.transformer")
-ME_GRAPH = Agent("me-graph", "morphgen.rl.agents.graph", channels=("tree",))
+ME_GRAPH = Agent("me-graph", "morphgen.rl.agents.graph", preset="fast", channels=("tree",))
 
 AGENTS: Registry[Agent] = Registry(
     "agent",

@@ -1,0 +1,196 @@
+"""Kinematic channels agree with kinematics, are canonical, and are zero where nothing moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import morphgen
+from helpers.goal_sets import draw_spec
+from morphgen.errors import TaskError
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import forward_kinematics, frame_jacobian
+from morphgen.tasks.kinematic_channels import (
+    COLUMN_SCALE,
+    KINEMATIC_CHANNELS,
+    POSITION_SCALE,
+    ROTATION_SCALE,
+)
+from morphgen.tasks.make import batch_from_specs
+from morphgen.tasks.observation import CHANNELS, MAX_TREE_DISTANCE, NUM_POINTS, observation_config
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
+
+WORDS = ("arm3", "arm=ur5 ee=stick")
+ALL = observation_config((*KINEMATIC_CHANNELS, "tree"))
+SIZES = {"lag": 1, "joint": 10, "poses": 15, "jacobian": 20, "dls": 3}
+
+
+@pytest.fixture(scope="module")
+def specs(tmp_path_factory):
+    cache = tmp_path_factory.mktemp("goals")
+    robots = [morphgen.compose(words, geometry="primitive") for words in WORDS]
+    config = replace(ReachConfig(), num_goals=10)
+    return [draw_spec(robot, config, obstacles=False, seed=0, cache=cache) for robot in robots]
+
+
+@pytest.fixture(scope="module")
+def moved(specs):
+    """A batch of two environments of each robot after ten random steps, and its observation."""
+    batch = batch_from_specs(specs, 4, sim="kinematic", observe=ALL, seed=3)
+    batch.reset()
+    random = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        actions = torch.rand(batch.action_mask.shape, generator=random) * 2 - 1
+        batch.step(actions)
+    return batch, batch.observe()
+
+
+def test_all_channels_have_a_vector_for_each_link(moved):
+    batch, observation = moved
+    for name, size in SIZES.items():
+        assert observation[name].shape == (4, batch.robot_tables.max_links, size), name
+        assert observation[name].isfinite().all(), name
+        assert not observation[name][~observation["links"]].any(), name
+
+
+def test_the_jacobian_channel_has_the_columns_of_the_numpy_jacobian(moved):
+    batch, observation = moved
+    for env, spec in enumerate(batch.specs * 2):
+        robot = spec.robot
+        q = batch.q[env, : robot.dof].double().numpy()
+        T_root_tool, J = frame_jacobian(robot, q, "tool")
+        error = batch.field("goal")[env, :3].numpy() - T_root_tool[:3, 3]
+        for joint in range(robot.dof):
+            link = int(batch.robot_tables.link_of_joint[batch.env_robot_index[env], joint])
+            step = float(batch.robot_tables.max_step[batch.env_robot_index[env], joint])
+            row = observation["jacobian"][env, link].numpy()
+            np.testing.assert_allclose(row[:3], COLUMN_SCALE * step * J[:3, joint], atol=2e-4)
+            np.testing.assert_allclose(row[3:6], ROTATION_SCALE * step * J[3:, joint], atol=2e-4)
+            if J[:3, joint].any():
+                np.testing.assert_allclose(row[7:10], POSITION_SCALE * error, atol=2e-4)
+
+
+def test_the_dls_step_of_small_errors_reaches_the_goal(specs):
+    batch = batch_from_specs(specs, 2, sim="kinematic", observe=observation_config(["dls"]))
+    batch.reset()
+    q = batch.q
+    batch.groups["reach"].goal[:, :3] = batch._tool_positions(q) + torch.tensor([0.003, 0, 0.002])
+    dls = torch.atanh(batch.observe()["dls"][..., 1])  # the gain 1, in largest steps
+    step = batch.robot_tables.max_step[batch.env_robot_index]
+    joints = torch.gather(dls, 1, batch.robot_tables.link_of_joint[batch.env_robot_index]) * step
+    error = batch.groups["reach"].goal[:, :3] - batch._tool_positions(q + joints)
+    assert (torch.linalg.vector_norm(error, dim=1) < 0.001).all()
+
+
+def test_equal_joints_look_equal_whatever_the_convention_of_frames(specs):
+    """A robot whose joint frames are turned about the origin, with axes to match, is the same."""
+    robot = specs[1].robot
+    turn = Pose.from_xyz_rpy((0.0, 0.0, 0.0), (0.4, -0.3, 1.1))
+    turned = _with_turned_frames(robot, turn)
+    np.testing.assert_allclose(
+        forward_kinematics(turned, np.array(robot.home))[:, :3, 3],
+        forward_kinematics(robot, np.array(robot.home))[:, :3, 3],
+        atol=1e-9,
+    )
+    rows = []
+    for same in (robot, turned):
+        spec = replace(specs[1], robot=same, scene=replace(specs[1].scene, robot=same))
+        batch = batch_from_specs([spec], 1, sim="kinematic", observe=ALL, seed=5)
+        rows.append(batch.reset())
+    for name in ("joint", "jacobian", "dls", "lag"):
+        # Steps of columns that are almost zero are quotients of small numbers.
+        torch.testing.assert_close(rows[0][name], rows[1][name], rtol=1e-4, atol=2e-3)
+    # The axis (z) and all vectors agree; x depends on the convention by a turn about the axis.
+    axis_and_vectors = [*range(3, 15)]
+    moves = rows[0]["joints"][0].tolist()
+    one, other = (row["poses"][0, moves][:, axis_and_vectors] for row in rows)
+    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
+def _with_turned_frames(robot, turn):
+    """Turn the frame of every link but the root about its origin; shapes and axes follow."""
+    back = turn.inverse()
+    links, joints = [robot.links[0]], []
+    for link in robot.links[1:]:
+        shapes = tuple(replace(s, T_link_shape=back @ s.T_link_shape) for s in link.collisions)
+        links.append(replace(link, visuals=(), collisions=shapes))
+    for joint in robot.joints:
+        parent_turn = Pose() if joint.parent == robot.links[0].name else back
+        T = parent_turn @ joint.T_parent_joint @ turn
+        axis = back.matrix[:3, :3] @ np.array(joint.axis)
+        joints.append(replace(joint, T_parent_joint=T, axis=tuple(axis.tolist())))
+    frames = tuple(replace(f, T_link_frame=back @ f.T_link_frame) for f in robot.frames)
+    return replace(robot, links=tuple(links), joints=tuple(joints), frames=frames)
+
+
+def test_the_lag_is_the_distance_of_joints_from_their_targets(moved):
+    batch, observation = moved
+    index = batch.env_robot_index
+    lag = (batch.targets - batch.q) / batch.robot_tables.max_step[index].clamp(min=1e-6)
+    links = batch.robot_tables.link_of_joint[index]
+    observed = torch.gather(observation["lag"][..., 0], 1, links)
+    exists = batch.robot_tables.max_step[index] > 0
+    torch.testing.assert_close(observed[exists], lag.clamp(-3, 3)[exists])
+    assert observed[exists].abs().max() > 0.5, "the joints lag"
+
+
+def test_tree_entries_of_a_serial_arm(moved):
+    _, observation = moved
+    joints = observation["joints"][1]
+    count = int((joints >= 0).sum())
+    assert count == 6
+    assert observation["joint_parents"][1, :count].tolist() == [-1, 0, 1, 2, 3, 4]
+    relations = observation["joint_relations"][1, :count, :count]
+    kinds, distances = relations // (MAX_TREE_DISTANCE + 1), relations % (MAX_TREE_DISTANCE + 1)
+    places = torch.arange(count)
+    assert distances.equal((places[:, None] - places).abs())
+    sign = (places[:, None] - places).sign()
+    assert kinds.equal(torch.where(sign == 0, 0, torch.where(sign > 0, 1, 2)))
+
+
+def test_push_observes_the_block_from_the_nearest_point_of_the_robot(tmp_path):
+    robot = morphgen.compose("arm3", geometry="primitive")
+    config = replace(PushConfig(), num_goals=3)
+    spec = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)
+    batch = batch_from_specs([spec], 2, sim="mujoco", observe=ALL)
+    observation = batch.reset()
+    P = 3
+    assert observation["jacobian"].shape[2] == 7 + 13 * P + 11
+    assert observation["poses"].shape[2] == 12 + 3 * P
+    offset = observation["jacobian"][..., 7 + 13 * P : 10 + 13 * P]
+    moving = observation["jacobian"][..., 6] > 0
+    distance = torch.linalg.vector_norm(offset[moving] / POSITION_SCALE, dim=-1)
+    tool = batch._tool_positions(batch.q)
+    to_block = torch.linalg.vector_norm(tool - batch.simulation.block_pose[:, :3], dim=1)
+    assert (distance <= to_block.max() + 1e-4).all()
+    assert (distance > 0).all()
+
+
+def test_channels_are_asked_for_by_name():
+    config = observation_config(["lag", "points", "no_state"], obstacles=3)
+    assert (config.lag, config.points, config.state, config.obstacles) == (
+        True,
+        NUM_POINTS,
+        False,
+        3,
+    )
+    for name in CHANNELS:
+        if name != "no_state":
+            assert observation_config([name]) != observation_config([])
+    with pytest.raises(TaskError, match=r"unknown observation channel 'jacobain'.*jacobian"):
+        observation_config(["jacobain"])
+    with pytest.raises(TaskError, match="expected points"):
+        observation_config(["no_state"])
+
+
+def test_without_state_boxes_are_hidden(tmp_path):
+    robot = morphgen.compose("arm3", geometry="primitive")
+    config = replace(PushConfig(), num_goals=2)
+    spec = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)
+    hidden = observation_config(["points", "no_state"])
+    observation = batch_from_specs([spec], 1, sim="mujoco", observe=hidden).reset()
+    assert not observation["object"].any()
+    assert observation["points"].any()
+    assert observation["line"].any()
