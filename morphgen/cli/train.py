@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -183,6 +184,16 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
         )
     for subrun in subruns:
         print(subrun.folder / CHECKPOINT)
+    print(_next_command(folder, config), file=sys.stderr)
+
+
+def _next_command(folder: Path, config: RunConfig) -> str:
+    """Return a line that says how to watch, or to score, what was trained."""
+    source = config.source
+    if source.task is not None and not source.grammars:
+        words = f"{source.task} {source.name} --policy {folder} --sim {config.sim}"
+        return f"watch it: morphgen play {words} --out episode.mp4"
+    return f"score it: morphgen eval {folder}"
 
 
 def agent_spec(args: argparse.Namespace) -> AgentSpec:
