@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
+from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import policy_from
 from morphgen.rl.observation_layout import (
     layout_from,
@@ -62,7 +64,10 @@ class Policy:
         Raises:
             TaskError: If it has another one.
         """
-        require_layout(self.layout, layout_of(observation), "the checkpoint")
+        layout = layout_of(observation)
+        if AGENTS[self.config.agent].any_size:
+            layout = replace(layout, links=self.layout.links)
+        require_layout(self.layout, layout, "the checkpoint")
 
     @torch.no_grad()
     def act(self, observation: Observation) -> torch.Tensor:
@@ -78,7 +83,7 @@ class Policy:
         needed = truncate_links(observation, rows_needed(self.config, observation))
         head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})
         actions = head.mode() if self._deterministic else head.sample(self._generator)
-        return pad_links(actions, self.layout.links).to(observation["links"].device)
+        return pad_links(actions, observation["links"].shape[1]).to(observation["links"].device)
 
 
 def load_policy(

@@ -13,6 +13,7 @@ from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic
+from morphgen.rl.agents import AGENTS
 from morphgen.rl.aliases import current_learner, current_run
 from morphgen.rl.checkpoint_content import require_learner
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
@@ -102,7 +103,8 @@ class RunConfig:
         obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
         channels = observation_config(self.policy.channels, obstacles=obstacles)
         channels = replace(channels, tool=channels.tool or self.policy.tool_position)
-        return Interface(self.policy.kind, self.max_links, channels)
+        max_links = None if AGENTS[self.policy.agent].any_size else self.max_links
+        return Interface(self.policy.kind, max_links, channels)
 
     def as_data(self) -> dict[str, Any]:
         """Return the config as JSON values, which ``config_from`` reads."""

@@ -134,7 +134,7 @@ class TrainingBatches:
             kind=interface.kind,
             observe=self._channels,
             workers=self._workers,
-            max_links=interface.max_links,
+            max_links=config.max_links,
             device=batch_device(config.sim, config.device),
             library=map(Path, config.source.library),
         )

@@ -57,6 +57,8 @@ class Agent:
     """Hide the robot's morphology from the networks; joint positions stay visible."""
     preset: str = "paper"
     """Name of the preset that training begins with, in ``morphgen.rl.presets.PRESETS``."""
+    any_size: bool = False
+    """Whether no weight belongs to the number of a link, so that a policy acts on larger robots."""
     channels: tuple[str, ...] = ()
     """Observation channels that the networks need, of ``morphgen.tasks.observation.CHANNELS``."""
 
@@ -75,7 +77,9 @@ class Agent:
 SE = Agent("se", "morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True)
 ME_MLP = Agent("me-mlp", "morphgen.rl.agents.mlp")
 ME_TF = Agent("me-tf", "morphgen.rl.agents.transformer")
-ME_GRAPH = Agent("me-graph", "morphgen.rl.agents.graph", preset="fast", channels=("tree",))
+ME_GRAPH = Agent(
+    "me-graph", "morphgen.rl.agents.graph", preset="fast", any_size=True, channels=("tree",)
+)
 
 AGENTS: Registry[Agent] = Registry(
     "agent",
