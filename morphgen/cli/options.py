@@ -105,7 +105,7 @@ def with_goal(
         return tuple(configs)
     if ReachConfig.task not in (names := tuple(dict.fromkeys(tasks))):
         raise TaskError(
-            f"--goal {goal} is for task {ReachConfig.task}; the robots are there to "
+            f"--goal {goal} is for task {ReachConfig.task}; the tasks of the robots: "
             f"{' and '.join(names)}"
         )
     return tuple(

@@ -377,7 +377,7 @@ def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_pat
         (("eval", "ik"), "name its robots with --split"),
         (
             ("eval", "random", "--split", "prims", "task=push", "--goal", "pose"),
-            "--goal pose is for task reach; the robots are there to push",
+            "--goal pose is for task reach; the tasks of the robots: push",
         ),
         ((*RUN, "--goal", "poses"), "invalid choice: 'poses'"),
         (
