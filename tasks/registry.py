@@ -70,7 +70,11 @@ class Registry(Generic[T]):
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is an object of this name."""
-        return name in self._builtin or name in self._loaded or name in self._entry_points
+        return name in self._loaded or (isinstance(name, str) and self.is_installed(name))
+
+    def is_installed(self, name: str) -> bool:
+        """Return whether every process knows the name, not only this one by ``register``."""
+        return name in self._builtin or name in self._entry_points
 
     def __getitem__(self, name: str) -> T:
         """Return the object of a name.

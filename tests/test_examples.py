@@ -34,11 +34,14 @@ def follow(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys):
+def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys, monkeypatch):
     assert len(CUSTOM_TASK.read_text(encoding="utf-8").splitlines()) < 150
     few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")
     robot, sim = "planar-cube", ("--sim", "mujoco")
+    monkeypatch.setattr(sys, "argv", ["follow.py"])
     assert main(["train", robot, "task=follow", "--agent", "se", *sim, *few]) == 0
+    watch = f"watch it: python follow.py play follow {robot} --policy {RUN} --sim mujoco"
+    assert watch in capsys.readouterr().err
     assert main(["eval", RUN, "--episodes", "1"]) == 0
     assert "follow" in capsys.readouterr().out
     assert main(["play", "follow", robot, "--policy", RUN, *sim]) == 0

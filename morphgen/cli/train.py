@@ -190,10 +190,14 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
 def _next_command(folder: Path, config: RunConfig) -> str:
     """Return a line that says how to watch, or to score, what was trained."""
     source = config.source
+    # Only the script that registered a task can play it.
+    program = "morphgen"
+    if source.task is not None and not TASKS.is_installed(source.task):
+        program = f"python {sys.argv[0]}"
     if source.task is not None and not source.grammars:
         words = f"{source.task} {source.name} --policy {folder} --sim {config.sim}"
-        return f"watch it: morphgen play {words} --out episode.mp4"
-    return f"score it: morphgen eval {folder}"
+        return f"watch it: {program} play {words} --out episode.mp4"
+    return f"score it: {program} eval {folder}"
 
 
 def agent_spec(args: argparse.Namespace) -> AgentSpec:
