@@ -209,7 +209,7 @@ def by_hand(cells, values):
 
 
 def test_rows_are_averages_over_seeds_and_robots(tmp_path):
-    cells = cells_in(tmp_path)[3:]
+    cells = cells_in(tmp_path)[4:]
     found = rows(by_hand(cells, [(1, 3, 10), (2, 6, 20), (5, 5, 5), (5, 5, 5)]))
     assert [(row.agent, row.mode, row.seeds) for row in found] == [
         ("se", "deterministic", (0, 1)),
@@ -224,7 +224,7 @@ def test_rows_are_averages_over_seeds_and_robots(tmp_path):
 
 
 def test_the_table_counts_unstable_episodes(tmp_path):
-    cells = cells_in(tmp_path, ("me-mlp",))[3:]
+    cells = cells_in(tmp_path, ("me-mlp",))[4:]
     found = by_hand(cells, [(1, 3, 10), (2, 6, 20)])
     assert "unstable" not in table_text(rows(found))
     for scores in found.values():
