@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import binomtest, bootstrap, trim_mean
 
 LEVEL = 0.95
 """Confidence level of the intervals."""
@@ -41,6 +41,17 @@ def mean_interval(samples: ArrayLike) -> Interval:
     if len(values) < 2:
         return Interval(mean, math.nan, math.nan)
     return _interval(mean, (values,), np.mean, paired=False)
+
+
+def wilson_interval(successes: int, trials: int) -> Interval:
+    """Return a success rate with its interval (Wilson 1927), which stays within 0 and 1.
+
+    Args:
+        successes: Number of successes.
+        trials: Number of trials, at least 1.
+    """
+    result = binomtest(successes, trials).proportion_ci(LEVEL, method="wilson")
+    return Interval(successes / trials, float(result.low), float(result.high))
 
 
 def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:

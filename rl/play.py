@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.baselines import BASELINES, ZERO_SHOT, policies_for
 from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
@@ -25,21 +25,25 @@ FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Frames per second, so that videos run in real time: 25."""
 
 
+ZERO_SHOT_FILE = Path(__file__).resolve().parent / "checkpoints" / "reach.pt"
+"""Checkpoint of the policy ``ZERO_SHOT``."""
+
+
 def require_policy(name: str, task: str) -> None:
     """Require that a controller exists for a task.
 
     Raises:
         TaskError: If it is unknown, or for another task.
     """
-    if _is_file(name):
-        return
-    valid = baselines_for(task)
-    if name in BASELINES and name not in valid:
-        raise TaskError(
-            f"policy {name!r} is for {' or '.join(BASELINES[name].tasks or ())}, not for {task}; "
-            f"valid: {', '.join(valid)}"
-        )
-    if name not in BASELINES:
+    valid = policies_for(task)
+    if name == ZERO_SHOT or (name in BASELINES and name not in valid):
+        tasks = ("reach",) if name == ZERO_SHOT else BASELINES[name].tasks or ()
+        if task not in tasks:
+            raise TaskError(
+                f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
+                f"valid: {', '.join(valid)}"
+            )
+    elif name not in BASELINES and _checkpoint(name) is None:
         raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
 
 
@@ -49,10 +53,8 @@ def interface_of(name: str) -> Interface:
     Raises:
         TaskError: If the file is not a checkpoint.
     """
-    if not _is_file(name):
-        return Interface()
-    run, _ = read_checkpoint(Path(name))
-    return run.interface
+    file = _checkpoint(name)
+    return Interface() if file is None else read_checkpoint(file)[0].interface
 
 
 def task_config_of(name: str, task: str) -> TaskConfig:
@@ -61,9 +63,10 @@ def task_config_of(name: str, task: str) -> TaskConfig:
     Raises:
         TaskError: If the file is not a checkpoint.
     """
-    if not _is_file(name):
+    file = _checkpoint(name)
+    if file is None:
         return GoalConfig().task_config(task)
-    run, _ = read_checkpoint(Path(name))
+    run, _ = read_checkpoint(file)
     return GoalConfig(tasks=eval_config_of(run, 1).tasks).task_config(task)
 
 
@@ -82,8 +85,9 @@ def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
         BenchmarkError: If the robot has hardly any collision-free configuration.
     """
     require_policy(name, env.task)
-    if _is_file(name):
-        run, learner = read_checkpoint(Path(name))
+    file = _checkpoint(name)
+    if file is not None:
+        run, learner = read_checkpoint(file)
         if run.policy.kind != env.batch.action_kind:
             raise TaskError(
                 f"{name}: its actions are {run.policy.kind}, not {env.batch.action_kind}"
@@ -134,8 +138,11 @@ def play(
         report(Episode(0, 0, *facts, info.get("angle", math.nan)))
 
 
-def _is_file(policy: str) -> bool:
-    return policy not in BASELINES and Path(policy).exists()
+def _checkpoint(policy: str) -> Path | None:
+    """Return the checkpoint or run folder that a policy's name means; None for a baseline."""
+    if policy == ZERO_SHOT:
+        return ZERO_SHOT_FILE
+    return Path(policy) if policy not in BASELINES and Path(policy).exists() else None
 
 
 def _shown(env: TaskEnv) -> Iterator[Frame]:

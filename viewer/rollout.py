@@ -16,9 +16,14 @@ from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.baselines import BASELINES, ZERO_SHOT, policies_for
 from morphgen.rl.drawn_robots import FILE, read_drawn
-from morphgen.rl.play import interface_of, make_controller, require_policy, task_config_of
+from morphgen.rl.play import (
+    interface_of,
+    make_controller,
+    require_policy,
+    task_config_of,
+)
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import Interface, read_checkpoint
@@ -171,8 +176,8 @@ def resolve_policy(policy: str, task: str, files: FileAccess) -> str:
         TaskError: If the policy is unknown, or is for another task.
         UriError: If it is a file that may not be read.
     """
-    if policy not in BASELINES:
-        return str(_checkpoint_path(policy, baselines_for(task), files))
+    if policy not in BASELINES and policy != ZERO_SHOT:
+        return str(_checkpoint_path(policy, policies_for(task), files))
     require_policy(policy, task)
     return policy
 

@@ -16,6 +16,7 @@ from morphgen.cli import (
     tokens,
     train,
     view,
+    zeroshot,
 )
 from morphgen.cli.command import Command
 
@@ -35,6 +36,7 @@ COMMANDS: tuple[Command, ...] = (
     similarity.similarity,
     split.split,
     goals.goals,
+    zeroshot.zeroshot,
     train.train,
     evaluate.evaluate,
     finetune.finetune,

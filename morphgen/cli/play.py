@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
 from morphgen.cli.progress import bar, print_line, status
-from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines import BASELINES, ZERO_SHOT
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 
 if TYPE_CHECKING:
@@ -24,9 +24,10 @@ OBSTACLES = flag("--obstacles", "place the robot among obstacles")
 
 
 def _policy(text: str) -> str:
-    if text not in BASELINES and not Path(text).exists():
+    names = (*BASELINES, ZERO_SHOT)
+    if text not in names and not Path(text).exists():
         raise argparse.ArgumentTypeError(
-            f"unknown policy {text!r}: expected one of {', '.join(BASELINES)}, or a path"
+            f"unknown policy {text!r}: expected one of {', '.join(names)}, or a path"
         )
     return text
 
@@ -42,8 +43,8 @@ def _policy(text: str) -> str:
         default="random",
         metavar="POLICY",
         help="the controller: zero (no action), random, jacobian (each joint along its own "
-        "Jacobian column, for reach), ik (inverse kinematics, for reach), scripted (for push); or "
-        "a checkpoint or run folder",
+        "Jacobian column, for reach), ik (inverse kinematics, for reach), scripted (for push), "
+        "zero-shot (the policy for reach that comes with morphgen); or a checkpoint or run folder",
     ),
     path_option("--out", "FILE", "the video: .mp4 or .gif"),
     opt.sim_option(),

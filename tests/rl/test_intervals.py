@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from morphgen.rl.intervals import iqm_interval, mean_interval
+from morphgen.rl.intervals import iqm_interval, mean_interval, wilson_interval
 
 
 def all_resamples(values):
@@ -62,3 +62,11 @@ def test_one_seed_has_no_interval():
 def test_empty_or_one_dimensional_scores_are_rejected(scores):
     with pytest.raises(ValueError, match="expected 2 axes"):
         iqm_interval(scores, together=True)
+
+
+def test_the_wilson_interval_stays_within_0_and_1():
+    for successes, low, high in ((0, 0.0, 0.1611), (10, 0.2993, 0.7007), (20, 0.8389, 1.0)):
+        interval = wilson_interval(successes, 20)
+        assert interval.value == successes / 20
+        assert interval.low == pytest.approx(low, abs=1e-4)
+        assert interval.high == pytest.approx(high, abs=1e-4)

@@ -1,0 +1,102 @@
+"""``morphgen zeroshot``: a policy that comes with morphgen reaches with a robot it never saw."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, number, path_option
+from morphgen.cli.progress import bar, print_line, status
+
+if TYPE_CHECKING:
+    from morphgen.rl.robot_source import RobotSource
+    from morphgen.rl.zeroshot import ZeroShotResult
+
+FILM_EPISODES = 3
+"""Number of episodes in a video."""
+
+
+@command(
+    "zeroshot",
+    "let a policy that comes with morphgen reach with any robot, without training",
+    opt.ROBOT,
+    path_option("--policy", "CHECKPOINT", "another policy: a checkpoint, or a run folder"),
+    number("--episodes", "number of episodes", default=20),
+    opt.SEED,
+    opt.sim_option("mujoco"),
+    opt.WORKERS,
+    path_option("--out", "FILE", "a video of three episodes: .mp4 or .gif"),
+    *opt.LIBRARY_JSON,
+    details="The success rate has a 95% Wilson interval, and stands beside controllers that do not "
+    "learn: jacobian (each joint along its own Jacobian column), ik (inverse kinematics with a "
+    "planned path) and random actions, in episodes with the same starts and goals.",
+    examples=("zeroshot arm=ur5 ee=stick", "zeroshot my_robot.urdf --out reach.mp4"),
+)
+def zeroshot(args: argparse.Namespace) -> None:
+    """Run the episodes, print the table, and write the video."""
+    from morphgen.rl.evaluation import EvalConfig
+    from morphgen.rl.play import ZERO_SHOT_FILE
+    from morphgen.rl.robot_source import robot_source
+    from morphgen.rl.zeroshot import zero_shot
+    from morphgen.tasks.renderer import require_video_path
+
+    if args.out is not None:
+        require_video_path(args.out)
+    policy = args.policy or ZERO_SHOT_FILE
+    with status(args, "reading the robot"):
+        source = robot_source(" ".join(args.words), "reach", library=tuple(args.library))
+    config = EvalConfig(args.episodes, args.sim or "mujoco", args.seed, args.workers)
+    with bar(args, "running the episodes") as progress:
+        results = zero_shot(
+            source,
+            config,
+            policy=policy,
+            progress=lambda name, done, total: progress(int(done), total),
+        )
+    opt.print_result(args, [asdict(result) for result in results], lambda: _table(results))
+    if args.out is not None:
+        with status(args, "filming"):
+            _film(source, policy, args)
+        print_line(str(args.out))
+
+
+def _table(results: list[ZeroShotResult]) -> str:
+    from tabulate import tabulate
+
+    rows = [
+        (
+            result.controller,
+            f"{result.success.value:.0%} ({result.success.low:.0%} to {result.success.high:.0%})",
+            f"{result.distance:.3f}",
+            f"{result.score:.1f}",
+        )
+        for result in results
+    ]
+    return tabulate(rows, headers=("controller", "success", "distance [m]", "score"))
+
+
+def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
+    from morphgen.rl.play import FPS, interface_of, make_controller, play
+    from morphgen.tasks.gym_env import TaskEnv
+    from morphgen.tasks.renderer import write_video
+
+    interface = interface_of(str(policy))
+    env = TaskEnv(
+        "reach",
+        source.name,
+        sim=args.sim or "mujoco",
+        layouts="eval",
+        kind=interface.kind,
+        observe=interface.channels,
+        max_links=interface.max_links,
+        library=args.library,
+        render_mode="rgb_array",
+    )
+    with closing(env):
+        controller = make_controller(str(policy), env, args.seed)
+        frames = play(env, controller, FILM_EPISODES, args.seed, lambda episode: None)
+        write_video(frames, args.out, FPS)
