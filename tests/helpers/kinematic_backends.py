@@ -6,6 +6,7 @@ import torch
 
 from morphgen.model import inverse_kinematics, inverse_kinematics_torch, kinematics
 from morphgen.model import kinematics_torch as batched
+from morphgen.model.frame_positions import frame_positions
 from morphgen.model.kinematics import joint_limits
 
 BACKENDS = ("numpy", "float64", "float32")
@@ -32,7 +33,7 @@ class NumpyBackend:
         return kinematics.frame_jacobian(self.robots[index], q)
 
     def frame_positions(self, index, q):
-        return kinematics.frame_positions(self.robots[index], q.T).T
+        return frame_positions(self.robots[index], q.T).T
 
     def dls_step(self, J, error, damping):
         return inverse_kinematics.dls_step(J, error, damping)

@@ -165,7 +165,7 @@ def nested(levels, wide):
         (put_run("policy", value=[1]), "run: policy: invalid value [1]; expected keys and values"),
         (
             put_run("sim", value="gazebo"),
-            "unknown simulator 'gazebo'; valid: mujoco, pybullet",
+            "unknown simulator 'gazebo'; valid: kinematic, mujoco, pybullet",
         ),
         (put_run("ppo", "colour", value=1), "ppo: unknown key 'colour'"),
         (lambda whole, _: whole["run"].pop("source"), "run: missing key 'source'"),
