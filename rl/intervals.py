@@ -23,7 +23,7 @@ TRIM = 0.25
 
 @dataclass(frozen=True)
 class Interval:
-    """An average with its bootstrap interval; the ends are nan if there is only one sample."""
+    """An average or a rate with its interval; the ends are nan if there is only one sample."""
 
     value: float
     low: float

@@ -36,14 +36,15 @@ def require_policy(name: str, task: str) -> None:
         TaskError: If it is unknown, or for another task.
     """
     valid = policies_for(task)
-    if name == ZERO_SHOT or (name in BASELINES and name not in valid):
+    if name in valid:
+        return
+    if name == ZERO_SHOT or name in BASELINES:
         tasks = ("reach",) if name == ZERO_SHOT else BASELINES[name].tasks or ()
-        if task not in tasks:
-            raise TaskError(
-                f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
-                f"valid: {', '.join(valid)}"
-            )
-    elif name not in BASELINES and _checkpoint(name) is None:
+        raise TaskError(
+            f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
+            f"valid: {', '.join(valid)}"
+        )
+    if _checkpoint(name) is None:
         raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
 
 

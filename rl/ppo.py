@@ -294,9 +294,11 @@ class Learner:
                 ema_update(self.target_critic, self.critic, config.slow_decay)
                 metrics.append(torch.stack([*loss_metrics, *norms]))
 
-        for network in (self.actor, self.critic, self.target_critic):
-            if network.normalizer is not None:
-                network.normalizer.update(observations)
+        if self.actor.normalizer is not None:
+            self.actor.normalizer.update(observations)
+            for network in (self.critic, self.target_critic):
+                assert network.normalizer is not None
+                network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
         means = dict(zip(LEARN_METRICS, torch.stack(metrics).mean(dim=0).tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         explained = float(explained_variance(values, returns))

@@ -13,7 +13,7 @@ from morphgen.rl.intervals import Interval, wilson_interval
 from morphgen.rl.play import ZERO_SHOT_FILE
 from morphgen.rl.robot_source import RobotSource
 
-BASELINES = ("jacobian", "ik", "random")
+COMPARED = ("jacobian", "ik", "random")
 """Controllers that the policy is compared with."""
 
 Progress = Callable[[str, float, int], None]
@@ -43,7 +43,7 @@ def zero_shot(
     policy: Path = ZERO_SHOT_FILE,
     progress: Progress = lambda name, done, total: None,
 ) -> list[ZeroShotResult]:
-    """Run a policy, and the controllers of ``BASELINES``, on a robot that reaches.
+    """Run a policy, and the controllers of ``COMPARED``, on a robot that reaches.
 
     All of them have the same starts and goals.
 
@@ -68,7 +68,7 @@ def zero_shot(
         progress=lambda done, total: progress(name, done, total),
     )
     scores = [(name, score)]
-    for baseline in BASELINES:
+    for baseline in COMPARED:
         (score,) = evaluate_baseline(
             baseline,
             source,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from morphgen.benchmark.token_layout import GEOMETRY, SHAPE_POSE
-from morphgen.model.inverse_kinematics_torch import dls_step
+from morphgen.model.inverse_kinematics_torch import dls_step, pose_task
 from morphgen.model.kinematics_torch import (
     compile_tree,
     forward_kinematics,
@@ -92,7 +92,7 @@ class _State:
 class KinematicChannels:
     """The kinematic channels of a batch's environments, each of shape (n, L, size).
 
-    P is the number of target points of the tasks (``Task.num_target_points``); R is 1 if a task
+    P is the number of target points of the tasks (``TaskEnvs.target_points``); R is 1 if a task
     wants an orientation of the tool, else 0; B is 1 if a scene has a block, else 0.
 
     ``lag`` (1)
@@ -135,7 +135,8 @@ class KinematicChannels:
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
         self._has_block = has_block if bool(has_block.any()) else None
-        self._joint = tables.joint_of_link[index]
+        self._joint, self._link_of_joint = tables.joint_of_link[index], tables.link_of_joint[index]
+        self._link_mask = tables.link_mask[index]
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._max_step = tables.max_step[index]
         # Padding has a largest step of zero; its columns are zero, too.
@@ -217,7 +218,7 @@ class KinematicChannels:
         to_points = (state.goals.points[:, None] - origins[:, :, None]).flatten(2)
         vectors = POSITION_SCALE * torch.cat([origins, to_tool, to_points], dim=-1)
         poses = torch.cat([R_root_joint[..., 0], R_root_joint[..., 2], vectors], dim=-1)
-        return poses * self._tables.link_mask[self._index][..., None]
+        return poses * self._link_mask[..., None]
 
     def _jacobian(self, state: _State) -> torch.Tensor:
         linear, angular = state.J_root_tool[:, :3], state.J_root_tool[:, 3:]
@@ -247,10 +248,12 @@ class KinematicChannels:
         errors = (goals.points - later_tool[:, None]) * goals.exists[..., None]
         columns = [self._dls_step(J[:, :3], error, state.targets) for error in errors.unbind(1)]
         if goals.rotations is not None:
-            rotation_error = ROTATION_LENGTH * _rotation_error(goals, state.T_root_target)
-            scaled = torch.cat([J[:, :3], ROTATION_LENGTH * J[:, 3:]], dim=1)
-            error = torch.cat([errors[:, 0], rotation_error], dim=1)
-            columns.append(self._dls_step(scaled, error, state.targets))
+            assert goals.has_rotation is not None
+            points, rotations = goals.points[:, 0], goals.rotations
+            J_task, error = pose_task(state.T_root_target, J, points, rotations, ROTATION_LENGTH)
+            wanted = torch.stack([goals.exists[:, 0], goals.has_rotation], dim=1)
+            error = error * wanted.repeat_interleave(3, dim=1)
+            columns.append(self._dls_step(J_task, error, state.targets))
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
 
     def _dls_step(
@@ -312,7 +315,7 @@ class KinematicChannels:
         point = points[rows, link]
 
         origins, axes = joint_axes(tree, self._index, T_root_link)
-        link_of_joint = self._tables.link_of_joint[self._index]
+        link_of_joint = self._link_of_joint
         at_joint = rows[:, None], link_of_joint
         lever = point[:, None] - origins[at_joint]
         axis = axes[at_joint]

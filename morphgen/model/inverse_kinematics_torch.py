@@ -6,10 +6,12 @@ The functions have the names and formulas of ``morphgen.model.inverse_kinematics
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from morphgen.model.inverse_kinematics import DAMPING, MAX_STEP
-from morphgen.model.kinematics_torch import FrameChain, frame_jacobian, frame_pose
+from morphgen.model.kinematics_torch import FrameChain, frame_jacobian
 from morphgen.model.rotation_torch import rotvec_from_matrix
 
 ROTATION_DAMPING = 0.1
@@ -60,12 +62,12 @@ def solve_position_ik(
     Returns:
         Configurations, shape (n, J), and the remaining position errors, shape (n, 3) [m].
     """
-    q = torch.clamp(q, *limits)
-    for _ in range(iterations):
+
+    def task(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
-        step = dls_step(J_root_tool[:, :3], positions - T_root_tool[:, :3, 3], damping)
-        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
-    return q, positions - frame_pose(chain, robot_index, q)[:, :3, 3]
+        return J_root_tool[:, :3], positions - T_root_tool[:, :3, 3]
+
+    return _solve(task, q, limits, iterations, damping, max_step)
 
 
 def pose_task(
@@ -126,17 +128,12 @@ def solve_pose_ik(
     Returns:
         Configurations, shape (n, J), and the remaining errors of ``pose_task``, shape (n, 6) [m].
     """
-    q = torch.clamp(q, *limits)
 
     def task(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
         return pose_task(T_root_tool, J_root_tool, positions, rotations, rotation_weight)
 
-    for _ in range(iterations):
-        J, error = task(q)
-        step = dls_step(J, error, damping)
-        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
-    return q, task(q)[1]
+    return _solve(task, q, limits, iterations, damping, max_step)
 
 
 def pose_ik_step(
@@ -189,6 +186,32 @@ def pose_ik_step(
         target = q + (step + rotation_step)[..., 0]
         free = free & (target >= lower) & (target <= upper)
     return torch.clamp(target, lower, upper)
+
+
+def _solve(
+    task: Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
+    q: torch.Tensor,
+    limits: tuple[torch.Tensor, torch.Tensor],
+    iterations: int,
+    damping: float,
+    max_step: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Repeat steps of damped least squares; return configurations and the remaining errors.
+
+    Args:
+        task: Function from configurations (n, J) to Jacobians (n, m, J) and errors (n, m).
+        q: Initial configurations, shape (n, J) [rad or m].
+        limits: Lower and upper joint limits, each (n, J) [rad or m].
+        iterations: Number of iterations.
+        damping: See ``dls_step``.
+        max_step: Largest change of a joint position in one iteration [rad or m].
+    """
+    q = torch.clamp(q, *limits)
+    for _ in range(iterations):
+        J, error = task(q)
+        step = dls_step(J, error, damping)
+        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
+    return q, task(q)[1]
 
 
 def _limit_rotation(

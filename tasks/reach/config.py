@@ -43,7 +43,7 @@ class ReachConfig:
     score_near: float = 200.0
     """Score of a step near the goal (released evaluation)."""
     goal: str = "position"
-    """What has to be reached, one of ``GOAL_KINDS``: the goal's position (paper), or its pose. The
+    """Kind of the goal, of ``GOAL_KINDS``: a position (paper) or a pose for the tool to reach. The
     goal sets are the same: each goal is a full pose, which a configuration reaches."""
     near_angle: float = math.radians(10)
     """With goal ``pose``: angle between tool and goal that counts as success, together with

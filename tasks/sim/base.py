@@ -141,4 +141,4 @@ class Simulator:
     devices: tuple[str, ...] = ("cpu",)
     """Types of the devices that its tensors can be on, as of ``torch.device.type``."""
     simulates_contacts: bool = True
-    """Whether it simulates contacts; otherwise it takes no scenes with a block or obstacles."""
+    """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
