@@ -32,7 +32,7 @@ def first(grammar):
     return str(derive(grammar, LIBRARY, FirstChooser()))
 
 
-def test_there_is_a_grammar_for_each_category():
+def test_there_is_a_grammar_for_each_category_and_one_for_serial_arms():
     assert grammar_names() == [
         "arm3",
         "arm5",
@@ -45,6 +45,7 @@ def test_there_is_a_grammar_for_each_category():
         "panda_variations",
         "planar_arm",
         "prims",
+        "serial",
         "stick",
         "tongs",
     ]

@@ -25,7 +25,7 @@ def shipped(name):
 
 
 def benchmark_counts(category, derivation):
-    """Return the numbers of links and movable joints in the benchmark's table."""
+    """Return the numbers of links and movable joints; those of the benchmark for its categories."""
     nodes = list(derivation.walk())
     parts = [node.part for node in nodes]
     values = {node.part: dict(node.parameters) for node in nodes}
@@ -35,6 +35,9 @@ def benchmark_counts(category, derivation):
             return beams + 2, beams
         case "chain":
             return 3 * beads + 4, 2 * beads + 3
+        case "serial":
+            tubes = parts.count("tube")
+            return 2 * tubes + 2, tubes
         case "planar_arm":
             return (beams + 4, beams + 2) if "jaw" in parts else (beams + 5, beams + 4)
         case "tongs":
