@@ -20,6 +20,7 @@ OBSERVATION_SWITCHES = tuple(name.replace("_", "-") for name in CHANNELS)
 SWITCHES = (
     *("symlog", "slow-critic", "task-reweighting", "robot-advantages", "joint-entropy"),
     *("curriculum", "discrete", "fixed-deviation", "mask-morphology", "tool-position"),
+    "residual",
     *("normalize", *OBSERVATION_SWITCHES),
 )
 """Names of switches on the command line, in the order in which a spec prints them: first those of

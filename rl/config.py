@@ -36,6 +36,9 @@ class PolicyConfig:
     """Further observation channels, of ``morphgen.tasks.observation.CHANNELS``, in that order."""
     normalize: bool = False
     """Normalize the kinematic channels by their running means and variances."""
+    residual: bool = False
+    """Add the way that the channel ``ik`` shows to the mean actions. The policy learns what to
+    change about it (Silver et al. 2018, Residual policy learning, arXiv 1812.06298)."""
     network: NetworkConfig | None = None
     """Sizes of the agent's networks; by default those of the agent's module."""
 
@@ -50,6 +53,11 @@ class PolicyConfig:
         if self.fixed_std and self.discrete:
             raise TaskError(
                 "fixed-deviation: discrete actions have no deviation; it goes with --no-discrete"
+            )
+        if self.residual and (self.discrete or "ik" not in self.observe):
+            raise TaskError(
+                "residual: actions are added to the channel ik; expected --observe ik and "
+                "--no-discrete"
             )
         if self.network is None:
             object.__setattr__(self, "network", config())

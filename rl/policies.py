@@ -14,6 +14,7 @@ from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded
 from morphgen.rl.normalizer import RunningNormalizer
 from morphgen.rl.observation_layout import Layout, last_link
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import Observation
 
 
@@ -32,13 +33,15 @@ class Actor(nn.Module):
         if not config.discrete:
             rows = 1 if self.network.shares_joints else layout.links
             self.raw_log_std = nn.Parameter(torch.zeros(rows), requires_grad=not config.fixed_std)
+        self.residual = config.residual
         self.normalizer = RunningNormalizer(layout) if config.normalize else None
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers for ``head``: (n, L, 11) for discrete actions, else (n, L, 1), float32."""
-        if self.normalizer is not None:
-            observation = self.normalizer(observation)
-        numbers: torch.Tensor = self.scale * self.network(observation).float()
+        seen = observation if self.normalizer is None else self.normalizer(observation)
+        numbers: torch.Tensor = self.scale * self.network(seen).float()
+        if self.residual:
+            numbers = numbers + observation["ik"][..., IK_SHARE, None]
         return torch.where(observation["actions"][..., None], numbers, 0.0)
 
     def head(self, numbers: torch.Tensor, mask: torch.Tensor) -> Head:

@@ -377,6 +377,8 @@ class TaskBatch:
         self.episode_step[envs] = 0
         self.previous_qd[envs] = 0
         self.previous_action[envs] = 0
+        if self._kinematics is not None:
+            self._kinematics.begin(envs)
 
     @property
     def _q(self) -> torch.Tensor:

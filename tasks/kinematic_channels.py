@@ -22,10 +22,14 @@ from morphgen.model.kinematics_torch import (
     joint_axes,
 )
 from morphgen.model.rotation_torch import matrix_from_quaternion, rotvec_from_matrix, skew
+from morphgen.tasks.ik_channel import IkSolutions
 from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.tool_targets import ToolTargets
 
-KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls")
+KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik")
 """Names of the channels, in the order in which networks concatenate them."""
+IK_SHARE = 4
+"""Column of the channel ``ik`` with the joint's share of the way, -1 to 1."""
 MAX_LAG = 3.0
 """Bound of the observed lag [largest steps]; no joint in free motion is further behind."""
 STEPS_TO_LIMIT = 10.0
@@ -49,23 +53,6 @@ ROTATION_LENGTH = 0.3
 """Length by which rotation errors are multiplied to compare with position errors [m/rad]."""
 DAMPING = 0.03
 """Damping of the least squares of ``dls``, in units of the Jacobian's singular values [m/rad]."""
-
-
-@dataclass(frozen=True, eq=False)
-class ToolTargets:
-    """Points and orientations that tasks want the tool at, in the root frame: n environments.
-
-    They are for observation channels such as ``jacobian``; evaluation does not depend on them.
-    """
-
-    points: torch.Tensor
-    """Target points, in the order in which the tool should visit them, shape (n, P, 3) [m]."""
-    exists: torch.Tensor
-    """Points that an environment's task has, shape (n, P), bool."""
-    rotations: torch.Tensor | None = None
-    """Orientations for the tool at the first point, shape (n, 3, 3); None if no task wants one."""
-    has_rotation: torch.Tensor | None = None
-    """Environments whose task wants an orientation, shape (n,), bool; None if none does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +100,12 @@ class KinematicChannels:
         The joint's share of a damped least-squares step of all joints (Wampler 1986) towards each
         target point, and towards the first one with its orientation, at three gains.
 
+    ``ik`` (6)
+        The joint's way from its target to a configuration that brings the tool to the first target
+        point, with its orientation if it has one (``IkSolutions``): in largest steps at three
+        gains, in rad or m, and as a share of the joint that needs the most steps; and the logarithm
+        of the tool's distance from the target there.
+
     Links without an independent joint have zeros, except in ``poses``.
     """
 
@@ -143,6 +136,7 @@ class KinematicChannels:
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5
         self._is_prismatic = tables.is_prismatic[index].float()
+        self._solutions = IkSolutions(tables, index) if "ik" in names else None
         needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
         self._tree = (
             compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)
@@ -155,6 +149,11 @@ class KinematicChannels:
             tokens = tables.tokens[index]
             self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
             self._shape_pose = tokens[..., SHAPE_POSE.columns]
+
+    def begin(self, envs: torch.Tensor) -> None:
+        """Note that episodes begin in the environments with these indices, shape (k,), int64."""
+        if self._solutions is not None:
+            self._solutions.forget(envs)
 
     def __call__(
         self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor
@@ -185,6 +184,7 @@ class KinematicChannels:
             "poses": self._poses,
             "jacobian": self._jacobian,
             "dls": self._dls,
+            "ik": self._ik,
         }
         return {name: channels[name](state) for name in self._names}
 
@@ -255,6 +255,17 @@ class KinematicChannels:
             error = error * wanted.repeat_interleave(3, dim=1)
             columns.append(self._dls_step(J_task, error, state.targets))
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
+
+    def _ik(self, state: _State) -> torch.Tensor:
+        solutions = self._solutions
+        assert solutions is not None
+        solutions.update(state.targets, state.goals, ROTATION_LENGTH)
+        change = solutions.q - state.targets
+        steps = change * self._per_step
+        share = steps / steps.abs().amax(dim=1, keepdim=True).clamp(min=1)
+        log_error = ((solutions.error + NEAR).log() / 2)[:, None].expand_as(steps)
+        columns = [torch.tanh(gain * steps) for gain in GAINS]
+        return self._at_links(torch.stack([*columns, change, share, log_error], dim=2))
 
     def _dls_step(
         self, J: torch.Tensor, error: torch.Tensor, targets: torch.Tensor

@@ -58,6 +58,8 @@ class ObservationConfig:
     """Whether to observe the tool's Jacobian and its products with the errors."""
     dls: bool = False
     """Whether to observe a damped least-squares step towards the targets."""
+    ik: bool = False
+    """Whether to observe the way to a configuration that reaches the target."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.tasks.kinematic_channels import ToolTargets
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import (
     STANDARD_FIELDS,
@@ -21,6 +20,7 @@ from morphgen.tasks.task import (
     TaskEnvs,
     TaskState,
 )
+from morphgen.tasks.tool_targets import ToolTargets
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -42,6 +42,7 @@ SWITCHES = {
     "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
     "mask-morphology": "hide the robot's morphology from the agent (default: off)",
     "tool-position": "add the tool's position to the observations (default: off)",
+    "residual": "add the actions to the way that the channel ik shows (default: off)",
     "normalize": "normalize the kinematic channels of observations (default: off)",
     "robot-advantages": "normalize advantages robot by robot (default: off)",
     "joint-entropy": "weigh the mean entropy of the joints instead of their sum (default: off)",
@@ -114,8 +115,8 @@ OBSERVE = option(
     "--observe",
     metavar="A,B,...",
     default="",
-    help="further channels of the observations: lag, joint, poses, jacobian, dls, velocity, "
-    "previous-action, points, no-state",
+    help="further channels of the observations: lag, joint, poses, jacobian, dls, ik, "
+    "velocity, previous-action, points, no-state",
 )
 RESUME = flag("--resume", "continue the run in the output folder")
 

@@ -237,6 +237,8 @@ def test_every_training_switch_has_an_option(run, tmp_path):
     assert policy.tool_position
     code, _, err = run(*RUN, "--steps", "32", "--fixed-deviation", "--out", "bins")
     assert (code, "fixed-deviation: discrete actions have no" in err) == (2, True)
+    code, _, err = run(*RUN, "--steps", "32", "--no-discrete", "--residual", "--out", "bins")
+    assert (code, "residual: actions are added to the channel ik" in err) == (2, True)
     assert not Path("bins").exists()
 
 

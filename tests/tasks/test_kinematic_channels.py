@@ -24,7 +24,7 @@ from morphgen.tasks.reach.config import ReachConfig
 
 WORDS = ("arm3", "arm=ur5 ee=stick")
 ALL = observation_config((*KINEMATIC_CHANNELS, "tree"))
-SIZES = {"lag": 1, "joint": 10, "poses": 15, "jacobian": 20, "dls": 3}
+SIZES = {"lag": 1, "joint": 10, "poses": 15, "jacobian": 20, "dls": 3, "ik": 6}
 
 
 @pytest.fixture(scope="module")

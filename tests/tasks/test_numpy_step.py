@@ -25,7 +25,15 @@ CONFIGS = {
     "push": PushConfig(max_episode_steps=STEPS, num_goals=5, line=-0.1),
 }
 CHANNELS = ObservationConfig(
-    *(True,) * 3, points=7, lag=True, joint=True, poses=True, jacobian=True, dls=True, tree=True
+    *(True,) * 3,
+    points=7,
+    lag=True,
+    joint=True,
+    poses=True,
+    jacobian=True,
+    dls=True,
+    ik=True,
+    tree=True,
 )
 
 
@@ -62,7 +70,7 @@ def assert_observation_equals(seen, env, expected):
             batch_values = batch_values[list(env.action_links)]
         assert values.shape == env.observation_space[name].shape
         links = len(env.env_spec.robot.links)
-        if name in ("tokens", "velocity", "lag", "joint", "poses", "jacobian", "dls"):
+        if name in ("tokens", "velocity", "lag", "joint", "poses", "jacobian", "dls", "ik"):
             assert not batch_values[links:].any()
             batch_values = batch_values[:links]
         np.testing.assert_allclose(values, batch_values, rtol=1e-5, atol=ROUNDING, err_msg=name)

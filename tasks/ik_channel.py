@@ -1,0 +1,143 @@
+"""Configurations that bring tools to their targets, for the observation channel ``ik``."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from morphgen.model.inverse_kinematics_torch import solve_pose_ik, solve_position_ik
+from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.tool_targets import ToolTargets
+
+STARTS = 8
+"""Number of start configurations of a solution."""
+ITERATIONS = 25
+"""Iterations of damped least squares."""
+DAMPING = 0.05
+"""Damping of the least squares [joint units per metre]."""
+MAX_STEP = 0.5
+"""Largest change of a joint in one iteration [rad or m]."""
+SOLVED = 0.005
+"""Distance of tool and target that counts as a solution [m]."""
+MOVED = 0.01
+"""Distance that a target moves before it is solved again [m]."""
+
+
+class IkSolutions:
+    """A configuration for each environment that brings the tool to its first target.
+
+    It is found by damped least squares from the joint targets and from other starts, which are the
+    same for all robots as fractions of their joints' ranges. Of several solutions it is the one
+    that the robot reaches first. Links and obstacles may be in the way: kinematics does not know.
+    A solution is kept until the episode ends or the target moves.
+    """
+
+    def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
+        """Gather the tables of every environment.
+
+        Args:
+            tables: The robots.
+            env_robot_index: Robot of each environment, shape (n,), int64.
+        """
+        index = env_robot_index
+        self._tables, self._index = tables, index
+        self._lower, self._upper = tables.lower[index], tables.upper[index]
+        self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
+        self._moves_tool = tables.moves_tool[index]
+        self._turns = ~tables.is_prismatic[index] & self._moves_tool
+        n, J = self._lower.shape
+        device = tables.device
+        # The first point of the sequence is zero, a corner of the range.
+        sobol = torch.quasirandom.SobolEngine(J)  # type: ignore[no-untyped-call]
+        sobol.fast_forward(1)  # type: ignore[no-untyped-call]
+        self._fractions = sobol.draw(STARTS - 1).to(device)
+        self.q = torch.zeros(n, J, device=device)
+        """The configurations, shape (n, J) [rad or m]."""
+        self.error = torch.zeros(n, device=device)
+        """Distance from tool to target there, shape (n,) [m]."""
+        self._solved_for = torch.full((n, 3), math.inf, device=device)
+
+    def forget(self, envs: torch.Tensor) -> None:
+        """Forget the solutions of environments whose episode begins.
+
+        Args:
+            envs: Their indices, shape (k,), int64.
+        """
+        self._solved_for[envs] = math.inf
+
+    def update(self, targets: torch.Tensor, goals: ToolTargets, metres_per_radian: float) -> None:
+        """Solve where an episode has begun or the tool's target has moved.
+
+        Args:
+            targets: Targets of the independent joints, shape (n, J) [rad or m].
+            goals: Points and orientations that the tasks want the tool at.
+            metres_per_radian: Length by which errors of orientation are multiplied [m/rad].
+        """
+        points = goals.points[:, 0]
+        moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
+        self.q[~goals.exists[:, 0]] = targets[~goals.exists[:, 0]]
+        rows = torch.nonzero(moved & goals.exists[:, 0])[:, 0]
+        if not len(rows):
+            return
+        self._solved_for[rows] = points[rows]
+        if goals.rotations is None or goals.has_rotation is None:
+            self._solve(rows, targets, points, None, metres_per_radian)
+            return
+        posed = goals.has_rotation[rows]
+        for some, rotations in ((rows[~posed], None), (rows[posed], goals.rotations)):
+            if len(some):
+                self._solve(some, targets, points, rotations, metres_per_radian)
+
+    def _solve(
+        self,
+        rows: torch.Tensor,
+        targets: torch.Tensor,
+        points: torch.Tensor,
+        rotations: torch.Tensor | None,
+        metres_per_radian: float,
+    ) -> None:
+        """Solve for some environments, shape (k,)."""
+        now, lower, upper = targets[rows], self._lower[rows], self._upper[rows]
+        random = lower + (upper - lower) * self._fractions[:, None]
+        starts = torch.cat([now[None], torch.where(self._moves_tool[rows], random, now)])
+        many = rows.repeat(STARTS)
+        limits = self._lower[many], self._upper[many]
+        chain, robots = self._tables.tool_chain, self._index[many]
+        if rotations is None:
+            q, error = solve_position_ik(
+                chain,
+                robots,
+                starts.flatten(0, 1),
+                points[many],
+                limits,
+                iterations=ITERATIONS,
+                damping=DAMPING,
+                max_step=MAX_STEP,
+            )
+        else:
+            q, error = solve_pose_ik(
+                chain,
+                robots,
+                starts.flatten(0, 1),
+                points[many],
+                rotations[many],
+                limits,
+                rotation_weight=metres_per_radian,
+                iterations=ITERATIONS,
+                damping=DAMPING,
+                max_step=MAX_STEP,
+            )
+        q = self._nearest_turn(q.view_as(starts), now, rows)
+        distance = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
+        steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
+        best = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance)).argmin(dim=0)
+        column = torch.arange(len(rows), device=rows.device)
+        self.q[rows], self.error[rows] = q[best, column], distance[best, column]
+
+    def _nearest_turn(self, q: torch.Tensor, now: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """Return configurations with turns of 360 degrees taken away where limits allow it."""
+        turn = 2 * math.pi * torch.round((q - now) / (2 * math.pi))
+        nearer = q - turn
+        allowed = (nearer >= self._lower[rows]) & (nearer <= self._upper[rows]) & self._turns[rows]
+        return torch.where(allowed, nearer, q)
