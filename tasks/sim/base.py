@@ -142,3 +142,42 @@ class Simulator:
     """Types of the devices that its tensors can be on, as of ``torch.device.type``."""
     simulates_contacts: bool = True
     """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
+
+
+def require_reset_shapes(
+    scenes: Sequence[Scene],
+    num_joints: int,
+    envs: torch.Tensor,
+    q: torch.Tensor,
+    block_pose: torch.Tensor,
+    obstacle_poses: torch.Tensor | None,
+) -> None:
+    """Require that arguments of ``Simulation.reset`` have the right shapes.
+
+    Args:
+        scenes: Scene of each environment.
+        num_joints: Number of independent joints with padding, J.
+        envs: As of ``reset``, like the others.
+        q: Joint positions.
+        block_pose: Poses of blocks.
+        obstacle_poses: Poses of obstacles, or None.
+
+    Raises:
+        ValueError: If a shape is wrong, or an environment does not exist.
+    """
+    k, n = len(envs), len(scenes)
+    if tuple(q.shape) != (k, num_joints) or tuple(block_pose.shape) != (k, 7):
+        raise ValueError(
+            f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
+            f"{tuple(block_pose.shape)}; expected ({k}, {num_joints}) and ({k}, 7)"
+        )
+    if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
+        raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
+    if obstacle_poses is None:
+        return
+    most = max(len(scene.obstacles) for scene in scenes)
+    if tuple(obstacle_poses.shape) != (k, most, 7):
+        raise ValueError(
+            f"reset of {k} environments with obstacles of shape {tuple(obstacle_poses.shape)}; "
+            f"expected ({k}, {most}, 7)"
+        )

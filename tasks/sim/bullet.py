@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import DivergedError, SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, Share
 from morphgen.tasks.sim.bullet_workers import (
     STEP,
@@ -120,8 +120,12 @@ class BulletSimulation:
             SimulationError: If the simulation is closed, or a worker died.
         """
         self._require_open()
+        joints = self._is_joint.shape[1]
+        require_reset_shapes(self.scenes, joints, envs, q, block_pose, obstacle_poses)
         indices, positions, poses = self._checked_state(envs, q, block_pose)
-        obstacles = self._checked_obstacles(envs, obstacle_poses)
+        obstacles: Float32 | None = None if obstacle_poses is None else obstacle_poses.numpy()
+        if obstacles is not None and not np.isfinite(obstacles).all():
+            raise ValueError(f"reset of {len(envs)} environments: obstacles are not finite")
 
         def state(rows: NDArray[np.bool_]) -> BulletState:
             moved = None if obstacles is None else obstacles[rows]
@@ -199,15 +203,7 @@ class BulletSimulation:
         self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor
     ) -> tuple[NDArray[np.int64], Float32, Float32]:
         """Return valid arguments of ``reset`` as arrays."""
-        n, joints = self._is_joint.shape
         indices, positions, poses = envs.numpy(), q.numpy(), block_pose.numpy()
-        if positions.shape != (len(indices), joints) or poses.shape != (len(indices), 7):
-            raise ValueError(
-                f"reset of {len(indices)} environments with q of shape {positions.shape} and "
-                f"blocks of shape {poses.shape}; they need ({len(indices)}, {joints}) and (.., 7)"
-            )
-        if ((indices < 0) | (indices >= n)).any():
-            raise ValueError(f"reset of environments {indices.tolist()}; there are {n}")
         invalid = (self._is_joint[indices] & ~np.isfinite(positions)).any(axis=1)
         invalid |= self._has_block[indices] & ~np.isfinite(poses).all(axis=1)
         if invalid.any():
@@ -217,21 +213,6 @@ class BulletSimulation:
                 f"block {poses[k].tolist()}"
             )
         return indices, positions, poses
-
-    def _checked_obstacles(
-        self, envs: torch.Tensor, obstacle_poses: torch.Tensor | None
-    ) -> Float32 | None:
-        """Return valid poses of obstacles for ``reset`` as an array."""
-        if obstacle_poses is None:
-            return None
-        most = max(len(scene.obstacles) for scene in self.scenes)
-        poses: Float32 = obstacle_poses.numpy()
-        if poses.shape != (len(envs), most, 7) or not np.isfinite(poses).all():
-            raise ValueError(
-                f"reset of {len(envs)} environments with obstacles of shape {poses.shape}; they "
-                f"need finite numbers of shape ({len(envs)}, {most}, 7)"
-            )
-        return poses
 
     def _label(self, env: int) -> str:
         return f"environment {env} ({self.scenes[env].robot.name!r})"

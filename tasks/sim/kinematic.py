@@ -9,7 +9,7 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, LAG, speed_limit
 from morphgen.typing import Array
 
@@ -107,14 +107,7 @@ class KinematicSimulation:
             SimulationError: If the simulation is closed.
         """
         self._require_open()
-        k, (n, joints) = len(envs), self.q.shape
-        if q.shape != (k, joints) or block_pose.shape != (k, 7):
-            raise ValueError(
-                f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
-                f"{tuple(block_pose.shape)}; expected ({k}, {joints}) and ({k}, 7)"
-            )
-        if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
-            raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
+        require_reset_shapes(self.scenes, self.q.shape[1], envs, q, block_pose, None)
         positions = torch.where(self._is_joint[envs], q, 0.0)
         if (row := _first_not_finite(positions)) is not None:
             env = int(envs[row])

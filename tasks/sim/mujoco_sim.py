@@ -12,7 +12,14 @@ import torch
 from morphgen.errors import DivergedError, SimulationError
 from morphgen.formats.mujoco_warnings import MujocoWarnings
 from morphgen.model.kinematics import movable_positions
-from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
+from morphgen.tasks.sim.base import (
+    SUBSTEPS,
+    TIMESTEP,
+    Contacts,
+    Scene,
+    Simulator,
+    require_reset_shapes,
+)
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import MujocoState
@@ -108,20 +115,8 @@ class MujocoSimulation:
                 finite; the environments before that one have been reset.
         """
         self._require_open()
-        k, (n, joints) = len(envs), self._targets.shape
-        if q.shape != (k, joints) or block_pose.shape != (k, 7):
-            raise ValueError(
-                f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
-                f"{tuple(block_pose.shape)}; they need ({k}, {joints}) and ({k}, 7)"
-            )
-        most = max(len(world.obstacles) for world in self._worlds)
-        if obstacle_poses is not None and obstacle_poses.shape != (k, most, 7):
-            raise ValueError(
-                f"reset of {k} environments with obstacles of shape {tuple(obstacle_poses.shape)}; "
-                f"they need ({k}, {most}, 7)"
-            )
-        if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
-            raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
+        joints = self._targets.shape[1]
+        require_reset_shapes(self.scenes, joints, envs, q, block_pose, obstacle_poses)
         rows = zip(envs.tolist(), q.tolist(), block_pose.tolist(), strict=True)
         for row, (env, positions, pose) in enumerate(rows):
             self._put(env, positions[: self._worlds[env].robot.dof], pose)
