@@ -21,7 +21,11 @@ from morphgen.model.kinematics_torch import (
     frame_pose,
     joint_axes,
 )
-from morphgen.model.rotation_torch import matrix_from_quaternion, rotvec_from_matrix, skew
+from morphgen.model.rotation_torch import (
+    matrix_from_quaternion,
+    rotation_from_z,
+    rotvec_from_matrix,
+)
 from morphgen.tasks.ik_channel import IkSolutions
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
@@ -144,7 +148,7 @@ class KinematicChannels:
             else None
         )
         if self._tree is not None:
-            self._R_joint_canonical = _rotation_from_z(self._tree.joints.axis)[index]
+            self._R_joint_canonical = rotation_from_z(self._tree.joints.axis)[index]
             self._ancestors = tables.ancestors[index]
             tokens = tables.tokens[index]
             self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
@@ -351,23 +355,6 @@ def _rotation_error(goals: ToolTargets, T_root_tool: torch.Tensor) -> torch.Tens
     assert goals.has_rotation is not None
     R_error = goals.rotations @ T_root_tool[:, :3, :3].transpose(1, 2)
     return rotvec_from_matrix(R_error) * goals.has_rotation[:, None]
-
-
-def _rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
-    """Return the smallest rotations that turn z into unit vectors (..., 3), shape (..., 3, 3).
-
-    For the opposite of z it is half a turn about x.
-    """
-    z = torch.zeros_like(axes)
-    z[..., 2] = 1
-    cross, cosine = torch.linalg.cross(z, axes), axes[..., 2]
-    K = skew(cross)
-    opposite = cosine < -1 + 1e-6
-    factor = 1 / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
-    eye = torch.eye(3, device=axes.device)
-    R = eye + K + K @ K * factor[..., None, None]
-    half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], device=axes.device))
-    return torch.where(opposite[..., None, None], half_turn, R)
 
 
 def _half_extents(geometry: torch.Tensor) -> torch.Tensor:

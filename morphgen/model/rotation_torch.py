@@ -38,6 +38,23 @@ def skew(v: torch.Tensor) -> torch.Tensor:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
 
 
+def rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
+    """Return the smallest rotations that turn z into unit vectors (..., 3), shape (..., 3, 3).
+
+    For the opposite of z it is half a turn about x.
+    """
+    z = torch.zeros_like(axes)
+    z[..., 2] = 1
+    cross, cosine = torch.linalg.cross(z, axes), axes[..., 2]
+    K = skew(cross)
+    opposite = cosine < -1 + 1e-6
+    factor = 1 / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
+    eye = torch.eye(3, device=axes.device)
+    R = eye + K + K @ K * factor[..., None, None]
+    half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], device=axes.device))
+    return torch.where(opposite[..., None, None], half_turn, R)
+
+
 def angle_between(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
     """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad].
 

@@ -4,11 +4,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from morphgen.model import rotation
+from morphgen.model.rotation_torch import rotation_from_z
 
 ANGLES = st.floats(-math.pi, math.pi, allow_nan=False)
 RPY = st.tuples(ANGLES, st.floats(-math.pi / 2, math.pi / 2), ANGLES)
@@ -55,3 +57,15 @@ def test_quaternions_round_trip_through_matrices(rpy):
 def test_a_zero_quaternion_is_an_error():
     with pytest.raises(ValueError, match="invalid rotation quaternion"):
         rotation.normalize((0.0, 0.0, 0.0, 0.0))
+
+
+def test_the_smallest_rotation_from_z_maps_z_to_any_axis():
+    axes = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    axes = torch.cat([axes / axes.norm(dim=1, keepdim=True), torch.eye(3), -torch.eye(3)])
+    R = rotation_from_z(axes)
+    torch.testing.assert_close(R[..., 2], axes, atol=1e-5, rtol=0)
+    torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).expand_as(R), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(len(R)), atol=1e-5, rtol=0)
+    # It is the smallest: its angle is that between z and the axis.
+    cosine = (R.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
+    torch.testing.assert_close(cosine, axes[:, 2], atol=1e-5, rtol=0)
