@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.baselines import BASELINES, ZERO_SHOT, policies_for
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
@@ -25,10 +26,6 @@ FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Frames per second, so that videos run in real time: 25."""
 
 
-ZERO_SHOT_FILE = Path(__file__).resolve().parent / "checkpoints" / "reach.pt"
-"""Checkpoint of the policy ``ZERO_SHOT``."""
-
-
 def require_policy(name: str, task: str) -> None:
     """Require that a controller exists for a task.
 
@@ -38,8 +35,7 @@ def require_policy(name: str, task: str) -> None:
     valid = policies_for(task)
     if name in valid:
         return
-    if name == ZERO_SHOT or name in BASELINES:
-        tasks = ("reach",) if name == ZERO_SHOT else BASELINES[name].tasks or ()
+    if tasks := tasks_of(name):
         raise TaskError(
             f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
             f"valid: {', '.join(valid)}"
@@ -141,9 +137,8 @@ def play(
 
 def _checkpoint(policy: str) -> Path | None:
     """Return the checkpoint or run folder that a policy's name means; None for a baseline."""
-    if policy == ZERO_SHOT:
-        return ZERO_SHOT_FILE
-    return Path(policy) if policy not in BASELINES and Path(policy).exists() else None
+    path = checkpoint_path(policy)
+    return path if policy not in BASELINES and path.exists() else None
 
 
 def _shown(env: TaskEnv) -> Iterator[Frame]:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from morphgen.errors import TaskError
-from morphgen.rl.baselines import ZERO_SHOT
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints
 from morphgen.rl.intervals import Interval, wilson_interval
-from morphgen.rl.play import ZERO_SHOT_FILE
 from morphgen.rl.robot_source import RobotSource
+from morphgen.rl.shipped_policies import ZERO_SHOT, name_of
 
 COMPARED = ("jacobian", "ik", "random")
 """Controllers that the policy is compared with."""
@@ -40,7 +39,7 @@ def zero_shot(
     source: RobotSource,
     config: EvalConfig,
     *,
-    policy: Path = ZERO_SHOT_FILE,
+    policy: Path = ZERO_SHOT.file,
     progress: Progress = lambda name, done, total: None,
 ) -> list[ZeroShotResult]:
     """Run a policy, and the controllers of ``COMPARED``, on a robot that reaches.
@@ -59,7 +58,7 @@ def zero_shot(
     """
     if source.task != "reach":
         raise TaskError(f"{source.name}: task {source.task}; expected a robot at reach")
-    name = ZERO_SHOT if policy == ZERO_SHOT_FILE else str(policy)
+    name = name_of(policy)
     (score,) = evaluate_checkpoints(
         [policy],
         source,

@@ -12,7 +12,8 @@ import viser
 from morphgen.benchmark.split_file import split_names
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.robot_source import is_set_folder
-from morphgen.rl.baselines import BASELINES, ZERO_SHOT, baselines_for, policies_for
+from morphgen.rl.baselines import baselines_for
+from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer.address import Address, parse_count
 from morphgen.viewer.robot_rows import folder_rows, split_rows
@@ -109,7 +110,7 @@ def complete_address(session: Session) -> Robots:
     An address without a task gets the task and the obstacles of the training.
     """
     policy = session.address.state.get("policy", "")
-    if not policy or policy == ZERO_SHOT or policy in BASELINES:
+    if not policy or is_named(policy):
         return []
     task, obstacles, robots = training_robots(policy, session.files)
     if not session.address.subject:
@@ -230,8 +231,7 @@ def _use_robot(controls: RolloutControls, action: str) -> None:
 def _change_task(controls: RolloutControls) -> None:
     """Start another task, with its own baseline if the current one is for the other task."""
     config = replace(controls.config, task=controls.handles["task"].value)
-    named = config.policy in BASELINES or config.policy == ZERO_SHOT
-    if named and config.policy not in policies_for(config.task):
+    if is_named(config.policy) and config.policy not in policies_for(config.task):
         config = replace(config, policy=baselines_for(config.task)[0])
     controls.handles["policy"].options = _policies(controls.session.files, config)
     controls.handles["policy"].value = config.policy

@@ -16,7 +16,7 @@ from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.rl.baselines import BASELINES, ZERO_SHOT, policies_for
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.drawn_robots import FILE, read_drawn
 from morphgen.rl.play import (
     interface_of,
@@ -27,6 +27,7 @@ from morphgen.rl.play import (
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS, installed_simulators
@@ -176,7 +177,7 @@ def resolve_policy(policy: str, task: str, files: FileAccess) -> str:
         TaskError: If the policy is unknown, or is for another task.
         UriError: If it is a file that may not be read.
     """
-    if policy not in BASELINES and policy != ZERO_SHOT:
+    if not is_named(policy):
         return str(_checkpoint_path(policy, policies_for(task), files))
     require_policy(policy, task)
     return policy

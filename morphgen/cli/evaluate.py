@@ -22,6 +22,7 @@ from morphgen.cli.training_robots import (
 )
 from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
 from morphgen.tasks.registry import default_simulator
 
 if TYPE_CHECKING:
@@ -36,7 +37,9 @@ if TYPE_CHECKING:
     "eval",
     "score a trained policy or a baseline on each robot",
     option(
-        "checkpoint", help=f"a checkpoint or a run folder; or a baseline: {', '.join(BASELINES)}"
+        "checkpoint",
+        help="a checkpoint, a run folder, a policy that comes with morphgen "
+        f"({', '.join(POLICIES)}), or a baseline ({', '.join(BASELINES)})",
     ),
     split_option("robots of a baseline, or other robots than the checkpoint's"),
     option("--on", choices=SIDES, help="side of the split (default: both)"),
@@ -67,6 +70,7 @@ if TYPE_CHECKING:
     examples=(
         "eval runs/interpolation/arm3/reach/me-tf/seed0 --on test",
         "eval ik --split interpolation/arm3/reach",
+        "eval zero-shot --split extrapolation/arms/reach --on test",
     ),
 )
 def evaluate(args: argparse.Namespace) -> None:
@@ -138,7 +142,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
 
     require_split_for_options(args)
     require_device(args.device)
-    path = Path(args.checkpoint)
+    path = checkpoint_path(args.checkpoint)
     files = list(checkpoint_files(path))
     for file in files:
         run, learner = read_checkpoint(file)

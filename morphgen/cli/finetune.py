@@ -18,6 +18,7 @@ from morphgen.cli.training_robots import (
     split_option,
 )
 from morphgen.errors import TaskError
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
 
 if TYPE_CHECKING:
     from morphgen.rl.runs import RunConfig
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 @command(
     "finetune",
     "train a policy further, by default on the test robots of its split",
-    option("checkpoint", type=Path, help="a checkpoint, or a run folder"),
+    option("checkpoint", help=f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
     split_option("other robots than those of the checkpoint's split"),
     option("--on", choices=SIDES, default="test", help="side of the split"),
     opt.OBSTACLES,
@@ -58,12 +59,14 @@ def finetune(args: argparse.Namespace) -> None:
     from morphgen.rl.training import checkpoint_files
 
     require_split_for_options(args)
-    files = list(checkpoint_files(args.checkpoint))
+    files = list(checkpoint_files(checkpoint_path(args.checkpoint)))
     if len(files) > 1:
         raise TaskError(
             f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
         )
-    folder = args.out or files[0].parent / "finetuned" / f"{args.on}-seed{args.seed}"
+    shipped = args.checkpoint in POLICIES
+    parent = Path("runs") / args.checkpoint if shipped else files[0].parent
+    folder = args.out or parent / "finetuned" / f"{args.on}-seed{args.seed}"
     run_training(folder, _finetuning_config(files[0], args), args)
 
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
 from morphgen.cli.progress import bar, print_line, status
-from morphgen.rl.baselines import BASELINES, ZERO_SHOT
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.shipped_policies import POLICIES
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ OBSTACLES = flag("--obstacles", "place the robot among obstacles")
 
 
 def _policy(text: str) -> str:
-    names = (*BASELINES, ZERO_SHOT)
+    names = (*BASELINES, *POLICIES)
     if text not in names and not Path(text).exists():
         raise argparse.ArgumentTypeError(
             f"unknown policy {text!r}: expected one of {', '.join(names)}, or a path"
@@ -44,7 +45,8 @@ def _policy(text: str) -> str:
         metavar="POLICY",
         help="the controller: zero (no action), random, jacobian (each joint along its own "
         "Jacobian column, for reach), ik (inverse kinematics, for reach), scripted (for push), "
-        "zero-shot (the policy for reach that comes with morphgen); or a checkpoint or run folder",
+        "zero-shot and zero-shot-obstacles (policies for reach that come with morphgen); or a "
+        "checkpoint or run folder",
     ),
     path_option("--out", "FILE", "the video: .mp4 or .gif"),
     opt.sim_option(),

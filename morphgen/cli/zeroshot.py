@@ -26,6 +26,7 @@ FILM_EPISODES = 3
     opt.ROBOT,
     path_option("--policy", "CHECKPOINT", "another policy: a checkpoint, or a run folder"),
     number("--episodes", "number of episodes", default=20),
+    opt.OBSTACLES,
     opt.SEED,
     opt.sim_option("mujoco"),
     opt.WORKERS,
@@ -39,16 +40,18 @@ FILM_EPISODES = 3
 def zeroshot(args: argparse.Namespace) -> None:
     """Run the episodes, print the table, and write the video."""
     from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.play import ZERO_SHOT_FILE
     from morphgen.rl.robot_source import robot_source
+    from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
     from morphgen.rl.zeroshot import zero_shot
     from morphgen.tasks.renderer import require_video_path
 
     if args.out is not None:
         require_video_path(args.out)
-    policy = args.policy or ZERO_SHOT_FILE
+    policy = checkpoint_path(args.policy or zero_shot_policy(obstacles=args.obstacles).name)
     with status(args, "reading the robot"):
-        source = robot_source(" ".join(args.words), "reach", library=tuple(args.library))
+        source = robot_source(
+            " ".join(args.words), "reach", obstacles=args.obstacles, library=tuple(args.library)
+        )
     config = EvalConfig(args.episodes, args.sim or "mujoco", args.seed, args.workers)
     with bar(args, "running the episodes") as progress:
         results = zero_shot(
@@ -89,6 +92,7 @@ def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
         "reach",
         source.name,
         sim=args.sim or "mujoco",
+        obstacles=args.obstacles,
         layouts="eval",
         kind=interface.kind,
         observe=interface.channels,

@@ -61,12 +61,3 @@ BASELINES: Registry[Baseline] = Registry(
 def baselines_for(task: str) -> tuple[str, ...]:
     """Return the names of a task's baselines; one that solves the task comes first."""
     return tuple(name for name in reversed(tuple(BASELINES)) if BASELINES[name].suits((task,)))
-
-
-ZERO_SHOT = "zero-shot"
-"""Name of the policy for reach that comes with morphgen; it acts on any robot."""
-
-
-def policies_for(task: str) -> tuple[str, ...]:
-    """Return the names of a task's baselines, and of the policy that comes with morphgen."""
-    return (*baselines_for(task), *((ZERO_SHOT,) if task == "reach" else ()))

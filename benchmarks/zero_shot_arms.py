@@ -1,0 +1,91 @@
+"""Success of a policy on every arm of the library with a stick, beside jacobian, ik and random.
+
+    python benchmarks/zero_shot_arms.py [--policy CHECKPOINT] [--obstacles] [--episodes 50]
+        [--only ur] [--seed 0] [--jobs 2] [--json rows.json]
+
+The arms are those in use: not the templates of which robots are drawn for training, not the Panda
+with other sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in
+MuJoCo. A cell is the success rate with its 95% Wilson interval. The last rows are the mean over the
+arms, and the number of arms below 80%.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import mean
+
+import torch
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.grammar.library import default_library
+from morphgen.processes import parallel_map
+from morphgen.rl.evaluation import EvalConfig
+from morphgen.rl.robot_source import robot_source
+from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
+from morphgen.rl.zeroshot import ZeroShotResult, zero_shot
+
+LEFT_OUT = ("arm3", "arm5", "arm_ed", "panda_scaled", "yumi")
+ENOUGH = 0.8
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """Measurement of one arm, as worker processes run it."""
+
+    policy: Path
+    obstacles: bool
+    episodes: int
+    seed: int
+
+    def __call__(self, arm: str) -> tuple[str, list[ZeroShotResult]]:
+        """Run the episodes of one arm."""
+        torch.set_num_threads(1)
+        source = robot_source(f"arm={arm} ee=stick", "reach", obstacles=self.obstacles)
+        config = EvalConfig(self.episodes, "mujoco", self.seed)
+        return arm, zero_shot(source, config, policy=self.policy)
+
+
+def main() -> None:
+    """Measure all arms and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--policy", help="a checkpoint, or a policy that comes with morphgen")
+    parser.add_argument("--obstacles", action="store_true")
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--only", default="", help="arms whose name matches this expression")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    args = parser.parse_args()
+    arms = [
+        manifest.name
+        for manifest in default_library().manifests()
+        if manifest.kind == "arm"
+        and manifest.name not in LEFT_OUT
+        and re.search(args.only, manifest.name)
+    ]
+    policy = checkpoint_path(args.policy or zero_shot_policy(obstacles=args.obstacles).name)
+    work = Measuring(policy, args.obstacles, args.episodes, args.seed)
+    measured = dict(tqdm(parallel_map(work, arms, args.jobs, chunk=1), total=len(arms), unit="arm"))
+    if args.json:
+        rows = {arm: [asdict(result) for result in results] for arm, results in measured.items()}
+        args.json.write_text(json.dumps(rows, indent=2) + "\n")
+    names = [result.controller for result in measured[arms[0]]]
+    rates = list(zip(*([r.success.value for r in measured[arm]] for arm in arms), strict=True))
+    table: list[list[str]] = [[arm, *map(_cell, measured[arm])] for arm in arms]
+    table.append(["mean", *(f"{mean(rate):.1%}" for rate in rates)])
+    table.append(["below 80%", *(str(sum(x < ENOUGH for x in rate)) for rate in rates)])
+    print(tabulate(table, headers=["arm", *names]))
+
+
+def _cell(result: ZeroShotResult) -> str:
+    success = result.success
+    return f"{success.value:.0%} ({success.low:.0%} to {success.high:.0%})"
+
+
+if __name__ == "__main__":
+    main()
