@@ -10,7 +10,7 @@ from morphgen.model.inverse_kinematics_torch import solve_pose_ik, solve_positio
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
 
-STARTS = 8
+STARTS = 32
 """Number of start configurations of a solution."""
 ITERATIONS = 25
 """Iterations of damped least squares."""

@@ -118,7 +118,7 @@ def test_goals_that_are_poses_are_solved_with_their_orientation(tmp_path):
     wanted = batch.groups.tool_targets(batch.simulation.block_pose).rotations
     trace = (wanted * T_root_tool[:, :3, :3]).sum(dim=(1, 2))
     angle = torch.arccos(((trace - 1) / 2).clamp(-1, 1))
-    # From eight starts most poses are found, not all.
+    # Most poses are found, not all.
     assert (near & (angle < 0.05)).float().mean() >= 0.8
 
 
