@@ -76,15 +76,12 @@ def main() -> None:
         args.json.write_text(json.dumps(rows, indent=2) + "\n")
     names = [result.controller for result in measured[arms[0]]]
     rates = list(zip(*([r.success.value for r in measured[arm]] for arm in arms), strict=True))
-    table: list[list[str]] = [[arm, *map(_cell, measured[arm])] for arm in arms]
+    table: list[list[str]] = [
+        [arm, *(result.success.as_percent() for result in measured[arm])] for arm in arms
+    ]
     table.append(["mean", *(f"{mean(rate):.1%}" for rate in rates)])
     table.append(["below 80%", *(str(sum(x < ENOUGH for x in rate)) for rate in rates)])
     print(tabulate(table, headers=["arm", *names]))
-
-
-def _cell(result: ZeroShotResult) -> str:
-    success = result.success
-    return f"{success.value:.0%} ({success.low:.0%} to {success.high:.0%})"
 
 
 if __name__ == "__main__":

@@ -29,6 +29,10 @@ class Interval:
     low: float
     high: float
 
+    def as_percent(self) -> str:
+        """Return a rate as text, such as ``85% (64% to 95%)``."""
+        return f"{self.value:.0%} ({self.low:.0%} to {self.high:.0%})"
+
 
 def mean_interval(samples: ArrayLike) -> Interval:
     """Return the mean of independent samples, shape (k,).

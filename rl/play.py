@@ -71,8 +71,8 @@ def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
     """Return a controller by its name.
 
     Args:
-        name: Name of a baseline; or the path of a checkpoint or of a run's folder, whose policy
-            acts by the mean of its actions.
+        name: Name of a baseline or a shipped policy; or the path of a checkpoint or of a run's
+            folder, whose policy acts by the mean of its actions.
         env: Environment that the controller acts in.
         seed: Seed of random numbers.
 

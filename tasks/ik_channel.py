@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from morphgen.model.inverse_kinematics_torch import solve_pose_ik, solve_position_ik
+from morphgen.model.inverse_kinematics_torch import solve_from_starts
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
 
@@ -14,10 +14,6 @@ STARTS = 32
 """Number of start configurations of a solution."""
 ITERATIONS = 25
 """Iterations of damped least squares."""
-DAMPING = 0.05
-"""Damping of the least squares [joint units per metre]."""
-MAX_STEP = 0.5
-"""Largest change of a joint in one iteration [rad or m]."""
 SOLVED = 0.005
 """Distance of tool and target that counts as a solution [m]."""
 MOVED = 0.01
@@ -76,8 +72,9 @@ class IkSolutions:
         """
         points = goals.points[:, 0]
         moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
-        self.q[~goals.exists[:, 0]] = targets[~goals.exists[:, 0]]
-        rows = torch.nonzero(moved & goals.exists[:, 0])[:, 0]
+        exists = goals.exists[:, 0]
+        self.q = torch.where(exists[:, None], self.q, targets)
+        rows = torch.nonzero(moved & exists)[:, 0]
         if not len(rows):
             return
         self._solved_for[rows] = points[rows]
@@ -101,35 +98,18 @@ class IkSolutions:
         now, lower, upper = targets[rows], self._lower[rows], self._upper[rows]
         random = lower + (upper - lower) * self._fractions[:, None]
         starts = torch.cat([now[None], torch.where(self._moves_tool[rows], random, now)])
-        many = rows.repeat(STARTS)
-        limits = self._lower[many], self._upper[many]
-        chain, robots = self._tables.tool_chain, self._index[many]
-        if rotations is None:
-            q, error = solve_position_ik(
-                chain,
-                robots,
-                starts.flatten(0, 1),
-                points[many],
-                limits,
-                iterations=ITERATIONS,
-                damping=DAMPING,
-                max_step=MAX_STEP,
-            )
-        else:
-            q, error = solve_pose_ik(
-                chain,
-                robots,
-                starts.flatten(0, 1),
-                points[many],
-                rotations[many],
-                limits,
-                rotation_weight=metres_per_radian,
-                iterations=ITERATIONS,
-                damping=DAMPING,
-                max_step=MAX_STEP,
-            )
-        q = self._nearest_turn(q.view_as(starts), now, rows)
-        distance = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
+        q, error = solve_from_starts(
+            self._tables.tool_chain,
+            self._index[rows],
+            starts,
+            points[rows],
+            None if rotations is None else rotations[rows],
+            (lower, upper),
+            rotation_weight=metres_per_radian,
+            iterations=ITERATIONS,
+        )
+        q = self._nearest_turn(q, now, rows)
+        distance = torch.linalg.vector_norm(error, dim=2)
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
         best = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance)).argmin(dim=0)
         column = torch.arange(len(rows), device=rows.device)

@@ -1,4 +1,4 @@
-"""Where tasks want the tool, for observations and baselines."""
+"""Target points and orientations of a robot's tool, for observations and baselines."""
 
 from __future__ import annotations
 

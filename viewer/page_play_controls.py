@@ -199,7 +199,7 @@ def _split_robots(split: str, files: FileAccess) -> Robots:
 
 
 def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
-    """Return the task's baselines, the checkpoints in this folder, and the current policy."""
+    """Return the task's baselines and shipped policies, and the checkpoints in this folder."""
     names = (*policies_for(config.task), *list_checkpoints(files), config.policy)
     return tuple(dict.fromkeys(names))
 

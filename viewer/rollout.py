@@ -18,12 +18,7 @@ from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.drawn_robots import FILE, read_drawn
-from morphgen.rl.play import (
-    interface_of,
-    make_controller,
-    require_policy,
-    task_config_of,
-)
+from morphgen.rl.play import interface_of, make_controller, require_policy, task_config_of
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import Interface, read_checkpoint

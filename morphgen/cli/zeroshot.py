@@ -73,7 +73,7 @@ def _table(results: list[ZeroShotResult]) -> str:
     rows = [
         (
             result.controller,
-            f"{result.success.value:.0%} ({result.success.low:.0%} to {result.success.high:.0%})",
+            result.success.as_percent(),
             f"{result.distance:.3f}",
             f"{result.score:.1f}",
         )

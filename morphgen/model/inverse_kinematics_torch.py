@@ -16,6 +16,10 @@ from morphgen.model.rotation_torch import rotvec_from_matrix
 
 ROTATION_DAMPING = 0.1
 """Damping of rotations [joint units per radian]."""
+START_DAMPING = 0.05
+"""Damping of ``solve_from_starts`` [joint units per metre]: more than of paths that start near."""
+START_MAX_STEP = 0.5
+"""Largest change of a joint in one iteration of ``solve_from_starts`` [rad or m]."""
 
 _ROTATION_SHARES = (0.25, 0.5, 0.75, 1.0)
 """Fractions of a rotation step that are compared with the rotation budget."""
@@ -134,6 +138,57 @@ def solve_pose_ik(
         return pose_task(T_root_tool, J_root_tool, positions, rotations, rotation_weight)
 
     return _solve(task, q, limits, iterations, damping, max_step)
+
+
+def solve_from_starts(
+    chain: FrameChain,
+    robot_index: torch.Tensor,
+    starts: torch.Tensor,
+    positions: torch.Tensor,
+    rotations: torch.Tensor | None,
+    limits: tuple[torch.Tensor, torch.Tensor],
+    *,
+    rotation_weight: float,
+    iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Move tools to positions or poses from several starts each; see ``solve_position_ik``.
+
+    Args:
+        chain: Compiled robots.
+        robot_index: Compiled robot of each goal, shape (n,), int64.
+        starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
+        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+        rotations: Goal rotations, shape (n, 3, 3); None if only positions matter.
+        limits: Lower and upper joint limits, each (n, J) [rad or m].
+        rotation_weight: Weight of the rotation errors [m/rad].
+        iterations: Number of iterations.
+
+    Returns:
+        Configurations, shape (S, n, J), and the remaining errors, shape (S, n, 3) or, for poses as
+        of ``pose_task``, (S, n, 6) [m].
+    """
+    count = len(starts)
+    robots, q = robot_index.repeat(count), starts.flatten(0, 1)
+    goals = positions.repeat(count, 1)
+    all_limits = limits[0].repeat(count, 1), limits[1].repeat(count, 1)
+    constants = {"damping": START_DAMPING, "max_step": START_MAX_STEP}
+    if rotations is None:
+        q, error = solve_position_ik(
+            chain, robots, q, goals, all_limits, iterations=iterations, **constants
+        )
+    else:
+        q, error = solve_pose_ik(
+            chain,
+            robots,
+            q,
+            goals,
+            rotations.repeat(count, 1, 1),
+            all_limits,
+            rotation_weight=rotation_weight,
+            iterations=iterations,
+            **constants,
+        )
+    return q.view_as(starts), error.view(count, len(positions), -1)
 
 
 def pose_ik_step(

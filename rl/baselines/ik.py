@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from morphgen.model.inverse_kinematics_torch import solve_pose_ik, solve_position_ik
+from morphgen.model.inverse_kinematics_torch import solve_from_starts
 from morphgen.rl.baselines.path_planner import (
     Path,
     PathFollower,
@@ -31,11 +31,6 @@ TREE_ITERATIONS = 200
 """Number of random configurations of a tree, grown if inverse kinematics has no solution."""
 ITERATIONS = 60
 """Iterations of inverse kinematics."""
-DAMPING = 0.05
-"""Damping of the least squares [joint units per metre]; a radian counts as the goal's
-``metres_per_radian``."""
-MAX_STEP = 0.5
-"""Largest change of a joint in one iteration [rad or m]."""
 CLOSE = 0.003
 """Distance of tool and goal that counts as solved [m]; angles count as above."""
 
@@ -146,35 +141,19 @@ def _solve_ik(
     The distance from a goal that is a pose is the larger one of position and rotation.
     """
     tables, goals = task.robot_tables, reach_goals(task)
-    rows = task.env_robot_index[envs].repeat(len(starts))
-    limits = tables.lower[rows], tables.upper[rows]
-    positions = goals.positions[envs].repeat(len(starts), 1)
-    if goals.rotations is None:
-        q, error = solve_position_ik(
-            tables.tool_chain,
-            rows,
-            starts.flatten(0, 1),
-            positions,
-            limits,
-            iterations=ITERATIONS,
-            damping=DAMPING,
-            max_step=MAX_STEP,
-        )
-    else:
-        q, error = solve_pose_ik(
-            tables.tool_chain,
-            rows,
-            starts.flatten(0, 1),
-            positions,
-            goals.rotations[envs].repeat(len(starts), 1, 1),
-            limits,
-            rotation_weight=goals.metres_per_radian,
-            iterations=ITERATIONS,
-            damping=DAMPING,
-            max_step=MAX_STEP,
-        )
-    norms = torch.linalg.vector_norm(error.view(len(rows), -1, 3), dim=2)
-    return q.view_as(starts), norms.amax(dim=1).view(len(starts), -1)
+    robots = task.env_robot_index[envs]
+    q, error = solve_from_starts(
+        tables.tool_chain,
+        robots,
+        starts,
+        goals.positions[envs],
+        None if goals.rotations is None else goals.rotations[envs],
+        (tables.lower[robots], tables.upper[robots]),
+        rotation_weight=goals.metres_per_radian,
+        iterations=ITERATIONS,
+    )
+    norms = torch.linalg.vector_norm(error.view(*error.shape[:2], -1, 3), dim=3)
+    return q, norms.amax(dim=2)
 
 
 def random_starts(task: TaskBatch, envs: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
