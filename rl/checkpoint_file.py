@@ -97,7 +97,7 @@ def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
             f"{file} is damaged: its content does not have the hash that was stored with it; use "
             "another copy"
         )
-    return {key: _copied(value) for key, value in data.items()}, digest is not None
+    return {key: in_main_memory(value) for key, value in data.items()}, digest is not None
 
 
 @cache
@@ -227,12 +227,12 @@ def _add(digest: hashlib._Hash, value: object) -> None:
         digest.update(f"{type(value).__name__}{value};".encode())
 
 
-def _copied(value: object) -> object:
-    """Return a copy of a content whose tensors no longer need the file."""
+def in_main_memory(value: object) -> object:
+    """Return a copy of a content whose tensors are in main memory and need no file or GPU."""
     if isinstance(value, torch.Tensor):
-        return value.detach().clone()
+        return value.detach().to("cpu", copy=True)
     if isinstance(value, dict):
-        return {key: _copied(each) for key, each in value.items()}
+        return {key: in_main_memory(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(_copied(each) for each in value)
+        return type(value)(in_main_memory(each) for each in value)
     return value

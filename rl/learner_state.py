@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from torch import nn
 
 from morphgen.errors import TaskError
+from morphgen.rl.checkpoint_file import in_main_memory
 from morphgen.rl.config import PPOConfig, policy_from
 from morphgen.rl.observation_layout import last_link, layout_from, layout_of, require_layout
 from morphgen.rl.ppo import Learner
@@ -23,9 +23,10 @@ def state_of(learner: Learner) -> dict[str, Any]:
     new episodes, and equals one that continued only if that one calls ``restart_episodes`` when the
     state is saved.
     """
-    weights = {name: net.state_dict() for name, net in _networks(learner).items()}
+    states = {name: net.state_dict() for name, net in _networks(learner).items()}
+    states["optimiser"] = learner.optimiser.state_dict()
     return {
-        **copy.deepcopy({**weights, "optimiser": learner.optimiser.state_dict()}),
+        **{name: in_main_memory(state) for name, state in states.items()},
         "generators": {name: each.get_state() for name, each in learner.generators.items()},
         "batch": learner.batch.state_dict(),
         "actor_lr_scale": learner.actor_lr_scale,

@@ -3,10 +3,12 @@
 import copy
 
 import pytest
+import torch
 
 from helpers.learners import equal, learner, stored, untimed, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
+from morphgen.rl.checkpoint_file import packed
 from morphgen.rl.learner_state import load_networks, resume, state_of
 
 
@@ -38,6 +40,21 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
     for one, other in zip(reports, same, strict=True):
         assert untimed(one) == untimed(other)
     assert went_on.batch.state_dict() == again.batch.state_dict()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_run_on_a_gpu_is_written_and_resumed():
+    options = {"device": "cuda", "learning_rate": 3e-3}
+    went_on = learner(**options)
+    went_on.iterate(), went_on.iterate()
+    packed(state_of(went_on), "checkpoint.pt")  # refuses tensors outside main memory
+    checkpoint = stored(state_of(went_on))
+    went_on.restart_episodes()
+    report = went_on.iterate()
+
+    again = learner(OnALine(8, seed=99), seed=77, **options)
+    resume(again, checkpoint)
+    assert again.iterate().value_loss == pytest.approx(report.value_loss, rel=1e-4)
 
 
 @pytest.mark.slow
