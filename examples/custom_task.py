@@ -2,13 +2,10 @@
 
 The script registers the task and runs the command line, so that every command knows the task:
 
-    python examples/custom_task.py train ur5-stick task=follow --agent se --sim mujoco --steps 2e5
-    python examples/custom_task.py eval runs/ur5-stick-follow/se/seed0
-    python examples/custom_task.py play follow ur5-stick --policy runs/ur5-stick-follow/se/seed0
+    python examples/custom_task.py train ur5-stick task=follow --sim mujoco --steps 2e5 --out runs/1
+    python examples/custom_task.py eval runs/1
+    python examples/custom_task.py play follow ur5-stick --policy runs/1 --sim mujoco --out 1.mp4
     python examples/custom_task.py view
-
-Worker processes do not run the script. A package declares its tasks as entry points of the group
-``morphgen.tasks`` instead, which all processes know.
 """
 
 import sys
@@ -33,7 +30,6 @@ class FollowConfig:
     """Constants of the task."""
 
     task: ClassVar[str] = "follow"
-
     max_episode_steps: int = 200
     """Duration of an episode [control steps]."""
     num_goals: int = 20
@@ -108,6 +104,10 @@ class FollowEnvs(TaskEnvs):
         """Return the goal, in the field that policies know from reach."""
         return {"goal": self.goal, "time": self.time[:, None]}
 
+    def target_points(self, block_pose):
+        """Return the goal's position, for the kinematic channels of observations."""
+        return self.goal[:, None, :3]
+
     def marker_poses(self, row):
         """Return the pose of the goal."""
         return {"goal": self.goal[row].cpu().numpy()}
@@ -121,16 +121,16 @@ class Follow(Task):
 
     def sample(self, robot, config, *, obstacles, ground, seeds, identity):
         """Sample free configurations."""
-        space = FreeSpace(Scene(robot, ground=ground))
-        q, tried = space.sample(config.num_goals, np.random.default_rng(seeds))
+        space, rng = FreeSpace(Scene(robot, ground=ground)), np.random.default_rng(seeds)
+        q, tried = space.sample(config.num_goals, rng)
         poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(q), 1))
         poses[:, :3] = frame_pose(robot, q)[:, :3, 3]
         return FollowSet(q=q, goal_poses=poses, tried=tried, accepted=len(q), **identity)
 
     def certify(self, goals, robot, scene):
         """Test that the starts are free of collisions."""
-        free = FreeSpace(scene).free(goals.q)
-        return [f"goal {i}: its configuration is in collision" for i in np.flatnonzero(~free)]
+        hits = np.flatnonzero(~FreeSpace(scene).free(goals.q))
+        return [f"goal {i}: its configuration is in collision" for i in hits]
 
     def make_envs(self, specs, spec, num_joints):
         """Make the environments of a batch."""

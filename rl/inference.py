@@ -19,8 +19,10 @@ from morphgen.rl.observation_layout import (
 )
 from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.observation import Observation
+from morphgen.tasks.make import BatchOptions
+from morphgen.tasks.observation import Observation, observation_config
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
@@ -30,10 +32,11 @@ MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
 class Policy:
     """A trained policy, from observations to actions.
 
-    It needs no environment::
+    Its observations are those of environments that are made with its ``batch_options``::
 
-        policy = load_policy("runs/interpolation/arm3/reach/me-tf/seed0")
-        actions = policy.act(observation)
+        policy = load_policy("zero-shot")
+        batch = make_batch("reach", ["arm=ur5 ee=stick"], 4, **policy.batch_options)
+        actions = policy.act(batch.reset())
     """
 
     def __init__(self, learner: dict[str, Any], mode: Mode, seed: int, device: str = "cpu") -> None:
@@ -57,6 +60,21 @@ class Policy:
         self._actor = actor.to(self._device).eval()
         self._deterministic = mode == "deterministic"
         self._generator = torch.Generator(self._device).manual_seed(seed)
+
+    @property
+    def batch_options(self) -> BatchOptions:
+        """Arguments of ``make_batch`` for environments with the policy's observations and actions.
+
+        They are continuous or discrete actions, the observation channels, and the number of links
+        that an agent for robots of one size needs.
+        """
+        observe = observation_config(self.config.channels, obstacles=self.layout.obstacles)
+        any_size = AGENTS[self.config.agent].any_size
+        return {
+            "kind": self.config.kind,
+            "observe": replace(observe, tool=observe.tool or self.layout.tool),
+            "max_links": None if any_size else self.layout.links,
+        }
 
     def require(self, observation: Observation) -> None:
         """Require that an observation has the layout that the policy was trained with.
@@ -89,12 +107,19 @@ class Policy:
 def load_policy(
     path: Path | str, mode: Mode = "deterministic", seed: int = 0, device: str = "cpu"
 ) -> Policy:
-    """Load the policy of a checkpoint, or of a run's folder. Nothing in the file is executed.
+    """Load a policy. Nothing in its checkpoint is executed.
+
+    Args:
+        path: A checkpoint, the folder of a run, or the name of a shipped policy: ``zero-shot`` or
+            ``zero-shot-obstacles``.
+        mode: Whether the policy acts by the mean of its actions, or samples them.
+        seed: Seed of the samples.
+        device: Device of the network.
 
     Raises:
         TaskError: If the checkpoint is missing, damaged or of another version.
     """
-    return Policy(read_checkpoint(Path(path))[1], mode, seed, device)
+    return Policy(read_checkpoint(checkpoint_path(path))[1], mode, seed, device)
 
 
 class PolicyController:

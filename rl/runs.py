@@ -18,7 +18,7 @@ from morphgen.rl.aliases import current_learner, current_run
 from morphgen.rl.checkpoint_content import require_learner
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
-from morphgen.rl.robot_source import RobotSource, most_obstacles
+from morphgen.rl.robot_source import RobotSource, most_obstacles, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig, observation_config
@@ -194,15 +194,16 @@ def config_from(data: object) -> RunConfig:
     tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
-    for name in TASKS.builtin:
-        if name not in tasks:
-            raise TaskError(f"run: missing key {name!r}")
     for name, values in tasks.items():
         read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
     nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
     values = read_fields(entries, RunConfig, "run", given=nested)
+    source = RobotSource(**read_fields(nested["source"], RobotSource, "run: source"))
+    for name in tasks_of(source):  # not of all tasks: some may be newer than the run
+        if name not in tasks:
+            raise TaskError(f"run: missing key {name!r}")
     return RunConfig(
-        RobotSource(**read_fields(nested["source"], RobotSource, "run: source")),
+        source,
         policy_from(nested["policy"], "run: policy"),
         PPOConfig(**read_fields(nested["ppo"], PPOConfig, "run: ppo")),
         tasks=task_configs(tasks),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from morphgen.benchmark.token_layout import GEOMETRY, SHAPE_POSE
+from morphgen.errors import TaskError
 from morphgen.model.inverse_kinematics_torch import dls_step, pose_task
 from morphgen.model.kinematics_torch import (
     compile_tree,
@@ -258,11 +259,14 @@ class KinematicChannels:
             wanted = torch.stack([goals.exists[:, 0], goals.has_rotation], dim=1)
             error = error * wanted.repeat_interleave(3, dim=1)
             columns.append(self._dls_step(J_task, error, state.targets))
+        columns.append(J[:, :0])  # a task without targets has no columns
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
 
     def _ik(self, state: _State) -> torch.Tensor:
         solutions = self._solutions
         assert solutions is not None
+        if not state.goals.points.shape[1]:
+            raise TaskError("observation channel ik: no task here has target points for the tool")
         solutions.update(state.targets, state.goals, ROTATION_LENGTH)
         change = solutions.q - state.targets
         steps = change * self._per_step

@@ -9,6 +9,8 @@ import pytest
 
 from morphgen.cli import main
 from morphgen.grammar.library import default_library
+from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import episode_bytes, read_episode
@@ -18,7 +20,7 @@ from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
 
 CUSTOM_TASK = Path(__file__).parents[1] / "examples" / "custom_task.py"
-RUN = "runs/planar-cube-follow/se/seed0"
+RUN = "runs/planar-cube-follow/me-graph/seed0"
 
 
 @pytest.fixture
@@ -39,7 +41,7 @@ def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys
     few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")
     robot, sim = "planar-cube", ("--sim", "mujoco")
     monkeypatch.setattr(sys, "argv", ["follow.py"])
-    assert main(["train", robot, "task=follow", "--agent", "se", *sim, *few]) == 0
+    assert main(["train", robot, "task=follow", *sim, *few]) == 0
     watch = f"watch it: python follow.py play follow {robot} --policy {RUN} --sim mujoco"
     assert watch in capsys.readouterr().err
     assert main(["eval", RUN, "--episodes", "1"]) == 0
@@ -63,3 +65,10 @@ def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys
     read = read_episode(tmp_path / "episode.npz", places).tracks[0]
     assert np.array_equal(read.marker_poses["goal"], goals)
     assert record_scene(rollout.episode)
+
+
+def test_files_of_before_a_task_existed_are_read(follow, monkeypatch):
+    monkeypatch.setattr(TASKS, "builtin", (*TASKS.builtin, "follow"))
+    config, _ = read_checkpoint(checkpoint_path("zero-shot"))
+    assert [each.task for each in config.tasks] == ["reach", "push"]
+    assert "follow" in config.as_data()

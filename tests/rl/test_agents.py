@@ -73,11 +73,8 @@ def test_a_policy_acts_on_an_observation_alone(tmp_path):
 
     train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
     policy = load_policy(tmp_path)
-    kind = policy.config.kind
     with closing(
-        make_batch(
-            "reach", ["planar-cube"], 3, sim="mujoco", kind=kind, max_links=policy.layout.links
-        )
+        make_batch("reach", ["planar-cube"], 3, sim="mujoco", **policy.batch_options)
     ) as batch:
         observation = batch.reset()
         actions = policy.act(observation)
@@ -88,3 +85,19 @@ def test_a_policy_acts_on_an_observation_alone(tmp_path):
         batch.step(actions)
     with pytest.raises(TaskError, match="the checkpoint is for other observations"):
         policy.act({**observation, "tokens": observation["tokens"][:, :3]})
+
+
+@pytest.mark.parametrize("name", ["zero-shot", "zero-shot-obstacles"])
+def test_a_shipped_policy_is_loaded_by_its_name(name):
+    from contextlib import closing
+
+    from morphgen.tasks.make import make_batch
+
+    policy = load_policy(name)
+    with closing(
+        make_batch("reach", ["planar-cube"], 2, sim="mujoco", **policy.batch_options)
+    ) as batch:
+        observation = batch.reset()
+        assert policy.act(observation).shape == observation["links"].shape
+    with pytest.raises(TaskError, match="no such checkpoint"):
+        load_policy("zero-shott")

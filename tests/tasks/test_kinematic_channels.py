@@ -21,6 +21,8 @@ from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import CHANNELS, MAX_TREE_DISTANCE, NUM_POINTS, observation_config
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.envs import ReachEnvs
+from morphgen.tasks.task import TaskEnvs
 
 WORDS = ("arm3", "arm=ur5 ee=stick")
 ALL = observation_config((*KINEMATIC_CHANNELS, "tree"))
@@ -134,6 +136,19 @@ def test_the_lag_is_the_distance_of_joints_from_their_targets(moved):
     exists = batch.robot_tables.max_step[index] > 0
     torch.testing.assert_close(observed[exists], lag.clamp(-3, 3)[exists])
     assert observed[exists].abs().max() > 0.5, "the joints lag"
+
+
+def test_tasks_without_target_points_have_no_errors_and_no_way(specs, monkeypatch):
+    monkeypatch.setattr(ReachEnvs, "target_points", TaskEnvs.target_points)
+    observe = observation_config(("lag", "joint", "poses", "jacobian", "dls"))
+    batch = batch_from_specs(specs, len(specs), sim="mujoco", observe=observe)
+    sizes = {name: batch.reset()[name].shape[-1] for name in ("jacobian", "dls", "poses")}
+    batch.close()
+    assert sizes == {"jacobian": 7, "dls": 0, "poses": 12}
+    batch = batch_from_specs(specs, len(specs), sim="mujoco", observe=observation_config(("ik",)))
+    with pytest.raises(TaskError, match="channel ik: no task here has target points"):
+        batch.reset()
+    batch.close()
 
 
 def test_tree_entries_of_a_serial_arm(moved):
