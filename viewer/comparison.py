@@ -25,7 +25,8 @@ from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
 
 FitQuality = dict[str, tuple[float, tuple[Shape, ...]]]
-"""IoU of a link's primitives with the shapes they replace, and the primitives, by link."""
+"""By the name of a link: its primitives, and before them the intersection over union (IoU) of these
+with the shapes that they replace."""
 _RED_TO_GREEN = ((224, 49, 49), (250, 200, 30), (47, 158, 68))
 
 

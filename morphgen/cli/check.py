@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -73,7 +74,9 @@ def _findings(
         return (*check(robot, tool_required=tool_required), *in_files), ()
     robot, repaired = fix(robot)
     findings = check(robot, tool_required=tool_required)
-    write_bundle(robot, bundle_folder(args.fix, robot.name), findings)
+    written = bundle_folder(args.fix, robot.name)
+    write_bundle(robot, written, findings)
+    print(f"written: {written}", file=sys.stderr)
     return findings, repaired
 
 

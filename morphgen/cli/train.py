@@ -42,7 +42,7 @@ SWITCHES = {
     "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
     "mask-morphology": "hide the robot's morphology from the agent (default: off)",
     "tool-position": "add the tool's position to the observations (default: off)",
-    "residual": "add the actions to the way that the channel ik shows (default: off)",
+    "residual": "add the actions to the steps that the channel ik shows (default: off)",
     "normalize": "normalize the kinematic channels of observations (default: off)",
     "robot-advantages": "normalize advantages robot by robot (default: off)",
     "joint-entropy": "weigh the mean entropy of the joints instead of their sum (default: off)",
@@ -61,7 +61,12 @@ def on_off(name: str, help: str, default: bool | None = None) -> Option:
 
 
 def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Option, ...]:
-    """Return the options of all commands that train; without defaults, a preset has them."""
+    """Return the options of all commands that train.
+
+    Args:
+        num_steps: Default of ``--steps``; None if the preset determines it.
+        num_envs: Default of ``--envs``; None if the preset determines it.
+    """
     preset = "" if num_steps else " (default: the preset's)"
     return (
         number(
@@ -274,8 +279,8 @@ def _drawn_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace
 def _max_links(source: RobotSource) -> int:
     """Return the number of links that observations are padded to, unless ``--max-links`` is given.
 
-    It is the split's; or the benchmark's, or that of the one robot if it has more, such as a robot
-    with two arms.
+    For a split it is the split's number. For one robot it is the benchmark's, or the number of the
+    robot's links if these are more, as for a robot with two arms.
     """
     from morphgen.benchmark.split_file import parse_split
     from morphgen.benchmark.token_layout import MAX_LINKS

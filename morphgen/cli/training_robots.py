@@ -152,8 +152,8 @@ def draw_robots(
 
     Returns:
         The source with the hash of its robots, and the number of links that observations are
-        padded to: as many as ``--max-links``, or the benchmark's, or those that the robots or the
-        splits of ``--held-out`` need.
+        padded to: ``--max-links`` if it is given, else the largest of the benchmark's number, those
+        of the splits of ``--held-out`` and the links of the largest robot.
     """
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.token_layout import MAX_LINKS

@@ -16,6 +16,7 @@ from morphgen.model.robot import Joint
 from morphgen.typing import Array
 
 MeshFile = Callable[[Mesh], str]
+"""Function that writes a mesh, or finds it, and returns its path for the document."""
 FLAT = 1e-5
 """Extent below which a collision hull counts as flat [m]; MuJoCo refuses flat hulls."""
 FLAT_THICKNESS = 1e-4
@@ -23,7 +24,11 @@ FLAT_THICKNESS = 1e-4
 
 
 class Meshes:
-    """Mesh assets of a document, in order of first use."""
+    """Mesh assets of a document, in order of first use.
+
+    With a ``MeshFile`` the document names files (``write``). Without one, the compiled model gets
+    the triangles themselves (``add_to``).
+    """
 
     def __init__(self, mesh_file: MeshFile | None) -> None:
         self._mesh_file = mesh_file
@@ -47,7 +52,7 @@ class Meshes:
             etree.SubElement(asset, "mesh", name=name, vertex=vertex)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the triangles of every mesh that has no file."""
+        """Add the triangles of the meshes to a model, if they are not in files."""
         if self._mesh_file is not None:
             return
         for (mesh, collision), name in self._names.items():

@@ -1,4 +1,7 @@
-"""Read and write the documents of an expansion: bounded, with the location of every element."""
+"""Read and write the XML and YAML documents of a xacro expansion.
+
+The sizes of files and documents are bounded. Every element keeps its file and line for messages.
+"""
 
 from __future__ import annotations
 
