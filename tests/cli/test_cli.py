@@ -125,7 +125,7 @@ def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
         urdf_text(replace(valid_robot(), frames=()), str).replace('xyz="1 0 0"', 'xyz="3 0 0"')
     )
     code, out, err = run("check", path, "--fix", "mended")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, "written: mended/arm\n")
     assert "repaired axis-not-unit at joint elbow" in out
     assert read_bundle(tmp_path / "mended" / "arm").joints[1].axis == (1, 0, 0)
     code, out, err = run("check", path, "--fix", "mended", "--json")
