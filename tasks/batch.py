@@ -26,6 +26,7 @@ from morphgen.tasks.random_streams import random_streams
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
+from morphgen.tasks.straight_ways import StraightWays
 from morphgen.tasks.task import OBJECT, EnvSpec, TaskState
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
@@ -161,7 +162,10 @@ class TaskBatch:
         self._kinematics: KinematicChannels | None = None
         if names := self.observation_config.kinematic_channels:
             has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
-            self._kinematics = KinematicChannels(robot_tables, index, names, has_block=has_block)
+            ways = StraightWays(self.layouts, index)
+            self._kinematics = KinematicChannels(
+                robot_tables, index, names, has_block=has_block, first_free=ways
+            )
         self._points: PointClouds | None = None
         if self.observation_config.points:
             self._points = PointClouds(scenes, self.observation_config.points, device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -23,6 +24,8 @@ from morphgen.typing import Array
 
 TRIES = 1000
 """Configurations to test per required free one before giving up."""
+RESOLUTION = 0.05
+"""Largest change of a joint between tested configurations of a way [rad or m]."""
 
 _GROUND_SIZE = (200.0, 200.0, 20.0)
 """Size of the box whose top is the ground [m]."""
@@ -87,6 +90,24 @@ class FreeSpace:
                 no block.
         """
         return self._checker.free(self._positions(q, blocks))
+
+    def free_fraction(self, start: Array, end: Array, block: Array | None = None) -> float:
+        """Return the free fraction of a straight way of the joints, from its start on.
+
+        The way is tested at points that no joint moves more than ``RESOLUTION`` between.
+
+        Args:
+            start: Configuration, shape (dof,) [rad or m].
+            end: Configuration, shape (dof,) [rad or m].
+            block: Pose of the block, shape (7,); None to leave it out.
+
+        Returns:
+            1 if the whole way is free, else the fraction before the last free point.
+        """
+        count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
+        line = start + np.linspace(0, 1, count)[:, None] * (end - start)
+        free = self.free(line, None if block is None else np.tile(block, (count, 1)))
+        return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
     def place_obstacles(self, poses: Sequence[Pose]) -> None:
         """Move the obstacles of the scene to other poses in the world.

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 
 from morphgen.model.inverse_kinematics_torch import solve_from_starts
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
+from morphgen.typing import Array
 
+FirstFree = Callable[[int, Array, Array], "int | None"]
+"""Function that returns the first of the configurations (k, J) that an environment's robot reaches
+from another one, (J,), on a straight way without a collision; None if there is none."""
 STARTS = 32
 """Number of start configurations of a solution."""
 ITERATIONS = 25
@@ -25,18 +30,21 @@ class IkSolutions:
 
     It is found by damped least squares from the joint targets and from other starts, which are the
     same for all robots as fractions of their joints' ranges. Of several solutions it is the one
-    that the robot reaches first. Links and obstacles may be in the way: kinematics does not know.
-    A solution is kept until the episode ends or the target moves.
+    that the robot reaches first on a straight way without a collision; if all ways collide, the
+    nearest. A solution is kept until the episode ends or the target moves.
     """
 
-    def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
+    def __init__(
+        self, tables: RobotTables, env_robot_index: torch.Tensor, first_free: FirstFree
+    ) -> None:
         """Gather the tables of every environment.
 
         Args:
             tables: The robots.
             env_robot_index: Robot of each environment, shape (n,), int64.
+            first_free: Test of ways.
         """
-        index = env_robot_index
+        index, self._first_free = env_robot_index, first_free
         self._tables, self._index = tables, index
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
@@ -111,7 +119,15 @@ class IkSolutions:
         q = self._nearest_turn(q, now, rows)
         distance = torch.linalg.vector_norm(error, dim=2)
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
-        best = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance)).argmin(dim=0)
+        order = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance)).argsort(dim=0)
+        best = order[0].clone()
+        starts, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
+        solved = (distance < SOLVED).sum(dim=0).tolist()
+        for i, env in enumerate(rows.tolist()):
+            preferred = order[: solved[i], i]
+            free = self._first_free(env, starts[i], ends[preferred.cpu().numpy(), i])
+            if free is not None:
+                best[i] = preferred[free]
         column = torch.arange(len(rows), device=rows.device)
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
 

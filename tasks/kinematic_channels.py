@@ -27,7 +27,7 @@ from morphgen.model.rotation_torch import (
     rotation_from_z,
     rotvec_from_matrix,
 )
-from morphgen.tasks.ik_channel import IkSolutions
+from morphgen.tasks.ik_channel import FirstFree, IkSolutions
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
 
@@ -121,6 +121,7 @@ class KinematicChannels:
         names: Sequence[str],
         *,
         has_block: torch.Tensor,
+        first_free: FirstFree,
     ) -> None:
         """Gather the tables of every environment.
 
@@ -129,6 +130,7 @@ class KinematicChannels:
             env_robot_index: Robot of each environment, shape (n,), int64.
             names: Channels to compute, of ``KINEMATIC_CHANNELS``.
             has_block: Environments with a block, shape (n,), bool.
+            first_free: Test of ways, for ``ik``.
         """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
@@ -141,7 +143,7 @@ class KinematicChannels:
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5
         self._is_prismatic = tables.is_prismatic[index].float()
-        self._solutions = IkSolutions(tables, index) if "ik" in names else None
+        self._solutions = IkSolutions(tables, index, first_free) if "ik" in names else None
         needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
         self._tree = (
             compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)

@@ -6,7 +6,6 @@ divided by what that joint may change in one control step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,8 +32,6 @@ SHORTCUTS = 60
 """Number of random pairs of waypoints that are tried as shortcuts of a path."""
 COMPARED = 6
 """Number of free paths along a tree of which the cheapest is taken."""
-RESOLUTION = 0.05
-"""Largest change of a joint between tested configurations of a line [rad or m]."""
 LATE_COST, MAX_LATE_COST = 20.0, 400.0
 """Cost of each control step after the deadline, and the largest such cost [control steps]."""
 ARRIVED = 1.01 * min(fraction for fraction in BINS if fraction > 0)
@@ -218,7 +215,7 @@ class PathPlanner:
         Returns:
             None if no path is free.
         """
-        free_fraction = partial(self._free_fraction, block=block)
+        free_fraction = partial(self.space.free_fraction, block=block)
         cost = cost or PathCost(np.zeros(len(goals)), np.full(len(goals), np.inf))
         candidates: list[tuple[float, int, Path]] = []
         for i, goal in enumerate(goals):
@@ -264,7 +261,7 @@ class PathPlanner:
         Returns:
             The shortened path, None if the search failed; and the tree of the start.
         """
-        free_fraction = partial(self._free_fraction, block=block)
+        free_fraction = partial(self.space.free_fraction, block=block)
         rng = np.random.default_rng([self._seed, attempt])
         # Joints that may not move have limits without width.
         limits = np.where(self._movable[:, None], self._limits, start[:, None])
@@ -274,12 +271,6 @@ class PathPlanner:
         points = shortcut(points, free_fraction, rng)
         goal = int(np.abs(goals - points[-1]).max(axis=1).argmin())
         return Path(tuple(points[1:]), goal), tree
-
-    def _free_fraction(self, start: Array, end: Array, block: Array | None) -> float:
-        count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
-        line = start + np.linspace(0, 1, count)[:, None] * (end - start)
-        free = self.space.free(line, None if block is None else np.tile(block, (count, 1)))
-        return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
 
 class PathFollower:

@@ -11,7 +11,6 @@ from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.rl.baselines.path_planner import (
-    RESOLUTION,
     PathCost,
     PathFollower,
     PathPlanner,
@@ -19,7 +18,7 @@ from morphgen.rl.baselines.path_planner import (
     rrt_connect,
 )
 from morphgen.tasks.actions import encode_actions
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.free_space import RESOLUTION, FreeSpace
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.sim.base import Block, Scene
 

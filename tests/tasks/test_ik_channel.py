@@ -12,6 +12,7 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
 from morphgen.rl.rollouts import run_episodes
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.ik_channel import SOLVED
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.make import batch_from_specs
@@ -94,6 +95,15 @@ class Follower:
 def test_following_the_channel_reaches_every_goal_without_contacts(specs):
     episodes = run_episodes(batch_of(specs, 20), Follower(), 1)
     assert all(episode.success for episode in episodes)
+
+
+def test_the_way_is_free_of_collisions(specs):
+    batch = batch_of(specs[1:], 30)
+    ends = solution_of(batch, batch.reset()).double().numpy()
+    space = FreeSpace(specs[1].scene)
+    starts = batch.targets.double().numpy()
+    free = [space.free_fraction(*way) == 1 for way in zip(starts, ends, strict=True)]
+    assert sum(free) >= 29
 
 
 def test_a_residual_policy_begins_with_the_way_that_the_channel_shows(specs):
