@@ -1,12 +1,13 @@
-"""Success of a policy on every arm of the library with a stick, beside jacobian, ik and random.
+"""Success of a policy on every arm of the library with a stick, beside untrained controllers.
 
     python benchmarks/zero_shot_arms.py [--policy CHECKPOINT] [--obstacles] [--episodes 50]
         [--only ur] [--seed 0] [--jobs 2] [--json rows.json]
 
 The arms are those in use: not the templates of which robots are drawn for training, not the Panda
 with other sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in
-MuJoCo. A cell is the success rate with its 95% Wilson interval. The last rows are the mean over the
-arms, and the number of arms below 80%.
+MuJoCo. The controller "way" follows the way of the observation channel ``ik``, to which policies
+with ``--residual`` add their actions. A cell is the success rate with its 95% Wilson interval. The
+last rows are the mean over the arms, and the number of arms below 80%.
 """
 
 from __future__ import annotations
@@ -24,13 +25,26 @@ from tqdm import tqdm
 
 from morphgen.grammar.library import default_library
 from morphgen.processes import parallel_map
-from morphgen.rl.evaluation import EvalConfig
+from morphgen.rl.evaluation import EvalConfig, evaluate
 from morphgen.rl.robot_source import robot_source
+from morphgen.rl.runs import Interface
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
-from morphgen.rl.zeroshot import ZeroShotResult, zero_shot
+from morphgen.rl.zeroshot import ZeroShotResult, result_of, zero_shot
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.kinematic_channels import IK_SHARE
+from morphgen.tasks.observation import observation_config
 
 LEFT_OUT = ("arm3", "arm5", "arm_ed", "panda_scaled", "yumi")
 ENOUGH = 0.8
+WAY = observation_config(("ik",))
+
+
+class FollowWay:
+    """Controller that follows the way of the channel ``ik``."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions, shape (n, L)."""
+        return task.observe()["ik"][..., IK_SHARE]
 
 
 @dataclass(frozen=True)
@@ -47,7 +61,9 @@ class Measuring:
         torch.set_num_threads(1)
         source = robot_source(f"arm={arm} ee=stick", "reach", obstacles=self.obstacles)
         config = EvalConfig(self.episodes, "mujoco", self.seed)
-        return arm, zero_shot(source, config, policy=self.policy)
+        (score,) = evaluate([FollowWay], source, config, Interface(channels=WAY))
+        results = zero_shot(source, config, policy=self.policy)
+        return arm, [results[0], result_of("way", score), *results[1:]]
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints
 from morphgen.rl.intervals import Interval, wilson_interval
 from morphgen.rl.robot_source import RobotSource
+from morphgen.rl.scores import Score
 from morphgen.rl.shipped_policies import ZERO_SHOT, name_of
 
 COMPARED = ("jacobian", "ik", "random")
@@ -75,13 +76,15 @@ def zero_shot(
             progress=lambda done, total, of=baseline: progress(of, done, total),  # type: ignore[misc]
         )
         scores.append((baseline, score))
-    return [
-        ZeroShotResult(
-            controller,
-            score.episodes,
-            wilson_interval(round(score.success * score.episodes), score.episodes),
-            score.distance,
-            score.score,
-        )
-        for controller, score in scores
-    ]
+    return [result_of(controller, score) for controller, score in scores]
+
+
+def result_of(controller: str, score: Score) -> ZeroShotResult:
+    """Return the result of a controller from its score on a robot."""
+    return ZeroShotResult(
+        controller,
+        score.episodes,
+        wilson_interval(round(score.success * score.episodes), score.episodes),
+        score.distance,
+        score.score,
+    )
