@@ -121,11 +121,11 @@ class IkSolutions:
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
         order = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance)).argsort(dim=0)
         best = order[0].clone()
-        starts, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
+        here, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
         solved = (distance < SOLVED).sum(dim=0).tolist()
         for i, env in enumerate(rows.tolist()):
             preferred = order[: solved[i], i]
-            free = self._first_free(env, starts[i], ends[preferred.cpu().numpy(), i])
+            free = self._first_free(env, here[i], ends[preferred.cpu().numpy(), i])
             if free is not None:
                 best[i] = preferred[free]
         column = torch.arange(len(rows), device=rows.device)
