@@ -18,11 +18,11 @@ from morphgen.rl.observation_layout import (
     truncate_links,
 )
 from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs import policy_interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.make import BatchOptions
-from morphgen.tasks.observation import Observation, observation_config
+from morphgen.tasks.observation import Observation
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
@@ -68,13 +68,9 @@ class Policy:
         They are continuous or discrete actions, the observation channels, and the number of links
         that an agent for robots of one size needs.
         """
-        observe = observation_config(self.config.channels, obstacles=self.layout.obstacles)
-        any_size = AGENTS[self.config.agent].any_size
-        return {
-            "kind": self.config.kind,
-            "observe": replace(observe, tool=observe.tool or self.layout.tool),
-            "max_links": None if any_size else self.layout.links,
-        }
+        links, obstacles = self.layout.links, self.layout.obstacles
+        needed = policy_interface(self.config, max_links=links, obstacles=obstacles)
+        return {"kind": needed.kind, "observe": needed.channels, "max_links": needed.max_links}
 
     def require(self, observation: Observation) -> None:
         """Require that an observation has the layout that the policy was trained with.

@@ -44,6 +44,20 @@ class Interface:
     """Channels of the observations."""
 
 
+def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) -> Interface:
+    """Return the interface of a policy.
+
+    Args:
+        policy: Agent and networks.
+        max_links: Links that its observations are padded to, if it needs a fixed number.
+        obstacles: Minimum number of obstacle rows.
+    """
+    channels = observation_config(policy.channels, obstacles=obstacles)
+    channels = replace(channels, tool=channels.tool or policy.tool_position)
+    any_size = AGENTS[policy.agent].any_size
+    return Interface(policy.kind, None if any_size else max_links, channels)
+
+
 @dataclass(frozen=True)
 class RunConfig:
     """Configuration of a run; together with the machine it determines the weights."""
@@ -101,10 +115,7 @@ class RunConfig:
     def interface(self) -> Interface:
         """Actions and observations of the policy."""
         obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
-        channels = observation_config(self.policy.channels, obstacles=obstacles)
-        channels = replace(channels, tool=channels.tool or self.policy.tool_position)
-        max_links = None if AGENTS[self.policy.agent].any_size else self.max_links
-        return Interface(self.policy.kind, max_links, channels)
+        return policy_interface(self.policy, max_links=self.max_links, obstacles=obstacles)
 
     def as_data(self) -> dict[str, Any]:
         """Return the config as JSON values, which ``config_from`` reads."""

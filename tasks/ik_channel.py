@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 
 from morphgen.model.inverse_kinematics_torch import solve_from_starts
@@ -120,15 +121,14 @@ class IkSolutions:
         distance = torch.linalg.vector_norm(error, dim=2)
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
         cost = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance))
-        order = cost.argsort(dim=0, stable=True)
-        best = order[0].clone()
+        order = cost.argsort(dim=0, stable=True).cpu().numpy()
         here, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
         solved = (distance < SOLVED).sum(dim=0).tolist()
+        chosen = []
         for i, env in enumerate(rows.tolist()):
             preferred = order[: solved[i], i]
-            free = self._first_free(env, here[i], ends[preferred.cpu().numpy(), i])
-            if free is not None:
-                best[i] = preferred[free]
+            chosen.append(order[self._first_free(env, here[i], ends[preferred, i]) or 0, i])
+        best = torch.tensor(np.array(chosen), device=rows.device)
         column = torch.arange(len(rows), device=rows.device)
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
 
