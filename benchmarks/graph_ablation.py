@@ -1,0 +1,44 @@
+"""What the parts of the agent ``me-graph`` are worth: each is left out in turn.
+
+    python benchmarks/graph_ablation.py interpolation/arm3/reach --seeds 0..1 --steps 7e5
+        --sim mujoco --envs 160 --out ablation
+
+The options are those of ``morphgen study``, without ``--agents``. Rows are ``me-graph`` as it is;
+without each of its observation channels, and without all of them; without normalization; with
+advantages normalized robot by robot, and with the mean entropy of the joints; and two agents of
+``graph_variants``: attention without the tree, and a critic without descriptions of links.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from morphgen.cli import main
+from morphgen.rl.agents import AGENTS, Agent
+
+WITHOUT_TREE, BLIND_CRITIC = "graph-without-tree", "graph-blind-critic"
+AGENT_LABELS = (
+    "me-graph",
+    *(f"me-graph-{channel}" for channel in ("lag", "joint", "jacobian", "dls")),
+    "me-graph-jacobian-dls",
+    "me-graph-normalize-lag-joint-jacobian-dls",
+    "me-graph-normalize",
+    "me-graph+robot-advantages",
+    "me-graph+joint-entropy",
+    WITHOUT_TREE,
+    BLIND_CRITIC,
+)
+
+
+def variant(name: str, module: str) -> Agent:
+    """Return an agent with the networks of a module and all else as ``me-graph`` has it."""
+    return Agent(
+        name, f"graph_variants.{module}", preset="fast", any_size=True, channels=("tree",)
+    )
+
+
+if __name__ == "__main__":
+    AGENTS.register(variant(WITHOUT_TREE, "no_tree"))
+    AGENTS.register(variant(BLIND_CRITIC, "blind_critic"))
+    agents = [] if "--agents" in sys.argv else ["--agents", ",".join(AGENT_LABELS)]
+    sys.exit(main(["study", *sys.argv[1:], *agents]))
