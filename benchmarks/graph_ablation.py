@@ -32,9 +32,7 @@ AGENT_LABELS = (
 
 def variant(name: str, module: str) -> Agent:
     """Return an agent with the networks of a module and all else as ``me-graph`` has it."""
-    return Agent(
-        name, f"graph_variants.{module}", preset="fast", any_size=True, channels=("tree",)
-    )
+    return Agent(name, f"graph_variants.{module}", preset="fast", any_size=True, channels=("tree",))
 
 
 if __name__ == "__main__":

@@ -155,7 +155,7 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
     if _has_checkpoint(folder):
         if not resume:
             raise TaskError(f"{folder} has a run: pass --resume to continue it, or another --out")
-        _require_same(folder, read_config(folder), config)
+        require_same_run(folder, config)
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
@@ -274,8 +274,13 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
         )
 
 
-def _require_same(folder: Path, stored: RunConfig, config: RunConfig) -> None:
-    theirs, ours = _flat(stored), _flat(config)
+def require_same_run(folder: Path, config: RunConfig) -> None:
+    """Require that a folder has a run with this config.
+
+    Raises:
+        TaskError: If the run in the folder has another config; the message lists the differences.
+    """
+    theirs, ours = _flat(read_config(folder)), _flat(config)
     differences = [
         f"{name} {_short(theirs.get(name))}, not {_short(value)}"
         for name, value in ours.items()

@@ -32,7 +32,7 @@ from morphgen.rl.evaluation import (
 )
 from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
-from morphgen.rl.runs import RunConfig, require_open
+from morphgen.rl.runs import RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
 from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
 from morphgen.tasks.env_specs import GoalConfig, task_configs
@@ -166,7 +166,9 @@ def require_cells(cells: Sequence[Cell]) -> None:
     for cell in cells:
         if cell.config is not None:
             require_open(cell.folder, cell.config, resume=True)
-        read_scores(cell)
+        # The scores do not say how their policy was trained; the config beside them does.
+        if read_scores(cell) is not None and cell.config is not None:
+            require_same_run(cell.folder, cell.config)
 
 
 def do_cell(

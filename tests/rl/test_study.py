@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from morphgen.rl.study import (
     baseline_cells,
     matched_budget,
     read_scores,
+    require_cells,
     run_cells,
     run_cells_on_ray,
 )
@@ -152,6 +154,23 @@ def test_scores_of_another_evaluation_are_rejected(whole):
     for cell in (whole[0], whole[-1]):
         with pytest.raises(TaskError, match="of another set of robots"):
             read_scores(replace(cell, source=replace(cell.source, goal_seed=1)))
+
+
+def test_scores_of_another_run_are_rejected_without_its_checkpoint(whole, tmp_path):
+    """Studies may be kept without their checkpoints."""
+    folder = tmp_path / "study"
+    shutil.copytree(whole[0].folder.parents[2], folder)
+    for checkpoint in folder.rglob(CHECKPOINT):
+        checkpoint.unlink()
+    kept = [
+        replace(cell, folder=folder / cell.folder.relative_to(whole[0].folder.parents[2]))
+        for cell in whole
+    ]
+    require_cells(kept)
+    mlp = kept[-1]
+    ppo = replace(mlp.config.ppo, gamma=0.5)
+    with pytest.raises(TaskError, match=r"has another run: ppo.gamma 0\.\d+, not 0.5"):
+        require_cells([*kept[:-1], replace(mlp, config=replace(mlp.config, ppo=ppo))])
 
 
 def test_an_unexpected_error_does_not_stop_the_other_cells(tmp_path, monkeypatch, capsys):
