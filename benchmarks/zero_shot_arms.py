@@ -5,9 +5,9 @@
 
 The arms are those in use: not the templates of which robots are drawn for training, not the Panda
 with other sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in
-MuJoCo. The controller "way" follows the way of the observation channel ``ik``, to which policies
-with ``--residual`` add their actions. A cell is the success rate with its 95% Wilson interval. The
-last rows are the mean over the arms, and the number of arms below 80%.
+MuJoCo. The controller "path" follows the straight path of the observation channel ``ik``, to which
+policies with ``--residual`` add their actions. A cell is the success rate with its 95% Wilson
+interval. The last rows are the mean over the arms, and the number of arms below 80%.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from morphgen.tasks.observation import observation_config
 
 LEFT_OUT = ("arm3", "arm5", "arm_ed", "panda_scaled", "yumi")
 ENOUGH = 0.8
-WAY = observation_config(("ik",))
+PATH = observation_config(("ik",))
 
 
-class FollowWay:
-    """Controller that follows the way of the channel ``ik``."""
+class FollowPath:
+    """Controller that follows the straight path of the channel ``ik``."""
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions, shape (n, L)."""
@@ -61,9 +61,9 @@ class Measuring:
         torch.set_num_threads(1)
         source = robot_source(f"arm={arm} ee=stick", "reach", obstacles=self.obstacles)
         config = EvalConfig(self.episodes, "mujoco", self.seed)
-        (score,) = evaluate([FollowWay], source, config, Interface(channels=WAY))
+        (score,) = evaluate([FollowPath], source, config, Interface(channels=PATH))
         results = zero_shot(source, config, policy=self.policy)
-        return arm, [results[0], result_of("way", score), *results[1:]]
+        return arm, [results[0], result_of("path", score), *results[1:]]
 
 
 def main() -> None:

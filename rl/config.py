@@ -37,8 +37,8 @@ class PolicyConfig:
     normalize: bool = False
     """Normalize the kinematic channels by their running means and variances."""
     residual: bool = False
-    """Add the way that the channel ``ik`` shows to the mean actions. The policy learns what to
-    change about it (Silver et al. 2018, Residual policy learning, arXiv 1812.06298)."""
+    """Add the steps that the channel ``ik`` shows to the mean actions. The policy learns what to
+    change about them (Silver et al. 2018, Residual policy learning, arXiv 1812.06298)."""
     network: NetworkConfig | None = None
     """Sizes of the agent's networks; by default those of the agent's module."""
 

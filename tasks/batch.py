@@ -26,7 +26,7 @@ from morphgen.tasks.random_streams import random_streams
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
-from morphgen.tasks.straight_ways import StraightWays
+from morphgen.tasks.straight_paths import StraightPaths
 from morphgen.tasks.task import OBJECT, EnvSpec, TaskState
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
@@ -162,9 +162,9 @@ class TaskBatch:
         self._kinematics: KinematicChannels | None = None
         if names := self.observation_config.kinematic_channels:
             has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
-            ways = StraightWays(self.layouts, index)
+            paths = StraightPaths(self.layouts, index)
             self._kinematics = KinematicChannels(
-                robot_tables, index, names, has_block=has_block, first_free=ways
+                robot_tables, index, names, has_block=has_block, first_free=paths
             )
         self._points: PointClouds | None = None
         if self.observation_config.points:

@@ -25,7 +25,7 @@ from morphgen.typing import Array
 TRIES = 1000
 """Configurations to test per required free one before giving up."""
 RESOLUTION = 0.05
-"""Largest change of a joint between tested configurations of a way [rad or m]."""
+"""Largest change of a joint between tested configurations of a path [rad or m]."""
 
 _GROUND_SIZE = (200.0, 200.0, 20.0)
 """Size of the box whose top is the ground [m]."""
@@ -92,9 +92,9 @@ class FreeSpace:
         return self._checker.free(self._positions(q, blocks))
 
     def free_fraction(self, start: Array, end: Array, block: Array | None = None) -> float:
-        """Return the free fraction of a straight way of the joints, from its start on.
+        """Return the free fraction of a straight path of the joints, from its start on.
 
-        The way is tested at points that no joint moves more than ``RESOLUTION`` between.
+        The path is tested at points that no joint moves more than ``RESOLUTION`` between.
 
         Args:
             start: Configuration, shape (dof,) [rad or m].
@@ -102,7 +102,7 @@ class FreeSpace:
             block: Pose of the block, shape (7,); None to leave it out.
 
         Returns:
-            1 if the whole way is free, else the fraction before the last free point.
+            1 if the whole path is free, else the fraction before the last free point.
         """
         count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)

@@ -15,7 +15,7 @@ from morphgen.typing import Array
 
 FirstFree = Callable[[int, Array, Array], "int | None"]
 """Function that returns the first of the configurations (k, J) that an environment's robot reaches
-from another one, (J,), on a straight way without a collision; None if there is none."""
+from another one, (J,), on a straight path without a collision; None if there is none."""
 STARTS = 32
 """Number of start configurations of a solution."""
 ITERATIONS = 25
@@ -31,7 +31,7 @@ class IkSolutions:
 
     It is found by damped least squares from the joint targets and from other starts, which are the
     same for all robots as fractions of their joints' ranges. Of several solutions it is the one
-    that the robot reaches first on a straight way without a collision; if all ways collide, the
+    that the robot reaches first on a straight path without a collision; if all paths collide, the
     nearest. A solution is kept until the episode ends or the target moves.
     """
 
@@ -43,7 +43,7 @@ class IkSolutions:
         Args:
             tables: The robots.
             env_robot_index: Robot of each environment, shape (n,), int64.
-            first_free: Test of ways.
+            first_free: Test of straight paths.
         """
         index, self._first_free = env_robot_index, first_free
         self._tables, self._index = tables, index

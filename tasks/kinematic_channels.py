@@ -34,7 +34,7 @@ from morphgen.tasks.tool_targets import ToolTargets
 KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik")
 """Names of the channels, in the order in which networks concatenate them."""
 IK_SHARE = 4
-"""Column of the channel ``ik`` with the joint's share of the way, -1 to 1."""
+"""Column of the channel ``ik`` with the joint's action along the straight path, -1 to 1."""
 MAX_LAG = 3.0
 """Bound of the observed lag [largest steps]; no joint in free motion is further behind."""
 STEPS_TO_LIMIT = 10.0
@@ -106,10 +106,10 @@ class KinematicChannels:
         target point, and towards the first one with its orientation, at three gains.
 
     ``ik`` (6)
-        The joint's way from its target to a configuration that brings the tool to the first target
-        point, with its orientation if it has one (``IkSolutions``): in largest steps at three
-        gains, in rad or m, and as a share of the joint that needs the most steps; and the logarithm
-        of the tool's distance from the target there.
+        The straight path from the joint's target to a configuration that brings the tool to the
+        first target point, with its orientation if it has one (``IkSolutions``): in largest steps
+        at three gains, in rad or m, and as a share of the joint that needs the most steps; and the
+        logarithm of the tool's distance from the target there.
 
     Links without an independent joint have zeros, except in ``poses``.
     """
@@ -130,7 +130,7 @@ class KinematicChannels:
             env_robot_index: Robot of each environment, shape (n,), int64.
             names: Channels to compute, of ``KINEMATIC_CHANNELS``.
             has_block: Environments with a block, shape (n,), bool.
-            first_free: Test of ways, for ``ik``.
+            first_free: Test of straight paths, for ``ik``.
         """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables

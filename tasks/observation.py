@@ -59,7 +59,7 @@ class ObservationConfig:
     dls: bool = False
     """Whether to observe a damped least-squares step towards the targets."""
     ik: bool = False
-    """Whether to observe the way to a configuration that reaches the target."""
+    """Whether to observe the straight path to a configuration that reaches the target."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True

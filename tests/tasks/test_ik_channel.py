@@ -1,4 +1,4 @@
-"""The channel ``ik`` shows the way to a configuration with the tool at the target."""
+"""The channel ``ik`` shows the path to a configuration with the tool at the target."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 
 CHANGE = 3
-"""Column of the channel with the way in rad or m."""
+"""Column of the channel with the displacement of the joint in rad or m."""
 
 
 def specs_of(cache, **config):
@@ -86,7 +86,7 @@ def test_episodes_do_not_depend_on_what_was_solved_before(specs):
 
 
 class Follower:
-    """Moves all joints in proportion to their way."""
+    """Moves all joints along the straight path."""
 
     def act(self, task):
         return task.observe()["ik"][..., IK_SHARE]
@@ -97,27 +97,27 @@ def test_following_the_channel_reaches_every_goal_without_contacts(specs):
     assert all(episode.success for episode in episodes)
 
 
-def test_the_way_is_free_of_collisions(specs):
+def test_the_path_is_free_of_collisions(specs):
     batch = batch_of(specs[1:], 30)
     ends = solution_of(batch, batch.reset()).double().numpy()
     space = FreeSpace(specs[1].scene)
     starts = batch.targets.double().numpy()
-    free = [space.free_fraction(*way) == 1 for way in zip(starts, ends, strict=True)]
+    free = [space.free_fraction(*path) == 1 for path in zip(starts, ends, strict=True)]
     assert sum(free) >= 29
 
 
-def test_a_residual_policy_begins_with_the_way_that_the_channel_shows(specs):
+def test_a_residual_policy_begins_with_the_path_that_the_channel_shows(specs):
     policy = PolicyConfig(
         "me-graph", discrete=False, observe=("ik",), normalize=True, residual=True
     )
     observe = observation_config(policy.channels)
     observation = batch_from_specs(specs, 4, sim="kinematic", observe=observe).reset()
     actor, _ = make_networks(policy, layout_of(observation), 0)
-    way = observation["ik"][..., IK_SHARE]
-    assert way.abs().max() > 0.5
+    path = observation["ik"][..., IK_SHARE]
+    assert path.abs().max() > 0.5
     actions = actor.distribution(observation).mode()
-    assert actions.shape == way.shape
-    assert (actions - way * observation["actions"]).abs().max() < 0.05
+    assert actions.shape == path.shape
+    assert (actions - path * observation["actions"]).abs().max() < 0.05
 
 
 def test_goals_that_are_poses_are_solved_with_their_orientation(tmp_path):
@@ -132,7 +132,7 @@ def test_goals_that_are_poses_are_solved_with_their_orientation(tmp_path):
     assert (near & (angle < 0.05)).float().mean() >= 0.8
 
 
-def test_push_shows_the_way_to_its_first_point_wherever_the_block_is(tmp_path):
+def test_push_shows_the_path_to_its_first_point_wherever_the_block_is(tmp_path):
     robot = morphgen.compose("arm3", geometry="primitive")
     config = replace(PushConfig(), num_goals=3)
     spec = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)

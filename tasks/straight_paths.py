@@ -1,4 +1,4 @@
-"""Straight ways of the joints that hit nothing, in the current scenes of a batch."""
+"""Straight paths of the joints that hit nothing, in the current scenes of a batch."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from morphgen.typing import Array
 SAME = 0.02
 """Largest difference of joints between configurations that count as the same [rad or m]."""
 COMPARED = 12
-"""Number of different configurations whose ways are tested."""
+"""Number of different configurations whose paths are tested."""
 
 
-class StraightWays:
-    """Finds the first configuration that a robot reaches on a straight way without a collision.
+class StraightPaths:
+    """Finds the first configuration that a robot reaches on a straight path without a collision.
 
     Links, the ground and the obstacles of the running episode count; see ``FreeSpace``.
     """
@@ -32,7 +32,7 @@ class StraightWays:
         self._spaces: dict[int, FreeSpace] = {}
 
     def __call__(self, env: int, start: Array, ends: Array) -> int | None:
-        """Return the index of the first end with a free way, or None.
+        """Return the index of the first end with a free path, or None.
 
         Args:
             env: The environment.

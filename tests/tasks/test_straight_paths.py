@@ -1,4 +1,4 @@
-"""Straight ways of the joints are tested in the current scene of each environment."""
+"""Straight paths of the joints are tested in the current scene of each environment."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import torch
 from helpers.scenes import ball
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.straight_ways import SAME, StraightWays
+from morphgen.tasks.straight_paths import SAME, StraightPaths
 
 START, BEHIND, BESIDE = np.array([-0.5, 0.0]), np.array([0.5, 0.0]), np.array([-0.5, 0.5])
 
@@ -25,8 +25,8 @@ class Layouts:
         return Scene(ball(0.2), obstacles=self.obstacles(env))
 
 
-def test_the_first_end_with_a_free_way_is_found():
-    first_free = StraightWays(Layouts(), torch.tensor([0, 1]))
+def test_the_first_end_with_a_free_path_is_found():
+    first_free = StraightPaths(Layouts(), torch.tensor([0, 1]))
     assert first_free(0, START, np.array([BEHIND, BESIDE])) == 1
     assert first_free(0, START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
     assert first_free(0, START, BEHIND[None]) is None
@@ -36,13 +36,13 @@ def test_the_first_end_with_a_free_way_is_found():
 
 def test_obstacles_count_where_they_are_now():
     layouts = Layouts()
-    first_free = StraightWays(layouts, torch.tensor([0]))
+    first_free = StraightPaths(layouts, torch.tensor([0]))
     assert first_free(0, START, BEHIND[None]) is None
     layouts.wall = replace(layouts.wall, pose=Pose((0.0, 2.0, 0.2)))
     assert first_free(0, START, BEHIND[None]) == 0
 
 
 def test_padding_of_configurations_is_ignored():
-    first_free = StraightWays(Layouts(), torch.tensor([0]))
+    first_free = StraightPaths(Layouts(), torch.tensor([0]))
     padded = np.array([[*BEHIND, 0.0], [*BESIDE, 0.0]])
     assert first_free(0, np.array([*START, 9.0]), padded) == 1
