@@ -2,12 +2,13 @@
 
 import pytest
 
-from morphgen.tasks.sim.bullet import BulletSimulation
-
 
 @pytest.fixture
 def simulate():
     """Create PyBullet simulations of scenes in this process."""
+    pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+    from morphgen.tasks.sim.bullet import BulletSimulation
+
     simulations = []
 
     def make(*scenes, contacts=None):

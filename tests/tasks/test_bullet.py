@@ -3,13 +3,16 @@
 import gc
 
 import numpy as np
-import pybullet
 import pytest
 import torch
 
-from helpers.pybullet_states import PUSHING, client_of, reset, starts, state, touching, wander
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 from morphgen.errors import DivergedError, SimulationError
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+import pybullet
+
+from helpers.pybullet_states import PUSHING, client_of, reset, starts, state, touching, wander
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation
 

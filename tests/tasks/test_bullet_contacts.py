@@ -3,17 +3,20 @@
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 import pytest
 import torch
 
-from helpers.pybullet_states import client_of, reset, touching
 from helpers.robots import arm
 from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, Block, Contacts, Scene
-from morphgen.tasks.sim.bullet_scene import FRICTION
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+import pybullet
+
+from helpers.pybullet_states import client_of, reset, touching
+from morphgen.tasks.sim.bullet_scene import FRICTION
 
 
 def block_scene(friction=1.0, height=0.5, mass=0.1):

@@ -3,11 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 import pytest
 import torch
 
-from helpers.pybullet_states import client_of, reset
 from helpers.robots import arm
 from helpers.scenes import push_scene, reach_scene, real_arm_scene, robot
 from morphgen.model.dynamics import BANDWIDTH, mass_matrix
@@ -19,8 +17,13 @@ from morphgen.model.kinematics import (
     movable_positions,
 )
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.bullet_scene import OVERSPEED
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+import pybullet
+
+from helpers.pybullet_states import client_of, reset
+from morphgen.tasks.sim.bullet_scene import OVERSPEED
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])

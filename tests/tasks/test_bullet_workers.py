@@ -15,11 +15,13 @@ import pytest
 import torch
 
 from helpers.commands import heed_ctrl_c
-from helpers.pybullet_states import state
 from helpers.scenes import mixed_scenes, push_scene
 from morphgen.errors import DivergedError, SimulationError
-from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import Block, Scene
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+from helpers.pybullet_states import state
+from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
 
 TESTS = Path(__file__).parents[1]
