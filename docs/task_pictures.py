@@ -16,8 +16,7 @@ import numpy as np
 from PIL import Image
 
 from morphgen.rl.baselines import baselines_for
-from morphgen.rl.play import make_controller, play
-from morphgen.tasks.gym_env import TaskEnv
+from morphgen.rl.play import make_env, play, read_controller
 from morphgen.tasks.registry import TASKS
 
 ROBOTS = ("ur5-plane", "prims", "chain beads=3")
@@ -43,8 +42,9 @@ def main() -> int:
 
 
 def _row(task: str, robot: str, seed: int) -> np.ndarray:
-    with closing(TaskEnv(task, robot, render_mode="rgb_array", size=SIZE)) as env:
-        controller = make_controller(baselines_for(task)[0], env, seed)
+    spec = read_controller(baselines_for(task)[0], task)
+    env, controller = make_env(spec, robot, seed, render_mode="rgb_array", size=SIZE)
+    with closing(env):
         frames = list(play(env, controller, 1, seed, lambda episode: print(robot, episode)))
     # A push ends with success; a reach is stationary after a quarter of its time.
     last = len(frames) if TASKS[task].target == "line" else len(frames) // 4

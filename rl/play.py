@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import dataclass, field
+from typing import Any
 
 from morphgen.errors import TaskError, nearest
+from morphgen.model.robot import Robot
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
+from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
@@ -26,73 +29,92 @@ FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Frames per second, so that videos run in real time: 25."""
 
 
-def require_policy(name: str, task: str) -> None:
-    """Require that a controller exists for a task.
+@dataclass(frozen=True, eq=False)
+class ControllerSpec:
+    """A controller for one task: a baseline, or the policy of a checkpoint."""
 
-    Raises:
-        TaskError: If it is unknown, or for another task.
-    """
-    valid = policies_for(task)
-    if name in valid:
-        return
-    if tasks := tasks_of(name):
-        raise TaskError(
-            f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
-            f"valid: {', '.join(valid)}"
-        )
-    if _checkpoint(name) is None:
-        raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
+    name: str
+    """Name of a baseline or a shipped policy, or path of a checkpoint."""
+    task: str
+    """Name of the task."""
+    task_config: TaskConfig
+    """Constants of the task that the checkpoint's run is evaluated with, else the defaults."""
+    interface: Interface = field(default_factory=Interface)
+    """Interface of the policy; baselines take any environment."""
+    learner: dict[str, Any] | None = None
+    """State of the learner in the checkpoint; None for a baseline."""
 
 
-def interface_of(name: str) -> Interface:
-    """Return the interface of a checkpoint's policy; baselines take any environment.
-
-    Raises:
-        TaskError: If the file is not a checkpoint.
-    """
-    file = _checkpoint(name)
-    return Interface() if file is None else read_checkpoint(file)[0].interface
-
-
-def task_config_of(name: str, task: str) -> TaskConfig:
-    """Return the constants of a task that a checkpoint's policy is evaluated with, else defaults.
-
-    Raises:
-        TaskError: If the file is not a checkpoint.
-    """
-    file = _checkpoint(name)
-    if file is None:
-        return GoalConfig().task_config(task)
-    run, _ = read_checkpoint(file)
-    return GoalConfig(tasks=eval_config_of(run, 1).tasks).task_config(task)
-
-
-def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
-    """Return a controller by its name.
+def read_controller(name: str, task: str) -> ControllerSpec:
+    """Return the controller of a name; ``make_env`` makes it.
 
     Args:
         name: Name of a baseline or a shipped policy; or the path of a checkpoint or of a run's
             folder, whose policy acts by the mean of its actions.
-        env: Environment that the controller acts in.
-        seed: Seed of random numbers.
+        task: Name of the task.
 
     Raises:
-        TaskError: As ``require_policy``; or if the file is not a checkpoint, or one for other
-            observations or actions.
-        BenchmarkError: If the robot has hardly any collision-free configuration.
+        TaskError: If it is unknown, or for another task; or if the file is not a checkpoint.
     """
-    require_policy(name, env.task)
-    file = _checkpoint(name)
-    if file is not None:
-        run, learner = read_checkpoint(file)
-        if run.policy.kind != env.batch.action_kind:
-            raise TaskError(
-                f"{name}: its actions are {run.policy.kind}, not {env.batch.action_kind}"
-            )
-        policy = Policy(learner, "deterministic", seed)
+    valid = policies_for(task)
+    if name not in valid and (tasks := tasks_of(name)):
+        raise TaskError(
+            f"policy {name!r} is for {' or '.join(tasks)}, not for {task}; "
+            f"valid: {', '.join(valid)}"
+        )
+    if name in BASELINES:
+        return ControllerSpec(name, task, GoalConfig().task_config(task))
+    path = checkpoint_path(name)
+    if not path.exists():
+        raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
+    run, learner = read_checkpoint(path)
+    config = GoalConfig(tasks=eval_config_of(run, 1).tasks).task_config(task)
+    return ControllerSpec(name, task, config, run.interface, learner)
+
+
+def make_env(
+    spec: ControllerSpec,
+    robot: str | Robot,
+    seed: int,
+    *,
+    kind: ActionKind | None = None,
+    **options: Any,  # noqa: ANN401
+) -> tuple[TaskEnv, Controller]:
+    """Make an environment that suits a controller, and the controller.
+
+    Args:
+        spec: The controller.
+        robot: The robot, as ``TaskEnv`` accepts it.
+        seed: Seed of the controller's random numbers.
+        kind: Kind of actions; by default that of the checkpoint, else continuous.
+        **options: Further arguments of ``TaskEnv``.
+
+    Raises:
+        TaskError: If the checkpoint is for other observations or actions.
+        MorphgenError: As ``TaskEnv``.
+    """
+    interface, policy = spec.interface, None
+    if spec.learner is not None:
+        if kind not in (None, interface.kind):
+            raise TaskError(f"{spec.name}: its actions are {interface.kind}, not {kind}")
+        policy = Policy(spec.learner, "deterministic", seed)
+    env = TaskEnv(
+        spec.task,
+        robot,
+        layouts="eval",
+        kind=kind or interface.kind,
+        observe=interface.channels,
+        max_links=interface.max_links,
+        **options,
+    )
+    if policy is None:
+        return env, BASELINES[spec.name].make(seed)
+    try:
         policy.require(env.batch.observe())
-        return PolicyController(policy)
-    return BASELINES[name].make(seed)
+    except TaskError:
+        env.close()
+        raise
+    return env, PolicyController(policy)
 
 
 def play(
@@ -133,12 +155,6 @@ def play(
         score = TASKS[env.task].episode_score(sum(scores), scores[-1], len(scores))
         facts = info["success"], info["distance"], score, len(scores), info["diverged"]
         report(Episode(0, 0, *facts, info.get("angle", math.nan)))
-
-
-def _checkpoint(policy: str) -> Path | None:
-    """Return the checkpoint or run folder that a policy's name means; None for a baseline."""
-    path = checkpoint_path(policy)
-    return path if policy not in BASELINES and path.exists() else None
 
 
 def _shown(env: TaskEnv) -> Iterator[Frame]:

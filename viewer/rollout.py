@@ -18,10 +18,10 @@ from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.drawn_robots import FILE, read_drawn
-from morphgen.rl.play import interface_of, make_controller, require_policy, task_config_of
+from morphgen.rl.play import ControllerSpec, make_env, read_controller
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
-from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.gym_env import TaskEnv
@@ -124,13 +124,12 @@ class Rollout:
         """
         self.faults: dict[str, str] = {}
         self._robots: list[_SimulatedRobot] = []
-        policy = resolve_policy(config.policy, config.task, files)
-        interface = interface_of(policy)
+        spec = _read_controller(config.policy, config.task, files)
         first_error: MorphgenError | None = None
         for uri in config.robots[:MAX_ROBOTS]:
             progress(f"preparing {uri_name(uri)}")
             try:
-                self._robots.append(_start_robot(config, uri, policy, interface, files))
+                self._robots.append(_start_robot(config, uri, spec, files))
             except MorphgenError as error:
                 first_error = first_error or error
                 self.faults[uri] = str(error)
@@ -165,17 +164,16 @@ def simulators() -> list[str]:
     return sorted(installed_simulators(), key=lambda name: name != "mujoco")
 
 
-def resolve_policy(policy: str, task: str, files: FileAccess) -> str:
-    """Return a policy as ``morphgen.rl.play`` names it: a checkpoint by its absolute path.
+def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpec:
+    """Return the controller that a page names.
 
     Raises:
-        TaskError: If the policy is unknown, or is for another task.
+        TaskError: If the policy is unknown, is for another task, or is not a checkpoint.
         UriError: If it is a file that may not be read.
     """
     if not is_named(policy):
-        return str(_checkpoint_path(policy, policies_for(task), files))
-    require_policy(policy, task)
-    return policy
+        policy = str(_checkpoint_path(policy, policies_for(task), files))
+    return read_controller(policy, task)
 
 
 def _checkpoint_path(policy: str, baselines: Iterable[str], files: FileAccess) -> Path:
@@ -233,34 +231,30 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
 
 
 def _start_robot(
-    config: RolloutConfig, uri: str, policy: str, interface: Interface, files: FileAccess
+    config: RolloutConfig, uri: str, spec: ControllerSpec, files: FileAccess
 ) -> _SimulatedRobot:
     """Begin the episode of a robot in an environment of its own."""
     robot = read_robot_uri(uri, files)
-    env = TaskEnv(
-        config.task,
+    env, controller = make_env(
+        spec,
         as_primitives(with_library_meshes(robot, files.library), files.library_folders),
+        config.seed,
         sim=config.simulator,
         obstacles=config.obstacles,
-        layouts="eval",
-        kind=interface.kind,
-        observe=interface.channels,
-        config=task_config_of(policy, config.task),
-        max_links=interface.max_links,
+        config=spec.task_config,
         library=files.library_folders,
     )
     with contextlib.ExitStack() as stack:
         stack.callback(env.close)
-        controller = make_controller(policy, env, config.seed)
         env.batch.reset(config.seed)
-        start, spec = render_state(env.batch), env.env_spec
+        start, env_spec = render_state(env.batch), env.env_spec
         track = Track(
             split_colours(robot),
             uri,
-            spec.scene.ground,
+            env_spec.scene.ground,
             env.batch.layouts.obstacles(0),
-            TASKS[spec.task].markers(spec.config, spec.goals),
-            spec.scene.block.size if spec.scene.block else None,
+            TASKS[env_spec.task].markers(env_spec.config, env_spec.goals),
+            env_spec.scene.block.size if env_spec.scene.block else None,
             [start.q],
             [] if start.block is None else [start.block],
             {name: [pose] for name, pose in start.markers.items()},

@@ -69,23 +69,13 @@ def _policy(text: str) -> str:
 def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
     with status(args, "loading"):
-        from morphgen.rl.play import (
-            FPS,
-            interface_of,
-            make_controller,
-            play,
-            require_policy,
-            task_config_of,
-        )
-        from morphgen.tasks.gym_env import TaskEnv
+        from morphgen.rl.play import FPS, make_env, play, read_controller
         from morphgen.tasks.renderer import require_video_path, write_video
 
-    require_policy(args.policy, args.task)
+    spec = read_controller(args.policy, args.task)
     if args.out is not None:
         require_video_path(args.out)
-    interface = interface_of(args.policy)
-    task_config = task_config_of(args.policy, args.task)
-    (config,) = opt.with_goal([task_config], args.goal, [args.task])
+    (config,) = opt.with_goal([spec.task_config], args.goal, [args.task])
     robot, target = " ".join(args.words), TASKS[args.task].target
     episodes = itertools.count(1)
 
@@ -98,22 +88,19 @@ def play(args: argparse.Namespace) -> None:
         )
 
     with bar(args, f"preparing {robot} and its goals") as progress:
-        env = TaskEnv(
-            args.task,
+        env, controller = make_env(
+            spec,
             robot,
+            args.seed,
+            kind=args.kind,
             sim=args.sim,
             obstacles=args.obstacles,
-            layouts="eval",
-            kind=args.kind or interface.kind,
-            observe=interface.channels,
             config=config,
-            max_links=interface.max_links,
             progress=progress,
             library=args.library,
             render_mode=None if args.out is None else "rgb_array",
         )
     with closing(env), status(args, "running the episodes"):
-        controller = make_controller(args.policy, env, args.seed)
         frames = play(env, controller, args.episodes, args.seed, report)
         if args.out is None:
             deque(frames, maxlen=0)

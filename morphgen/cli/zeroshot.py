@@ -83,24 +83,18 @@ def _table(results: list[ZeroShotResult]) -> str:
 
 
 def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
-    from morphgen.rl.play import FPS, interface_of, make_controller, play
-    from morphgen.tasks.gym_env import TaskEnv
+    from morphgen.rl.play import FPS, make_env, play, read_controller
     from morphgen.tasks.renderer import write_video
 
-    interface = interface_of(str(policy))
-    env = TaskEnv(
-        "reach",
+    env, controller = make_env(
+        read_controller(str(policy), "reach"),
         source.name,
+        args.seed,
         sim=args.sim or "mujoco",
         obstacles=args.obstacles,
-        layouts="eval",
-        kind=interface.kind,
-        observe=interface.channels,
-        max_links=interface.max_links,
         library=args.library,
         render_mode="rgb_array",
     )
     with closing(env):
-        controller = make_controller(str(policy), env, args.seed)
         frames = play(env, controller, FILM_EPISODES, args.seed, lambda episode: None)
         write_video(frames, args.out, FPS)

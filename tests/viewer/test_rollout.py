@@ -15,9 +15,8 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
 from morphgen.rl import runs
-from morphgen.rl.play import make_controller, play
+from morphgen.rl.play import make_env, play, read_controller
 from morphgen.rl.training import train
-from morphgen.tasks.gym_env import TaskEnv
 from morphgen.viewer.address import Address
 from morphgen.viewer.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
@@ -61,9 +60,10 @@ def episode(files, cache):
 
 @pytest.mark.slow
 def test_episode_equals_that_of_morphgen_play(episode):
-    env = TaskEnv("reach", "planar-cube", sim="mujoco")
+    spec = read_controller("ik", "reach")
+    env, controller = make_env(spec, "planar-cube", 3, sim="mujoco")
     results = []
-    list(play(env, make_controller("ik", env, 3), 1, 3, results.append))
+    list(play(env, controller, 1, 3, results.append))
     env.close()
     track = episode.tracks[0]
     (result,) = results
