@@ -28,6 +28,11 @@ _BLOCK, _OBSTACLE = (0.90, 0.55, 0.15, 1.0), (0.55, 0.25, 0.25, 1.0)
 _FRAME_MARKER, _BOX_MARKER = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
 _AXES = ((0.85, 0.15, 0.15, 1.0), (0.15, 0.70, 0.15, 1.0), (0.15, 0.30, 0.90, 1.0))
 _GREY = (0.65, 0.67, 0.70, 1.0)
+_LIGHT = np.array([-0.4, 0.3, -1.0])
+"""Direction of the light that casts shadows."""
+_GROUND_SPACING = 2.0
+"""Distance between the ground's vertices [m]. Without a GPU, a frame takes 15 ms longer with 0.1 m,
+and no pixel changes by more than 1%."""
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 """Corners of a cube of edge 1."""
 
@@ -73,7 +78,7 @@ def render_model(
     if scene.ground is not None:
         points = points[points[:, 2] >= scene.ground - 1e-6]
     spec = to_spec(_visible(robot))
-    _add_surroundings(spec, scene, float(np.ptp(points, axis=0).max()))
+    _add_surroundings(spec, scene, points)
     obstacles = []
     for obstacle in scene.obstacles:
         obstacles.append(spec.worldbody.add_body(mocap=True))
@@ -112,8 +117,9 @@ def _visible(robot: Robot) -> Robot:
     return replace(coloured, links=tuple(links), ignore_pairs=())
 
 
-def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
-    """Add sky, light and ground."""
+def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, points: Array) -> None:
+    """Add sky, ground, and a light whose shadow map is centred on the points."""
+    low, high = points.min(axis=0), points.max(axis=0)
     spec.add_texture(
         name="morphgen/sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -125,8 +131,8 @@ def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
     )
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=[extent, -extent, 3 * extent],
-        dir=[-0.4, 0.3, -1.0],
+        pos=(low + high) / 2 - 3 * (high - low).max() * _LIGHT,
+        dir=_LIGHT,
         diffuse=[0.5, 0.5, 0.5],
         specular=[0.1, 0.1, 0.1],
         castshadow=True,
@@ -152,7 +158,7 @@ def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "morphgen/squares"
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[20, 20, 0.1],
+        size=[20, 20, _GROUND_SPACING],
         pos=[0.0, 0.0, height],
         material="morphgen/ground",
     )

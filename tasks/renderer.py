@@ -41,9 +41,12 @@ _AZIMUTH, _ELEVATION = 220.0, -25.0
 """MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
 _MARGIN = 0.92
 """Fraction of the picture that the points in view fill."""
-_SHADOW_SIZE = 2048
-"""Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take half of
-the time; smoothed edges would take as long again, and are hardly visible in a video."""
+_SHADOW_SIZE = 1024
+"""Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take two
+thirds of the time; smoothed edges would take even longer, and are hardly visible in a video."""
+_SHADOW_CLIP = 0.8
+"""Half the width of the shadow map [extent of the scene, 1.5 edges of the cube in view]: more than
+half the cube's diagonal, and little more, so that shadows have sharp edges."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
 """Pose of bodies that must not be visible."""
 _NUM_STARTS = 32
@@ -100,7 +103,7 @@ class Renderer:
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_SIZE, 0
         low, high = self._model.points.min(axis=0), self._model.points.max(axis=0)
         model.stat.center[:], model.stat.extent = (low + high) / 2, 1.5 * (high - low).max()
-        model.vis.map.shadowclip = 2.0
+        model.vis.map.shadowclip = _SHADOW_CLIP
         light = model.vis.headlight
         light.ambient[:], light.diffuse[:], light.specular[:] = 0.35, 0.35, 0.1
         self._data = mujoco.MjData(model)
