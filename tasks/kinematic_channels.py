@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -16,6 +17,7 @@ from morphgen.benchmark.token_layout import GEOMETRY, SHAPE_POSE
 from morphgen.errors import TaskError
 from morphgen.model.inverse_kinematics_torch import dls_step, pose_task
 from morphgen.model.kinematics_torch import (
+    FrameChain,
     compile_tree,
     forward_kinematics,
     frame_jacobian,
@@ -64,21 +66,29 @@ DAMPING = 0.03
 class _State:
     """Quantities that several channels are computed from; n environments, J joints."""
 
+    chain: FrameChain
+    """Chains of the tools."""
+    robot_index: torch.Tensor
+    """Robot of each environment, shape (n,), int64."""
     q: torch.Tensor
     """Joint positions, shape (n, J) [rad or m]."""
     targets: torch.Tensor
     """Joint targets, shape (n, J) [rad or m]."""
-    T_root_tool: torch.Tensor
-    """Pose of the tool, shape (n, 4, 4)."""
-    J_root_tool: torch.Tensor
-    """Jacobian of the tool at ``q``, shape (n, 6, J)."""
-    T_root_target: torch.Tensor
-    """Pose that the tool will have once the joints are at their targets, shape (n, 4, 4)."""
     T_root_link: torch.Tensor | None
     """Poses of the links, shape (n, L, 4, 4), if a channel needs them."""
     goals: ToolTargets
     block_pose: torch.Tensor
     """Poses of the blocks, shape (n, 7)."""
+
+    @cached_property
+    def tool(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Pose of the tool, shape (n, 4, 4), and its Jacobian, shape (n, 6, J), at ``q``."""
+        return frame_jacobian(self.chain, self.robot_index, self.q)
+
+    @cached_property
+    def T_root_target(self) -> torch.Tensor:
+        """Pose that the tool will have once the joints are at their targets, shape (n, 4, 4)."""
+        return frame_pose(self.chain, self.robot_index, self.targets)
 
 
 class KinematicChannels:
@@ -173,14 +183,12 @@ class KinematicChannels:
             goals: Points and orientations that the tasks want the tool at.
             block_pose: Poses of the blocks, shape (n, 7).
         """
-        chain, index, tree = self._tables.tool_chain, self._index, self._tree
-        T_root_tool, J_root_tool = frame_jacobian(chain, index, q)
+        index, tree = self._index, self._tree
         state = _State(
+            chain=self._tables.tool_chain,
+            robot_index=index,
             q=q,
             targets=targets,
-            T_root_tool=T_root_tool,
-            J_root_tool=J_root_tool,
-            T_root_target=frame_pose(chain, index, targets),
             T_root_link=None if tree is None else forward_kinematics(tree, index, q),
             goals=goals,
             block_pose=block_pose,
@@ -221,16 +229,17 @@ class KinematicChannels:
         assert T_root_link is not None
         R_root_joint = T_root_link[..., :3, :3] @ self._R_joint_canonical
         origins = T_root_link[..., :3, 3]
-        to_tool = state.T_root_tool[:, None, :3, 3] - origins
+        to_tool = state.tool[0][:, None, :3, 3] - origins
         to_points = (state.goals.points[:, None] - origins[:, :, None]).flatten(2)
         vectors = POSITION_SCALE * torch.cat([origins, to_tool, to_points], dim=-1)
         poses = torch.cat([R_root_joint[..., 0], R_root_joint[..., 2], vectors], dim=-1)
         return poses * self._link_mask[..., None]
 
     def _jacobian(self, state: _State) -> torch.Tensor:
-        linear, angular = state.J_root_tool[:, :3], state.J_root_tool[:, 3:]
+        T_root_tool, J_root_tool = state.tool
+        linear, angular = J_root_tool[:, :3], J_root_tool[:, 3:]
         goals, step = state.goals, self._max_step[:, None]
-        tool, later_tool = state.T_root_tool[:, :3, 3], state.T_root_target[:, :3, 3]
+        tool, later_tool = T_root_tool[:, :3, 3], state.T_root_target[:, :3, 3]
         displacement = COLUMN_SCALE * linear * step
         columns = [displacement, ROTATION_SCALE * angular * step]
         columns.append(torch.linalg.vector_norm(displacement, dim=1, keepdim=True))
@@ -240,7 +249,7 @@ class KinematicChannels:
             columns.append(self._at_joints(POSITION_SCALE * error))
             columns += [self._products(linear, error), self._products(linear, later_error)]
         if goals.rotations is not None:
-            error = _rotation_error(goals, state.T_root_tool)
+            error = _rotation_error(goals, T_root_tool)
             columns += [self._at_joints(error), self._products(angular, error)]
         if self._has_block is not None:
             point, J_root_point = self._nearest_point(state)
@@ -250,7 +259,7 @@ class KinematicChannels:
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
 
     def _dls(self, state: _State) -> torch.Tensor:
-        goals, J = state.goals, state.J_root_tool
+        goals, (_, J) = state.goals, state.tool
         later_tool = state.T_root_target[:, :3, 3]
         errors = (goals.points - later_tool[:, None]) * goals.exists[..., None]
         columns = [self._dls_step(J[:, :3], error, state.targets) for error in errors.unbind(1)]
