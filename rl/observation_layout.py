@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from morphgen.errors import TaskError
 from morphgen.rl.heads import REST
-from morphgen.tasks.kinematic_channels import KINEMATIC_CHANNELS
+from morphgen.tasks.channels import KINEMATIC_CHANNELS
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import STANDARD_FIELDS

@@ -16,7 +16,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.kinematic_channels import KINEMATIC_CHANNELS
+from morphgen.tasks.channels import KINEMATIC_CHANNELS
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.numpy_step import EnvStep, numpy_stepper, pad_action
 from morphgen.tasks.observation import Observation, ObservationConfig

@@ -33,8 +33,6 @@ from morphgen.tasks.ik_channel import FirstFree, IkSolutions
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.tool_targets import ToolTargets
 
-KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik")
-"""Names of the channels, in the order in which networks concatenate them."""
 IK_SHARE = 4
 """Column of the channel ``ik`` with the joint's action along the straight path, -1 to 1."""
 MAX_LAG = 3.0
@@ -138,7 +136,7 @@ class KinematicChannels:
         Args:
             tables: The robots.
             env_robot_index: Robot of each environment, shape (n,), int64.
-            names: Channels to compute, of ``KINEMATIC_CHANNELS``.
+            names: Channels to compute, of ``channels.KINEMATIC_CHANNELS``.
             has_block: Environments with a block, shape (n,), bool.
             first_free: Test of straight paths, for ``ik``.
         """

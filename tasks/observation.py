@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
 from morphgen.model.rotation_torch import matrix_from_quaternion
-from morphgen.tasks.kinematic_channels import KINEMATIC_CHANNELS
+from morphgen.tasks.channels import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Block, Scene
 
@@ -85,15 +85,8 @@ class ObservationConfig:
         return tuple(name for name in KINEMATIC_CHANNELS if getattr(self, name))
 
 
-CHANNELS = (
-    *KINEMATIC_CHANNELS,
-    *("velocity", "previous_action", "tree", "points", "no_state"),
-)
-"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
-
-
 def observation_config(names: Collection[str], *, obstacles: int = 0) -> ObservationConfig:
-    """Return the config of observations with some entries of ``CHANNEL_NAMES``.
+    """Return the config of observations with some entries of ``CHANNELS``.
 
     Args:
         names: The entries; ``points`` are ``NUM_POINTS``, and ``no_state`` hides the state.

@@ -24,6 +24,7 @@ from morphgen.cli.training_robots import (
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.presets import PRESETS, preset_of
+from morphgen.tasks.channels import CHANNELS
 from morphgen.tasks.registry import TASKS, default_simulator
 
 if TYPE_CHECKING:
@@ -120,8 +121,7 @@ OBSERVE = option(
     "--observe",
     metavar="A,B,...",
     default="",
-    help="further channels of the observations: lag, joint, poses, jacobian, dls, ik, "
-    "velocity, previous-action, points, no-state",
+    help="further channels of the observations: " + ", ".join(CHANNELS).replace("_", "-"),
 )
 RESUME = flag("--resume", "continue the run in the output folder")
 
