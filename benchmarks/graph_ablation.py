@@ -11,9 +11,9 @@ advantages normalized robot by robot, and with the mean entropy of the joints; a
 
 from __future__ import annotations
 
+import runpy
 import sys
 
-from morphgen.cli import main
 from morphgen.rl.agents import AGENTS, Agent
 
 WITHOUT_TREE, BLIND_CRITIC = "graph-without-tree", "graph-blind-critic"
@@ -39,4 +39,5 @@ if __name__ == "__main__":
     AGENTS.register(variant(WITHOUT_TREE, "no_tree"))
     AGENTS.register(variant(BLIND_CRITIC, "blind_critic"))
     agents = [] if "--agents" in sys.argv else ["--agents", ",".join(AGENT_LABELS)]
-    sys.exit(main(["study", *sys.argv[1:], *agents]))
+    sys.argv = ["morphgen", "study", *sys.argv[1:], *agents]
+    runpy.run_module("morphgen", run_name="__main__", alter_sys=True)
