@@ -148,7 +148,8 @@ def _write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     "list the parts that morphgen compose joins",
     option("kind", nargs="?", choices=list(PART_KINDS), help="list only this kind"),
     *opt.LIBRARY_JSON,
-    details="The columns are degrees of freedom, reach (m), mass (kg), source and licence.",
+    details="The columns are degrees of freedom, reach (m), mass (kg), source, licence "
+    "and manufacturer of the real product.",
     examples=("list arms",),
 )
 def list_parts(args: argparse.Namespace) -> None:

@@ -32,7 +32,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
 
     Returns:
         Rows with name, kind, dof, reach (from the mount to the farthest port or tool, the largest
-        over all configurations) [m], mass [kg], source, licence and summary.
+        over all configurations) [m], mass [kg], source, licence, manufacturer and summary.
     """
     stored: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
     rows: list[dict[str, object]] = []
@@ -48,6 +48,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
                 **{key: facts[key] for key in ("dof", "reach", "mass")},
                 "source": source.package if isinstance(source, PackageSource) else "template",
                 "licence": manifest.licence,
+                "manufacturer": manifest.manufacturer,
                 "summary": manifest.summary,
             }
         )

@@ -71,6 +71,8 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     root: str
     """Link whose subtree is the part."""
     licence: str
+    manufacturer: str = ""
+    """Manufacturer of the real product, such as ``Kinova``; empty for a part that is none."""
     path: Path = Path()
     """The YAML file."""
     package_source: PackageSource | None = field(default=None, name="source")

@@ -33,6 +33,13 @@ def test_stored_facts_equal_the_computed_ones(name):
     assert STORED[name] == compute_facts(LIBRARY.manifest(name))
 
 
+def test_every_real_part_has_a_manufacturer():
+    real = [manifest for manifest in LIBRARY.manifests() if not manifest.is_template]
+    assert [manifest.name for manifest in real if not manifest.manufacturer] == []
+    rows = {row["name"]: row["manufacturer"] for row in catalogue(LIBRARY)}
+    assert (rows["mico"], rows["lwr"], rows["plane"]) == ("Kinova", "KUKA", "")
+
+
 def test_the_shipped_catalogue_loads_no_part(monkeypatch):
     monkeypatch.setattr(module, "compute_facts", None)
     assert len(catalogue(LIBRARY)) == len(STORED)
