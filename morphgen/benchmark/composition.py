@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,34 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from morphgen.benchmark.generate import SplitRequest, assemble
-from morphgen.benchmark.regimes import NOTHING, combination, parts
+from morphgen.benchmark.part_patterns import NOTHING, pattern_robots
+from morphgen.benchmark.regimes import combination, parts
 from morphgen.benchmark.robot_factory import ComposedRecipe, Progress, RobotFactory, make_robots
 from morphgen.benchmark.split import Member, Split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
-from morphgen.grammar.request import parse_words
 
 NUM_ATTEMPTS = 50
 """Number of random orders in which candidates are held out before the search fails."""
-_CHOICE = re.compile(r"\{([^{}]*)\}")
-
-
-def expand(pattern: str) -> list[tuple[str, ...]]:
-    """Expand the choices in braces in arguments of ``morphgen compose``: the product of all.
-
-    Args:
-        pattern: A pattern such as ``arm={ur5,panda} ee={plane,stick}``.
-
-    Raises:
-        BenchmarkError: If braces do not match, or contain an empty or repeated choice.
-    """
-    joined = _CHOICE.sub(lambda match: re.sub(r"\s", "", match[0]), pattern)
-    if "{" in _CHOICE.sub("", joined) or "}" in _CHOICE.sub("", joined):
-        raise BenchmarkError(f"--from {pattern!r}: a brace is not closed, or opened twice")
-    words = [_choices(word, pattern) for word in joined.split()]
-    if not words:
-        raise BenchmarkError("--from is empty; expected such as 'arm={ur5,panda} ee={plane,stick}'")
-    return list(itertools.product(*words))
 
 
 def composition(
@@ -56,7 +36,7 @@ def composition(
 
     Args:
         request: Sizes, tasks and seed. Without a size, all remaining candidates are train robots.
-        patterns: Patterns of the candidates, see ``expand``.
+        patterns: Patterns of the candidates, see ``pattern_robots``.
         library: The library of parts.
         jobs: Number of processes.
         progress: Receives the number of robots that are finished.
@@ -102,30 +82,13 @@ def composition(
     )
 
 
-def _choices(word: str, pattern: str) -> list[str]:
-    """Return a word once for each choice in its braces."""
-    fixed = _CHOICE.split(word)[::2]
-    choices = [match.split(",") for match in _CHOICE.findall(word)]
-    for options in choices:
-        twice = [choice for choice, times in Counter(options).items() if times > 1]
-        if "" in options or twice:
-            what = f"has {twice[0]!r} twice" if twice and twice[0] else "has an empty choice"
-            raise BenchmarkError(f"--from {pattern!r}: {{{','.join(options)}}} {what}")
-    return [
-        "".join(
-            piece for pair in itertools.zip_longest(fixed, chosen, fillvalue="") for piece in pair
-        )
-        for chosen in itertools.product(*choices)
-    ]
-
-
 def _candidates(
     patterns: Sequence[str], tasks: Sequence[str], library: Library
 ) -> Iterator[HoldoutCandidate]:
     """Yield every robot of the patterns once for each task."""
     name_by_derivation: dict[str, str] = {}
-    for words in itertools.chain.from_iterable(map(expand, patterns)):
-        derivation, name = parse_words(words, library)
+    for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
+        derivation, name = robot.derivation, robot.name
         if str(derivation) in name_by_derivation:
             continue
         if name in name_by_derivation.values():
@@ -134,7 +97,7 @@ def _candidates(
         *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
         properties = (str(derivation), combination(derivation), parts(derivation), last)
         for task in tasks:
-            yield HoldoutCandidate(name, words, *properties, task)
+            yield HoldoutCandidate(name, robot.words, *properties, task)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,10 @@ from morphgen.model.robot import (
     Robot,
 )
 
-Regime = Literal["interpolation", "composition", "extrapolation"]
-REGIMES: tuple[Regime, ...] = ("interpolation", "composition", "extrapolation")
+Regime = Literal["interpolation", "composition", "extrapolation", "hold-out"]
+REGIMES: tuple[Regime, ...] = ("interpolation", "composition", "extrapolation", "hold-out")
+HOLD_OUT: Regime = "hold-out"
+"""Regime of splits whose test robots have what ``provenance`` says is held out."""
 Side = Literal["train", "test"]
 SIDES: tuple[Side, ...] = ("train", "test")
 
@@ -30,6 +32,8 @@ COMPOSED = "composed"
 """Category of a robot that was not sampled from a grammar."""
 MAX_LINKS_KEY = "max_links"
 """Key in ``provenance`` of the largest number of links, if it is not the paper's."""
+HOLD_OUT_KEY = "hold_out"
+"""Key in ``provenance`` of the rules that say what is held out, see ``held_out``."""
 
 
 @dataclass(frozen=True)

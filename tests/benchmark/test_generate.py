@@ -10,10 +10,11 @@ import morphgen
 from helpers.grammars import grammar, shipped
 from morphgen.benchmark import generate, robot_factory
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.composition import composition, expand
+from morphgen.benchmark.composition import composition
 from morphgen.benchmark.extrapolation import Bound, extrapolation, parse_bound
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.interpolation import interpolation
+from morphgen.benchmark.part_patterns import expand
 from morphgen.benchmark.regimes import parameters, parts, regime_findings, structure
 from morphgen.benchmark.robot_factory import (
     ComposedRecipe,
