@@ -38,7 +38,7 @@ FIELDS = (
 OPTIONAL = ("reference", "made", "accepted", "statistics")
 MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
 """Keys of a robot, in order."""
-ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
 
 TASK_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 _BODY = re.compile(rf"[0-9a-f]{{{HASH_LENGTH}}}")
@@ -180,7 +180,7 @@ class _Reader:
         name = self._text(fields["name"], "name")
         if not ROBOT_NAME.fullmatch(name):
             raise self._fail(
-                fields["name"], f"name: {name!r}: use letters, digits, '-', '_' and '.'"
+                fields["name"], f"name: {name!r}: use letters, digits, '-', '_', '+' and '.'"
             )
         body = self._text(fields["body"], "body")
         if not _BODY.fullmatch(body):
@@ -381,7 +381,9 @@ def _plain_data(value: object) -> object:
 
 def _member_line(member: Member) -> str:
     if not ROBOT_NAME.fullmatch(member.name):
-        raise BenchmarkError(f"robot name {member.name!r}: use letters, digits, '-', '_' and '.'")
+        raise BenchmarkError(
+            f"robot name {member.name!r}: use letters, digits, '-', '_', '+' and '.'"
+        )
     values = ", ".join(
         _pair(key, member.robot_hash if key == "body" else getattr(member, key)) for key in MEMBER
     )

@@ -35,7 +35,7 @@ PICTURE = "preview.png"
 MESHES = "meshes"
 XACRO = ".xacro"
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
 
 
 def bundle_folder(parent: Path, name: str) -> Path:
@@ -46,7 +46,7 @@ def bundle_folder(parent: Path, name: str) -> Path:
     """
     if not _NAME.fullmatch(name):
         raise FormatError(
-            f"name {name!r}: use letters, digits, '-', '_' and '.', a letter or digit first, "
+            f"name {name!r}: use letters, digits, '-', '_', '+' and '.', a letter or digit first, "
             "at most 200"
         )
     return parent / name
