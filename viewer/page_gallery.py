@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from morphgen.benchmark.split import REGIMES, Member
+from morphgen.benchmark.split import Member
 from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
@@ -18,7 +18,7 @@ from morphgen.viewer.gallery_grid import (
 )
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
-from morphgen.viewer.splits import make_member, save_split
+from morphgen.viewer.splits import SAVED_REGIMES, make_member, save_split
 
 
 def show(session: Session) -> None:
@@ -61,7 +61,7 @@ def _add_split_form(gallery: Gallery) -> None:
     with gui.add_folder("New split", expand_by_default=False):
         gui.add_html(markup.framed(markup.dim("train: pass the filter; test: do not")))
         name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", REGIMES)
+        regime = gui.add_dropdown("regime", SAVED_REGIMES)
         task = gui.add_dropdown("task", tuple(TASKS))
         obstacles = gui.add_checkbox("obstacles", False)
         num_train = gui.add_number("to train on", 10, min=1, step=1)

@@ -11,7 +11,7 @@ import viser
 
 from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
-from morphgen.benchmark.split import REGIMES, SIDES, Member, Split, split_id
+from morphgen.benchmark.split import SIDES, Member, Split, split_id
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.figures import heatmap_svg, map_svg
@@ -25,7 +25,7 @@ from morphgen.viewer.gallery_grid import (
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.session import Session
-from morphgen.viewer.splits import SplitStudy, save_split, study_split
+from morphgen.viewer.splits import SAVED_REGIMES, SplitStudy, save_split, study_split
 
 PANEL_WIDTH = 520.0
 """Width of the panel [pixels]."""
@@ -185,7 +185,8 @@ def _add_split_form(gallery: Gallery, split: Split) -> None:
     gui, session = gallery.session.client.gui, gallery.session
     with gui.add_folder("New split of what is shown", expand_by_default=False):
         name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", REGIMES, initial_value=split.regime)
+        shown = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
+        regime = gui.add_dropdown("regime", SAVED_REGIMES, initial_value=shown)
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
         text = gui.add_html("")
 

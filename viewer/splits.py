@@ -11,7 +11,16 @@ import numpy as np
 from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import COMPOSED, SIDES, Member, Regime, Side, Split
+from morphgen.benchmark.split import (
+    COMPOSED,
+    HOLD_OUT,
+    REGIMES,
+    SIDES,
+    Member,
+    Regime,
+    Side,
+    Split,
+)
 from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.benchmark.statistics import summarize_survey
 from morphgen.benchmark.survey import (
@@ -36,6 +45,8 @@ from morphgen.viewer.robot_uri import (
 )
 from morphgen.viewer.workers import Workers
 
+SAVED_REGIMES = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
+"""Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
 SPLITS = "splits"
 """Folder in which new splits are written."""
 MAX_NAME = 200

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.benchmark.extrapolation import parse_bound
+from morphgen.benchmark.holdout_audit import hold_out_findings, says_what_is_held_out
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, no_progress
 
 
@@ -112,10 +113,12 @@ def audit(
     - ``body-near``: a test robot is a near duplicate of one, see ``NearThresholds``;
     - ``name-shared``: a train and a test robot with the same name are different;
     - ``similarity-bound``: a test robot violates the bound that the split was made with;
-    - those of ``regime_findings``.
+    - those of ``regime_findings``;
+    - those of ``hold_out_findings``, if the split says what it holds out.
 
-    Warnings: ``body-repeated`` (a side has a robot twice at one task) and ``accepted-unused`` (the
-    split accepts a finding that does not occur).
+    ``body-repeated`` (a side has a robot twice at one task) is an error if the split says what it
+    holds out, because such splits are made without repeated robots; else it is a warning. So is
+    ``accepted-unused`` (the split accepts a finding that does not occur).
 
     Args:
         split: The split.
@@ -202,6 +205,7 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
 
 def _repeated(split: Split) -> Iterator[Finding]:
     """Yield robots that a side has twice."""
+    severity: Severity = "error" if says_what_is_held_out(split) else "warning"
     for side in SIDES:
         first: dict[tuple[object, ...], str] = {}
         for member in split.side(side):
@@ -209,7 +213,7 @@ def _repeated(split: Split) -> Iterator[Finding]:
             earlier = first.setdefault(key, member.name)
             if earlier != member.name:
                 why = f"{side} robot {earlier} has the same body and task"
-                yield replace(_finding("body-repeated", side, member, why), severity="warning")
+                yield replace(_finding("body-repeated", side, member, why), severity=severity)
 
 
 def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ...]:
@@ -221,7 +225,10 @@ def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ..
     if not composable["train"]:
         return ()
     split = replace(survey.split, train=tuple(composable["train"]), test=tuple(composable["test"]))
-    return regime_findings(split, library)
+    findings = regime_findings(split, library)
+    if says_what_is_held_out(survey.split):
+        findings += hold_out_findings(split, library)
+    return findings
 
 
 def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:

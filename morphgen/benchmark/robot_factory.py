@@ -16,7 +16,7 @@ from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.grammar.compose import compose
+from morphgen.grammar.compose import compose, join
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar, grammar_names
 from morphgen.grammar.library import Library
@@ -48,7 +48,29 @@ class ComposedRecipe:
     """Name of the robot; by default made of the names of its parts."""
 
 
-Recipe = SampledRecipe | ComposedRecipe
+@dataclass(frozen=True)
+class DerivedRecipe:
+    """A robot given by its derivation."""
+
+    derivation: Derivation
+    name: str
+    category: str = COMPOSED
+
+
+Recipe = SampledRecipe | ComposedRecipe | DerivedRecipe
+
+
+class UnfitRobotError(BenchmarkError):
+    """A robot can be composed, but cannot be a member of a split."""
+
+    def __init__(self, message: str, reason: str) -> None:
+        """Create the error from its message and a reason that is the same for similar robots."""
+        super().__init__(message, reason)
+        self.reason = reason
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return str(self.args[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +106,7 @@ class RobotFactory:
         """Make a robot.
 
         Raises:
-            BenchmarkError: If ``morphgen check`` reports an error of a composed robot, or a robot
+            UnfitRobotError: If ``morphgen check`` reports an error of a composed robot, or a robot
                 has more than ``max_links`` links.
             SamplingError: If the grammar gives no valid robot.
             MorphgenError: If the recipe names an unknown part, or its parts do not fit.
@@ -94,14 +116,30 @@ class RobotFactory:
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
             )
             return self._candidate(sample.robot, sample.derivation, recipe.grammar.name)
+        if isinstance(recipe, DerivedRecipe):
+            return self._composed(
+                recipe.derivation, recipe.name, recipe.category, str(recipe.derivation)
+            )
         derivation, name = parse_words(recipe.words, self.library)
-        robot = compose(derivation, self.library, recipe.name or name)
+        category = category_of(recipe.words, self.library)
+        return self._composed(derivation, recipe.name or name, category, " ".join(recipe.words))
+
+    def _composed(self, derivation: Derivation, name: str, category: str, source: str) -> Candidate:
+        """Make a robot that nothing has checked before; ``source`` names it in messages."""
+        # Joining parts is fast, and the search for contacts of a composed robot is not.
+        self._require_links(join(derivation, self.library, name))
+        robot = compose(derivation, self.library, name)
         for finding in check(robot):
             if finding.severity == "error":
-                raise BenchmarkError(
-                    f"{' '.join(recipe.words)}: {finding.code} at {finding.where}: {finding.why}"
-                )
-        return self._candidate(robot, derivation, category_of(recipe.words, self.library))
+                text = f"{source}: {finding.code} at {finding.where}: {finding.why}"
+                raise UnfitRobotError(text, f"an error of morphgen check: {finding.code}")
+        return self._candidate(robot, derivation, category)
+
+    def _require_links(self, robot: Robot) -> None:
+        try:
+            require_max_links(len(robot.links), f"robot {robot.name!r}", self.max_links)
+        except BenchmarkError as error:
+            raise UnfitRobotError(str(error), f"more than {self.max_links} links") from error
 
     def _candidate(self, robot: Robot, derivation: Derivation, category: str) -> Candidate:
         # The text of a derivation has 12 digits per number. A split stores the text, so the robot
@@ -109,7 +147,7 @@ class RobotFactory:
         written = parse_derivation(str(derivation))
         if written != derivation:
             robot = compose(written, self.library, robot.name)
-        require_max_links(len(robot.links), f"robot {robot.name!r}", self.max_links)
+        self._require_links(robot)
         robot_features = None
         if self.with_features:
             shapes = token_shapes(robot, self.folders)
