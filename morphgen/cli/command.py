@@ -110,7 +110,8 @@ class Command:
     options: Options = ()
     """Options and positional arguments."""
     run: Run | None = None
-    """Function that runs the command; it may return an exit code. None for a group."""
+    """Function that runs the command; it may return an exit code. None for a group that needs one
+    of its commands."""
     details: str = ""
     """Sentences that follow the summary in the command's own help."""
     examples: Sequence[str] = ()
@@ -124,7 +125,9 @@ class Command:
         """Add the command's parser to those of its group."""
         parser = parsers.add_parser(self.name, help=self.summary, **self._texts())
         if self.commands:
-            add_commands(parser, self.commands, required=True)
+            is_required = self.run is None
+            add_commands(parser, self.commands, required=is_required, dest="subcommand")
+        if self.run is None:
             return
         for entry in self.options:
             alternatives = entry if isinstance(entry, tuple) else (entry,)
@@ -172,11 +175,15 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_commands(
-    parser: argparse.ArgumentParser, commands: Sequence[Command], *, required: bool = False
+    parser: argparse.ArgumentParser,
+    commands: Sequence[Command],
+    *,
+    required: bool = False,
+    dest: str = "command",
 ) -> None:
-    """Add commands to a parser; the chosen one sets ``run`` and ``parser``."""
+    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest."""
     parsers = parser.add_subparsers(
-        metavar="COMMAND", dest="command", required=required, parser_class=Parser
+        metavar="COMMAND", dest=dest, required=required, parser_class=Parser
     )
     for entry in commands:
         entry.add_to(parsers)

@@ -14,7 +14,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Command, command, flag, option
 from morphgen.cli.progress import bar
 from morphgen.cli.split_checks import audit, build, verify
-from morphgen.cli.split_new import new
+from morphgen.cli.split_regimes import new
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Member, Split

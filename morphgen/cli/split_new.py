@@ -1,15 +1,14 @@
-"""``morphgen split new``: robots chosen by the rules of a regime."""
+"""Choose the robots of splits and write them: what ``morphgen split new`` does for any regime."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.tasks.registry import TASKS
@@ -52,86 +51,9 @@ def new_split(args: argparse.Namespace) -> None:
         for split, path in zip(splits, paths, strict=True)
     ]
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
+    lines += _hold_out_notes(splits[-1], library)
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))
-
-
-def _regime_options(train: str, train_default: str = "") -> tuple[Option, ...]:
-    return (
-        option(
-            "--train",
-            metavar="N,...",
-            default=train,
-            help="number of train robots; several numbers give a split each, with the same test "
-            f"robots, the smaller within the larger (default: {train_default or train})",
-        ),
-        option("--test", type=int, default=1, metavar="N", help="number of test robots"),
-        option(
-            "--task", default="reach", metavar="TASK,...", help="one task, or several with commas"
-        ),
-        flag("--obstacles", "tasks have obstacles"),
-        opt.SEED,
-        number(
-            "--max-links",
-            "largest number of links of a robot, and the number that its tokens are padded to "
-            "(default: 23)",
-            least=2,
-        ),
-        option("--name", help="name of the split (default: from the other options)"),
-        path_option(
-            "--out",
-            "FILE.yaml|DIR",
-            "the file, or the folder where NAME.yaml goes (default: this folder)",
-            default=Path(),
-        ),
-        flag("--statistics", "add the statistics of morphgen split stats to the file"),
-        *opt.JOBS_LIBRARY_JSON,
-    )
-
-
-def _interpolation(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.interpolation import interpolation
-
-    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
-    return interpolation(
-        request, grammar, library, hull=args.hull, jobs=args.jobs, progress=progress
-    )
-
-
-def _composition(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.composition import composition
-
-    return composition(request, args.patterns, library, jobs=args.jobs, progress=progress)
-
-
-def _extrapolation(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.extrapolation import extrapolation, parse_bound
-
-    bound = parse_bound(args.similarity) if args.similarity else None
-    train, test = (
-        [opt.load_grammar_named(name.strip(), library, sound=True) for name in names.split(",")]
-        for names in (args.train_category, args.test_category)
-    )
-    return extrapolation(
-        request, train, test, library, similarity=bound, jobs=args.jobs, progress=progress
-    )
-
-
-def _robots_word(args: argparse.Namespace) -> str:
-    """Return a word or two about the robots of a split, for its name."""
-    if args.generate is _interpolation:
-        return Path(args.grammar).stem + ("" if args.hull == "any" else f"-{args.hull}")
-    if args.generate is _extrapolation:
-        return "-".join(Path(name).stem for name in args.test_category.split(","))
-    words = " ".join(args.patterns).split()
-    keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
-    return "-".join(keys) or "robots"
 
 
 def _request(args: argparse.Namespace) -> SplitRequest:
@@ -150,8 +72,12 @@ def _request(args: argparse.Namespace) -> SplitRequest:
         raise BenchmarkError(
             f"--train {args.train}: expected a whole number, or several such as 10,30,100"
         ) from error
-    regime = args.generate.__name__.removeprefix("_")
-    words = [regime, _robots_word(args), *tasks, *(["obstacles"] if args.obstacles else [])]
+    words = [
+        args.regime,
+        args.robots_word(args),
+        *tasks,
+        *(["obstacles"] if args.obstacles else []),
+    ]
     name = args.name or "-".join([*words, f"seed{args.seed}"])
     links = MAX_LINKS if args.max_links is None else args.max_links
     return SplitRequest(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
@@ -189,87 +115,19 @@ def _summary(split: Split, path: Path) -> list[str]:
     return lines
 
 
-REGIMES = (
-    Command(
-        "interpolation",
-        "test robots have the structure of train robots, in other sizes",
-        (
-            option(
-                "--grammar",
-                required=True,
-                help="name of a grammar (see: morphgen grammar list), or its file",
-            ),
-            option(
-                "--hull",
-                choices=["inside", "outside", "any"],
-                default="any",
-                help="parameters of test robots are inside or outside of the convex hull of those "
-                "of the train robots with the same structure",
-            ),
-            *_regime_options("10"),
+def _hold_out_notes(split: Split, library: Library) -> list[str]:
+    """Return what a user of ``--hold-out`` may not expect."""
+    from morphgen.benchmark.holdout_audit import related_parts
+    from morphgen.benchmark.split import HOLD_OUT
+
+    if split.regime != HOLD_OUT:
+        return []
+    left_out = cast("Mapping[str, int]", split.provenance.get("left_out", {}))
+    return [
+        *(f"  left out: {n} drawn robots with {reason}" for reason, n in left_out.items()),
+        *(
+            f"  note: train robots have {', '.join(names)}; --hold-out {rule} excludes parts of "
+            "that manufacturer"
+            for rule, names in related_parts(split, library).items()
         ),
-        new_split,
-        examples=("split new interpolation --grammar arm3 --train 10 --test 1 --hull inside",),
-        defaults={"generate": _interpolation},
-    ),
-    Command(
-        "composition",
-        "test robots join parts that are trained, but not together",
-        (
-            repeated(
-                "--from",
-                "words of morphgen compose with choices in braces",
-                dest="patterns",
-                metavar="WORDS",
-                required=True,
-                default=None,
-            ),
-            *_regime_options("", "all robots that may be trained on"),
-        ),
-        new_split,
-        details="Every part of a test robot is in a train robot; its combination is in none. With "
-        "several tasks, robot and task are combined: the end-effector of a test robot is trained "
-        "at other tasks only.",
-        examples=(
-            'split new composition --from "arm={ur5,panda} ee={plane,stick,cylinder,sake_ez}" '
-            "--train 7 --test 1 --task push",
-        ),
-        defaults={"generate": _composition},
-    ),
-    Command(
-        "extrapolation",
-        "test robots are of a category that is not trained",
-        (
-            *(
-                option(
-                    f"--{side}-category",
-                    metavar="GRAMMAR,...",
-                    required=True,
-                    help=f"names or files of grammars whose robots are {side} robots, in turn",
-                )
-                for side in ("train", "test")
-            ),
-            option(
-                "--similarity",
-                metavar="BOUND",
-                default="",
-                help="bound on the cosine similarity of each test robot to its nearest train "
-                "robot, such as '<0.6'",
-            ),
-            *_regime_options("10"),
-        ),
-        new_split,
-        details="Neither the category nor the structure of a test robot is trained.",
-        examples=(
-            "split new extrapolation --train-category stick,nlink,prims --test-category chain "
-            '--similarity "<0.6"',
-        ),
-        defaults={"generate": _extrapolation},
-    ),
-)
-new = Command(
-    "new",
-    "choose train and test robots by the rules of a regime, and write them as a split",
-    commands=REGIMES,
-    details="The same seed gives the same bytes, with any number of jobs.",
-)
+    ]

@@ -16,6 +16,8 @@ COMPOSITION = ("split", "new", "composition", "--from", "base=gantry ee={plane,c
 COMPOSITION += ("--from", "arm=lwr ee={plane,cube}")
 EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nlink,prims")
 EXTRAPOLATION += ("--test-category", "chain", "--train", "6")
+HOLD_OUT = ("split", "new", "--hold-out", "ee=plane", "--train", "2")
+HOLD_OUT += ("--from", "arm={lwr,arm3} ee={plane,cube,stick}")
 TRAPS = {
     "task": ("task: reach", "task: push", "the file was changed since it was written"),
     "syntax": ("regime: ", "regime: [", "invalid YAML: "),
@@ -92,6 +94,12 @@ def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
             (3, 1),
         ),
         (COMPOSITION, "composition-ee-reach-seed0", (3, 1)),
+        (HOLD_OUT, "hold-out-ee-plane-reach-seed0", (2, 1)),
+        (
+            (*HOLD_OUT, "--hold-out", "arm3.length=0.3..0.4", "--test", "2", "--task", "push"),
+            "hold-out-ee-plane-arm3.length-0.3..0.4-push-seed0",
+            (2, 2),
+        ),
         (
             (*EXTRAPOLATION, "--similarity", "<0.6", "--test", "2", "--task", "reach,push"),
             "extrapolation-chain-reach-push-seed0",
@@ -112,6 +120,39 @@ def test_every_regime_can_be_created(run, argv, name, counts):
         }
     ]
     assert (len(split.train), len(split.test)) == counts
+
+
+def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(run):
+    words = ("split", "new", "--hold-out", "arm=kinova*", "--name", "my/no-kinova")
+    words += ("--from", "arm={mico,kinova_gen3} ee={plane,stick}", "--train", "2")
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0] == "my/no-kinova.yaml: 2 robots without arm=kinova*; test: 1 with it"
+    assert lines[1] in ("  test: kinova_gen3+plane", "  test: kinova_gen3+stick")
+    assert (
+        "  note: train robots have mico; --hold-out arm.manufacturer=Kinova excludes parts of that "
+        "manufacturer"
+    ) in lines
+    assert lines[-1] == "next: morphgen split audit my/no-kinova.yaml"
+    before = Path("my/no-kinova.yaml").read_bytes()
+    assert run(*words, "--out", "again.yaml")[0] == 0
+    assert Path("again.yaml").read_bytes() == before
+    code, out, _ = run("split", "audit", "my/no-kinova.yaml", "--strict")
+    assert (code, out.splitlines()[-1]) == (
+        0,
+        "my/no-kinova: passed: 0 error, 0 warning, 0 accepted",
+    )
+    assert run("split", "verify", "my/no-kinova.yaml")[0] == 0
+
+
+def test_a_hold_out_split_can_be_built(run):
+    assert run(*HOLD_OUT, "--out", "a.yaml")[0] == 0
+    assert run("split", "build", "a.yaml", "--light", "--out", "data")[0] == 0
+    folder = Path("data/hold-out-ee-plane-reach-seed0")
+    names = {member.name for member in read_split("a.yaml").train}
+    assert names < {path.name for path in (folder / "robots").iterdir()}
+    assert run("split", "verify", folder)[0] == 0
 
 
 def test_several_train_sizes_write_one_file_each(run):
@@ -209,6 +250,11 @@ def test_interrupted_run_leaves_no_files(run, tmp_path, monkeypatch):
         ((*COMPOSITION, "--from", "arm={ur5,ur55}"), "unknown arm 'ur55'; did you mean 'ur5'?"),
         ((*COMPOSITION, "--from", "arm={ur5"), "a brace is not closed"),
         ((*COMPOSITION, "--test", "4"), "of 4 test robots can be held out of 4 combinations"),
+        ((*HOLD_OUT, "--hold-out", "arm=kinva"), "--hold-out arm=kinva: no arm matches 'kinva'; d"),
+        ((*HOLD_OUT, "--test", "3"), "--test 3: only 2 different robots with ee=plane, whose oth"),
+        ((*HOLD_OUT, "--grammar", "arm33"), "'arm33'; did you mean 'arm3'?"),
+        ((*HOLD_OUT, "--name", "../x"), "name '../x': use letters, digits"),
+        ((*HOLD_OUT, *COMPOSITION[2:]), "--hold-out ee=plane: cannot be joined with composition"),
         (("split", "show", "interpolation/arm3"), "no split of this name; did you mean"),
         (("split", "show", "x.yaml"), "x.yaml: no such file"),
     ],
@@ -232,5 +278,6 @@ def test_broken_split_file_is_rejected_with_its_line(run, refused, trap):
 
 
 def test_missing_arguments_are_named(refused):
-    for argv in (("split",), ("split", "new"), ("split", "new", "interpolation")):
+    assert "are required: --hold-out, or COMMAND; see" in refused("split", "new")
+    for argv in (("split",), ("split", "new", "interpolation")):
         assert "the following arguments are required" in refused(*argv)

@@ -1,0 +1,282 @@
+"""``morphgen split new``: the ways to choose robots, with their options."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import (
+    Command,
+    Option,
+    UsageError,
+    flag,
+    number,
+    option,
+    path_option,
+    repeated,
+)
+from morphgen.cli.split_new import Progress, new_split
+
+if TYPE_CHECKING:
+    from morphgen.benchmark.generate import SplitRequest
+    from morphgen.benchmark.split import Split
+    from morphgen.grammar.library import Library
+
+MAX_WORD = 60
+"""Largest number of characters of what is held out in the name of a split."""
+
+
+def new_hold_out(args: argparse.Namespace) -> None:
+    """Make a split from what it holds out."""
+    if not args.hold_out:
+        args.parser.error("the following arguments are required: --hold-out, or COMMAND")
+    new_split(args)
+
+
+def _new_in_regime(args: argparse.Namespace) -> None:
+    """Make a split by the rules of a regime."""
+    if args.hold_out:
+        raise UsageError(
+            f"--hold-out {args.hold_out[0]}: cannot be joined with {args.regime}; give --hold-out "
+            "without a regime"
+        )
+    new_split(args)
+
+
+def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
+    """Return the options of all regimes; ``train`` is the default of ``--train``."""
+    return (
+        option(
+            "--train",
+            metavar="N,...",
+            default=train,
+            help="number of train robots; several numbers give a split each, with the same test "
+            f"robots, the smaller within the larger (default: {train_default or train})",
+        ),
+        option("--test", type=int, default=1, metavar="N", help="number of test robots"),
+        option(
+            "--task", default="reach", metavar="TASK,...", help="one task, or several with commas"
+        ),
+        flag("--obstacles", "tasks have obstacles"),
+        opt.SEED,
+        number(
+            "--max-links",
+            "largest number of links of a robot, and the number that its tokens are padded to "
+            "(default: 23)",
+            least=2,
+        ),
+        option("--name", help="name of the split (default: from the other options)"),
+        path_option(
+            "--out",
+            "FILE.yaml|DIR",
+            "the file, or the folder where NAME.yaml goes (default: this folder)",
+            default=Path(),
+        ),
+        flag("--statistics", "add the statistics of morphgen split stats to the file"),
+        *opt.JOBS_LIBRARY_JSON,
+    )
+
+
+def _interpolation(
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
+) -> tuple[Split, ...]:
+    from morphgen.benchmark.interpolation import interpolation
+
+    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
+    return interpolation(
+        request, grammar, library, hull=args.hull, jobs=args.jobs, progress=progress
+    )
+
+
+def _interpolation_word(args: argparse.Namespace) -> str:
+    return Path(args.grammar).stem + ("" if args.hull == "any" else f"-{args.hull}")
+
+
+def _composition(
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
+) -> tuple[Split, ...]:
+    from morphgen.benchmark.composition import composition
+
+    return composition(request, args.patterns, library, jobs=args.jobs, progress=progress)
+
+
+def _composition_word(args: argparse.Namespace) -> str:
+    words = " ".join(args.patterns).split()
+    keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
+    return "-".join(keys) or "robots"
+
+
+def _extrapolation(
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
+) -> tuple[Split, ...]:
+    from morphgen.benchmark.extrapolation import extrapolation, parse_bound
+
+    bound = parse_bound(args.similarity) if args.similarity else None
+    train, test = (
+        [opt.load_grammar_named(name.strip(), library, sound=True) for name in names.split(",")]
+        for names in (args.train_category, args.test_category)
+    )
+    return extrapolation(
+        request, train, test, library, similarity=bound, jobs=args.jobs, progress=progress
+    )
+
+
+def _extrapolation_word(args: argparse.Namespace) -> str:
+    return "-".join(Path(name).stem for name in args.test_category.split(","))
+
+
+def _hold_out(
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
+) -> tuple[Split, ...]:
+    from morphgen.benchmark.holdout import hold_out
+
+    names = args.grammar.split(",") if args.grammar else []
+    grammars = [opt.load_grammar_named(name.strip(), library, sound=True) for name in names]
+    return hold_out(
+        request,
+        args.hold_out,
+        library,
+        patterns=args.patterns,
+        grammars=grammars,
+        jobs=args.jobs,
+        progress=progress,
+    )
+
+
+def _hold_out_word(args: argparse.Namespace) -> str:
+    return "-".join(re.findall(r"[A-Za-z0-9_.]+", ",".join(args.hold_out)))[:MAX_WORD].strip("-.")
+
+
+REGIMES = (
+    Command(
+        "interpolation",
+        "test robots have the structure of train robots, in other sizes",
+        (
+            option(
+                "--grammar",
+                required=True,
+                help="name of a grammar (see: morphgen grammar list), or its file",
+            ),
+            option(
+                "--hull",
+                choices=["inside", "outside", "any"],
+                default="any",
+                help="parameters of test robots are inside or outside of the convex hull of those "
+                "of the train robots with the same structure",
+            ),
+            *split_options("10"),
+        ),
+        _new_in_regime,
+        examples=("split new interpolation --grammar arm3 --train 10 --test 1 --hull inside",),
+        defaults={
+            "generate": _interpolation,
+            "regime": "interpolation",
+            "robots_word": _interpolation_word,
+        },
+    ),
+    Command(
+        "composition",
+        "test robots join parts that are trained, but not together",
+        (
+            repeated(
+                "--from",
+                "words of morphgen compose with choices in braces and wildcards",
+                dest="patterns",
+                metavar="WORDS",
+                required=True,
+                default=None,
+            ),
+            *split_options("", "all robots that may be trained on"),
+        ),
+        _new_in_regime,
+        details="Every part of a test robot is in a train robot; its combination is in none. With "
+        "several tasks, robot and task are combined: the end-effector of a test robot is trained "
+        "at other tasks only.",
+        examples=(
+            'split new composition --from "arm={ur5,panda} ee={plane,stick,cylinder,sake_ez}" '
+            "--train 7 --test 1 --task push",
+        ),
+        defaults={
+            "generate": _composition,
+            "regime": "composition",
+            "robots_word": _composition_word,
+        },
+    ),
+    Command(
+        "extrapolation",
+        "test robots are of a category that is not trained",
+        (
+            *(
+                option(
+                    f"--{side}-category",
+                    metavar="GRAMMAR,...",
+                    required=True,
+                    help=f"names or files of grammars whose robots are {side} robots, in turn",
+                )
+                for side in ("train", "test")
+            ),
+            option(
+                "--similarity",
+                metavar="BOUND",
+                default="",
+                help="bound on the cosine similarity of each test robot to its nearest train "
+                "robot, such as '<0.6'",
+            ),
+            *split_options("10"),
+        ),
+        _new_in_regime,
+        details="Neither the category nor the structure of a test robot is trained.",
+        examples=(
+            "split new extrapolation --train-category stick,nlink,prims --test-category chain "
+            '--similarity "<0.6"',
+        ),
+        defaults={
+            "generate": _extrapolation,
+            "regime": "extrapolation",
+            "robots_word": _extrapolation_word,
+        },
+    ),
+)
+new = Command(
+    "new",
+    "choose train and test robots, and write them as a split",
+    (
+        repeated(
+            "--hold-out",
+            "what test robots have and train robots do not: names of parts (arm=kinova*), a "
+            "manufacturer (manufacturer=Kinova), a range of a parameter (arm3.length=0.3..0.4), or "
+            "a combination (arm=ur5+ee=plane); several are separated by commas",
+            metavar="RULE,...",
+        ),
+        repeated(
+            "--from",
+            "robots to draw from: words of morphgen compose with choices in braces and wildcards "
+            "(default: 'arm=* ee=*')",
+            dest="patterns",
+            metavar="WORDS",
+        ),
+        option(
+            "--grammar",
+            metavar="GRAMMAR,...",
+            default="",
+            help="draw robots from these grammars instead, or besides those of --from",
+        ),
+        *split_options("10"),
+    ),
+    new_hold_out,
+    commands=REGIMES,
+    details="With --hold-out, say what is held out. Or choose by the rules of a regime: see "
+    "morphgen split new COMMAND --help. The same seed gives the same bytes, with any number of "
+    "jobs.",
+    examples=(
+        "split new --hold-out 'arm=kinova*' --train 12 --test 4 --name my/no-kinova",
+        "split new --hold-out arm=ur5+ee=plane,arm=panda+ee=stick --train 12 --test 2",
+        "split new --hold-out manufacturer=Kinova --from 'arm=* ee={plane,stick}' --test 6",
+        "split new --hold-out arm3.length=0.3..0.4 --grammar arm3 --test 4",
+        'split new composition --from "arm={ur5,panda} ee={plane,stick}" --train 3',
+    ),
+    defaults={"generate": _hold_out, "regime": "hold-out", "robots_word": _hold_out_word},
+)
