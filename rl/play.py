@@ -123,6 +123,7 @@ def play(
     episodes: int,
     seed: int,
     report: Callable[[Episode], None],
+    max_successes: int | None = None,
 ) -> Iterator[Frame]:
     """Run episodes, and yield their frames if the environment renders.
 
@@ -132,6 +133,8 @@ def play(
         episodes: Number of episodes.
         seed: Seed of the episodes.
         report: Called with the result of each episode.
+        max_successes: Control steps with success in a row after which an episode ends early; None
+            to run it to its end.
 
     Yields:
         Frames, ``FPS`` per second of simulated time, with the first and last frame of each episode.
@@ -144,12 +147,13 @@ def play(
         env.reset(seed=seed if number == 0 else None)
         yield from _shown(env)
         scores: list[float] = []
-        over = False
+        successes, over = 0, False
         while not over:
             action = controller.act(env.batch)[0, links].cpu().numpy()
             _, _, terminated, truncated, info = env.step(action)
             scores.append(info["score"])
-            over = terminated or truncated
+            successes = successes + 1 if info["success"] else 0
+            over = terminated or truncated or successes == max_successes
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
         score = TASKS[env.task].episode_score(sum(scores), scores[-1], len(scores))

@@ -41,12 +41,12 @@ _AZIMUTH, _ELEVATION = 220.0, -25.0
 """MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
 _MARGIN = 0.92
 """Fraction of the picture that the points in view fill."""
-_SHADOW_SIZE = 1024
+_SHADOW_SIZE = 1536
 """Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take two
 thirds of the time; smoothed edges would take even longer, and are hardly visible in a video."""
-_SHADOW_CLIP = 0.8
-"""Half the width of the shadow map [extent of the scene, 1.5 edges of the cube in view]: more than
-half the cube's diagonal, and little more, so that shadows have sharp edges."""
+_SHADOW_CLIP = 1.5
+"""Half the width of the shadow map, as a multiple of the extent of the scene. With 1.25, dark dots
+appear on the ground at the edge of pictures."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
 """Pose of bodies that must not be visible."""
 _NUM_STARTS = 32

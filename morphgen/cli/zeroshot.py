@@ -30,7 +30,12 @@ FILM_EPISODES = 3
     opt.SEED,
     opt.sim_option("mujoco"),
     opt.WORKERS,
-    path_option("--out", "FILE", "a video of three episodes: .mp4 or .gif"),
+    path_option(
+        "--out",
+        "FILE",
+        "a video of three episodes, which end when the tool has been at the goal for 1 s: .mp4 or "
+        ".gif",
+    ),
     *opt.LIBRARY_JSON,
     details="The success rate has a 95% Wilson interval, and stands beside controllers that do not "
     "learn: jacobian (each joint along its own Jacobian column), ik (inverse kinematics with a "
@@ -85,6 +90,7 @@ def _table(results: list[ZeroShotResult]) -> str:
 def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
     from morphgen.rl.play import FPS, make_env, play, read_controller
     from morphgen.tasks.renderer import write_video
+    from morphgen.tasks.sim.base import CONTROL_PERIOD
 
     env, controller = make_env(
         read_controller(str(policy), "reach"),
@@ -96,5 +102,6 @@ def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
         render_mode="rgb_array",
     )
     with closing(env):
-        frames = play(env, controller, FILM_EPISODES, args.seed, lambda episode: None)
+        one_second = round(1 / CONTROL_PERIOD)
+        frames = play(env, controller, FILM_EPISODES, args.seed, lambda episode: None, one_second)
         write_video(frames, args.out, FPS)
