@@ -1,0 +1,70 @@
+"""Film six arms that one policy reaches with: docs/images/zero_shot.gif.
+
+    python docs/zero_shot_film.py [--seed 3]
+
+The policy is ``zero-shot``, which was trained on none of these arms. Each has four episodes of
+reach; arms that reach earlier wait for the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from morphgen.rl.play import FPS, make_env, play, read_controller
+from morphgen.tasks.renderer import write_video
+
+ROBOTS = (
+    "arm=ur5 ee=stick",
+    "arm=panda ee=panda_hand",
+    "arm=kinova_gen3 ee=robotiq_2f85",
+    "arm=widowx ee=widowx_gripper",
+    "arm=xarm7 ee=stick",
+    "arm=so101 ee=so101_gripper",
+)
+COLUMNS = 3
+SIZE = (240, 180)
+EPISODES = 4
+STRIDE = 2
+"""Frames of an episode for a frame of the film."""
+REST = 25
+"""Control steps that an arm stays at its goal."""
+
+
+def main() -> int:
+    """Run the episodes and write the film."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=3)
+    images = Path(__file__).parent / "images"
+    parser.add_argument("--out", type=Path, default=images / "zero_shot.gif")
+    args = parser.parse_args()
+    films = [film(robot, args.seed) for robot in ROBOTS]
+    frames = (
+        tiled([own[min(i, len(own) - 1)] for own in films]) for i in range(max(map(len, films)))
+    )
+    write_video(frames, args.out, FPS / STRIDE)
+    print(args.out)
+    return 0
+
+
+def film(robot: str, seed: int) -> np.ndarray:
+    """Return the frames of a robot's episodes, shape (n, height, width, 3)."""
+    spec = read_controller("zero-shot", "reach")
+    env, controller = make_env(spec, robot, seed, sim="mujoco", render_mode="rgb_array", size=SIZE)
+    with closing(env):
+        frames = play(env, controller, EPISODES, seed, lambda e: print(robot, e), REST)
+        return np.stack(list(frames)[::STRIDE])
+
+
+def tiled(tiles: list[np.ndarray]) -> np.ndarray:
+    """Return pictures in rows of ``COLUMNS``."""
+    rows = [np.concatenate(tiles[i : i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
+    return np.concatenate(rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
