@@ -22,14 +22,17 @@ PART_KINDS: tuple[PartKind, ...] = ("base", "arm", "ee", "segment", "body")
 Number = FiniteNumber | str
 """A number, or an expression over the part's parameters such as ``${size / 2}``."""
 
-_REAL_ONLY = {"source", "citation", "mass", "drop", "collision_from_visual", "scaling"}
-_TEMPLATE_ONLY = {"file", "density", "reference"}
+REAL_ONLY = {"source", "citation", "mass", "drop", "collision_from_visual", "scaling"}
+"""Keys of parts whose source is a data package."""
+TEMPLATE_ONLY = {"file", "density", "reference"}
+"""Keys of parts whose source is a file; ``reference`` is their ``citation``."""
 
 
 class FrameSpec(Record, frozen=True):
     """A frame on one of the part's links."""
 
     link: str
+    """Link that carries the frame."""
     xyz: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     """Position in the link frame [m]."""
     rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -40,18 +43,20 @@ class Scaling(Record, frozen=True):
     """How a link of a real part is scaled."""
 
     parameter: str | None = field(default=None, name="by")
-    """Name of the parameter that holds the scale factor; None keeps the link's size."""
+    """Name of the parameter that holds the scale factor; without it the link keeps its size."""
     face: tuple[FiniteNumber, FiniteNumber, FiniteNumber] = (0.0, 0.0, 0.0)
-    """Point where the link meets its parent, in the link frame at factor 1 [m]; see
-    ``morphgen.model.scaling``."""
+    """Point where the link meets its parent, in the link frame at factor 1 [m]."""
 
 
 class PackageSource(Record, frozen=True):
     """A URDF or xacro file of an installed data package."""
 
     package: str
+    """Name of the pip package."""
     file: str
+    """URDF or xacro, relative to the folder in which pip installed the package."""
     raw_args: Mapping[str, str | bool | int | float] = field(default_factory=dict, name="args")
+    """Arguments of the xacro, by name."""
 
     @property
     def args(self) -> dict[str, str]:
@@ -66,19 +71,24 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     """Description of a part: its source file, frames, parameters and corrections of the source."""
 
     name: str
+    """Name of the part, the same as that of the YAML file."""
     kind: PartKind
+    """Kind of the part. Only grammars use a ``segment``, which they chain, and a ``body``, which is
+    a complete robot."""
     summary: str
+    """Description in one line, for ``morphgen list``."""
     root: str
     """Link whose subtree is the part."""
     licence: str
+    """Licence of the source; every card repeats it."""
     manufacturer: str = ""
     """Manufacturer of the real product, such as ``Kinova``; empty for a part that is none."""
-    path: Path = Path()
+    path: Path = field(default_factory=Path)
     """The YAML file."""
     package_source: PackageSource | None = field(default=None, name="source")
-    """Source of a real part."""
+    """File of an installed data package."""
     file: str = ""
-    """xacro of a template, relative to the YAML file."""
+    """URDF or xacro, relative to the YAML file."""
     without: tuple[str, ...] = ()
     """Links that are left out, with everything below them."""
     mount: FrameSpec | None = None
@@ -86,6 +96,8 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     ports: Mapping[str, FrameSpec] = {}
     """Frames that other parts can be attached to, by name."""
     tool: FrameSpec | None = None
+    """Frame at the working point, for example between the fingertips; its z axis points away from
+    the mount."""
     home: Mapping[str, Number] = {}
     """Home position by joint [rad or m]."""
     effort: Mapping[str, FiniteNumber] = {}
@@ -106,8 +118,11 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     density: PositiveNumber | None = None
     """Density of links without inertial [kg/m^3]."""
     parameters: Mapping[str, Parameter] = {}
+    """Numbers that shape the part, by name. A xacro gets them as its arguments."""
     citation: str = ""
+    """Where the part comes from."""
     notes: str = ""
+    """Reasons for the corrections of the source."""
 
     @property
     def is_template(self) -> bool:
@@ -144,7 +159,7 @@ def read_manifest(path: Path) -> Manifest:
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if value is not None}
         keys = {entry.encode_name for entry in fields(Manifest)} - {"path"} | {"reference"}
-        allowed = keys - (_TEMPLATE_ONLY if "source" in data else _REAL_ONLY)
+        allowed = keys - (TEMPLATE_ONLY if "source" in data else REAL_ONLY)
         for key in data:
             if isinstance(key, str) and key not in allowed:
                 raise PartError(f"{path}: unknown key {key!r}{nearest(key, allowed)}")

@@ -33,11 +33,15 @@ class Parameter(Record, frozen=True):
     """A number that shapes a part, in SI units."""
 
     default: FiniteNumber
+    """Value of a part that does not name the parameter [its `unit`]."""
     minimum: FiniteNumber = field(name="min")
+    """Smallest valid value [its `unit`]."""
     maximum: FiniteNumber = field(name="max")
+    """Largest valid value [its `unit`]."""
     unit: Unit = ""
     """SI unit; empty for a pure number."""
     summary: str = ""
+    """Description in a few words, for the viewer."""
     integer: bool = False
     """Whether only integers are valid, such as for a count."""
 
