@@ -23,7 +23,7 @@ def codes_in_source():
 
 
 def test_every_finding_code_is_documented():
-    page = (ROOT / "docs" / "checks.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")
     codes = codes_in_source()
     assert len(codes) > 30
     assert {code for code in codes if f"`{code}`" not in page} == set()

@@ -1,0 +1,130 @@
+"""Write the tables of ``part-manifest.md`` from the JSON schema and the shipped manifests.
+
+python docs/part_manifest.py
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from morphgen.grammar.library import default_library
+from morphgen.grammar.manifest import REAL_ONLY, TEMPLATE_ONLY
+from morphgen.grammar.manifest_schema import manifest_schema
+
+PAGE = Path(__file__).with_name("part-manifest.md")
+MARK = "<!-- The rest of this page is written by docs/part_manifest.py. -->\n"
+RECORDS = {
+    "FrameSpec": "Frame",
+    "PackageSource": "Source",
+    "Scaling": "Scaling of a link",
+    "Parameter": "Parameter",
+}
+"""Heading of the section about each record of the schema."""
+LONGEST_EXAMPLE = 80
+"""Longest example that is not cut [characters]."""
+
+
+def page() -> str:
+    """Return the page: its own text up to the mark, then the tables."""
+    text, mark, _ = PAGE.read_text(encoding="utf-8").partition(MARK)
+    return text + mark + "\n".join(tables())
+
+
+def tables() -> Iterator[str]:
+    """Yield the sections with the keys of a manifest and of the records in it."""
+    records = manifest_schema()["$defs"]
+    manifests = [
+        yaml.safe_load(path.read_text(encoding="utf-8"))
+        for path in default_library().paths.values()
+    ]
+    keys = list(records["Manifest"]["properties"])
+    sections = {
+        "Keys of every part": [k for k in keys if k not in REAL_ONLY | TEMPLATE_ONLY],
+        "Keys of a part with `file`": [k for k in keys if k in TEMPLATE_ONLY],
+        "Keys of a part with `source`": [k for k in keys if k in REAL_ONLY],
+    }
+    for title, names in sections.items():
+        yield from table(title, records["Manifest"], names, manifests)
+    values = list(_mappings(manifests))
+    for name, title in RECORDS.items():
+        record = records[name]
+        keys = list(record["properties"])
+        needed = set(record.get("required", keys[:1]))
+        examples = [value for value in values if needed <= set(value) <= set(keys)]
+        yield from table(title, record, keys, examples)
+
+
+def table(
+    title: str, record: dict[str, Any], keys: list[str], examples: list[dict[str, Any]]
+) -> Iterator[str]:
+    """Yield a section with a row for each key."""
+    yield f"\n## {title}\n\n| key | type | unit | default | meaning | example |"
+    yield "|---|---|---|---|---|---|"
+    for key in keys:
+        schema = record["properties"][key]
+        unit = "".join(re.findall(r" \[(.*?)\]", schema["description"]))
+        meaning = re.sub(r" \[.*?\]", "", schema["description"])
+        default = "required" if key in record.get("required", ()) else _default(schema)
+        shown = _example([data[key] for data in examples if data.get(key) not in (None, {}, [])])
+        yield f"| `{key}` | {_type(schema)} | {unit} | {default} | {meaning} | {shown} |"
+
+
+def _mappings(data: object) -> Iterator[dict[str, Any]]:
+    """Yield every mapping in nested data."""
+    if isinstance(data, dict):
+        yield data
+    for value in (
+        data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
+    ):
+        yield from _mappings(value)
+
+
+def _type(schema: dict[str, Any]) -> str:
+    """Return the type of a value in words."""
+    if "$ref" in schema:
+        title = RECORDS[schema["$ref"].rpartition("/")[2]]
+        return f"[{title.lower()}](#{title.lower().replace(' ', '-')})"
+    if "anyOf" in schema:
+        types = [_type(member) for member in schema["anyOf"] if member.get("type") != "null"]
+        if types == ["number", "text"]:
+            return "number or `${...}`"
+        return " or ".join(name for name in types if name != "integer")
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"] if value)
+    if "prefixItems" in schema:
+        return f"{len(schema['prefixItems'])} times {_type(schema['prefixItems'][0])}"
+    if schema["type"] == "array":
+        return f"list of {_type(schema['items'])}"
+    if schema["type"] == "object":
+        return f"map to {_type(schema['additionalProperties'])}"
+    if "exclusiveMinimum" in schema:
+        return f"number > {schema['exclusiveMinimum']}"
+    return {"string": "text", "boolean": "`true`, `false`"}.get(schema["type"], schema["type"])
+
+
+def _default(schema: dict[str, Any]) -> str:
+    default = schema["default"]
+    return "" if default in (None, "", (), [], {}) else f"`{_yaml(default)}`"
+
+
+def _example(values: list[object]) -> str:
+    """Return the shortest of the values that shipped manifests have."""
+    if not values:
+        return ""
+    text = min((_yaml(value) for value in values), key=lambda text: (len(text), text))
+    cut = text if len(text) <= LONGEST_EXAMPLE else f"{text[: LONGEST_EXAMPLE - 3]}..."
+    return f"`{cut}`"
+
+
+def _yaml(value: object) -> str:
+    dumped = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
+    return dumped.removesuffix("...\n").strip()
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
