@@ -32,7 +32,7 @@ def compose(
 ) -> Robot:
     """Compose a robot from parts.
 
-    Example:
+    Examples:
         >>> robot = morphgen.compose("ur5-plane")
         >>> robot.dof
         6
@@ -69,7 +69,7 @@ def sample(
 ) -> Iterator[Robot]:
     """Draw robots from a grammar; each is drawn when the iterator reaches it.
 
-    Example:
+    Examples:
         >>> for robot in morphgen.sample("arm3", 2, seed=7, where="reach > 0.4"):
         ...     print(robot.name)
         arm3-000000
@@ -98,7 +98,7 @@ def sample(
 def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:
     """Read a robot from a bundle's folder, a URDF or a xacro.
 
-    Example:
+    Examples:
         >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
         >>> morphgen.read(folder).name
         'ur5-plane'
@@ -117,7 +117,7 @@ def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) 
 def write(robot: Robot, folder: str | PathLike[str], *, picture: bool = True) -> Path:
     """Check a robot and write its bundle: URDF, MJCF, meshes, card and picture.
 
-    Example:
+    Examples:
         >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
         >>> print(folder)
         robots/ur5-plane
