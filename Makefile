@@ -1,4 +1,4 @@
-# make demo | test | test-all | check | view
+# make demo | test | test-all | check | docs | view
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A process a core, and in each one thread: torch's own would only get in each other's way.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
 
-.PHONY: demo test test-all check view format clean
+.PHONY: demo test test-all check docs view format clean
 
 demo: $(STAMP)
 	$(BIN)/morphgen compose arm=ur5 ee=plane --out robots
@@ -24,6 +24,10 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# The site needs no network; open build/site/index.html. The variable silences an advertisement.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 view: demo
 	$(BIN)/morphgen view robots/ur5-plane

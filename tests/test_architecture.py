@@ -36,6 +36,10 @@ MODULES = sorted(
     for file in files
     if file.endswith(".py")
 )
+COMMAND_LINE_USERS = (
+    PACKAGE / "__main__.py",
+    PACKAGE.parent / "docs" / "site" / "hooks.py",  # writes the reference of the commands
+)
 SIMULATORS_AND_MESHES = (
     "coacd",
     "manifold3d",
@@ -102,7 +106,7 @@ def test_no_module_imports_the_top_level_package(folder):
     outside = [
         path
         for path in modules
-        if PACKAGE / "cli" not in path.parents and path != PACKAGE / "__main__.py"
+        if PACKAGE / "cli" not in path.parents and path not in COMMAND_LINE_USERS
     ]
     guilty = [str(path) for path in outside if "morphgen.cli" in set(imports(path))]
     assert guilty == []
