@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 import morphgen
-from morphgen.cli import EXTRAS
+from morphgen.extras import EXTRAS
 
 PACKAGE = Path(morphgen.__file__).parent
 PACKAGES = (
     "errors",
+    "extras",
     "typing",
     "processes",
     "model",
@@ -178,15 +179,18 @@ class Without(PathFinder):
         return None if name in {extras} else PathFinder.find_spec(name, path, target)
 
 sys.meta_path[sys.meta_path.index(PathFinder)] = Without
-from morphgen.cli import main
-sys.exit(main({words}))
 """
 
 
-def run_without_extras(folder, *words):
+def python_without_extras(folder, statements):
     extras = [*EXTRAS, "pinocchio", "pybullet", "yourdfpy", "ray"]
-    code = WITHOUT_EXTRAS.format(extras=extras, words=list(words))
+    code = WITHOUT_EXTRAS.format(extras=extras) + statements
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+
+
+def run_without_extras(folder, *words):
+    statements = f"from morphgen.cli import main; sys.exit(main({list(words)}))"
+    return python_without_extras(folder, statements)
 
 
 CORE_COMMANDS = (

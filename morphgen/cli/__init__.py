@@ -16,18 +16,6 @@ if TYPE_CHECKING:  # imported when a command runs, so that Ctrl-C meanwhile is c
 
     from morphgen.cli.command import Parser
 
-EXTRAS = {
-    "embreex": "fit",
-    "fast_simplification": "fit",
-    "gymnasium": "tasks",
-    "imageio": "tasks",
-    "tensorboard": "rl",
-    "torch": "rl",
-    "viser": "viewer",
-    "websockets": "viewer",
-}
-"""Optional packages by import name, and the extra of morphgen that installs each."""
-
 
 def build_parser() -> Parser:
     """Return the parser of every command; each sets ``run``, which may return an exit code."""
@@ -70,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from morphgen.cli.command import UsageError, parse
     from morphgen.errors import MorphgenError, one_line
+    from morphgen.extras import missing_extra
 
     parser = build_parser()
     try:
@@ -93,11 +82,7 @@ def _run(argv: Sequence[str] | None) -> int:
                 raise KeyboardInterrupt from error
             if isinstance(error, MorphgenError):
                 return _refuse(error, str(error), args)
-            if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-                hint = f"pip install 'morphgen[{EXTRAS[error.name]}]'"
-                if error.name == "torch":
-                    hint += "; a small build without CUDA: https://pytorch.org/get-started/locally"
-                text = f"the package {error.name} is not installed: {hint}"
+            if (text := missing_extra(error)) is not None:
                 return _refuse(error, text, args)
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise

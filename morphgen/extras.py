@@ -1,0 +1,47 @@
+"""Optional packages, and the error that names the extra of morphgen that installs a missing one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from morphgen.errors import MissingDependencyError
+
+EXTRAS = {
+    "embreex": "fit",
+    "fast_simplification": "fit",
+    "gymnasium": "tasks",
+    "imageio": "tasks",
+    "tensorboard": "rl",
+    "torch": "rl",
+    "viser": "viewer",
+    "websockets": "viewer",
+}
+"""Optional packages by import name, and the extra of morphgen that installs each."""
+
+
+def missing_extra(error: Exception) -> str | None:
+    """Return how to install the optional package that an import lacks; None for other errors."""
+    if not (isinstance(error, ModuleNotFoundError) and error.name in EXTRAS):
+        return None
+    hint = f"pip install 'morphgen[{EXTRAS[error.name]}]'"
+    if error.name == "torch":
+        hint += "; a small build without CUDA: https://pytorch.org/get-started/locally"
+    return f"the package {error.name} is not installed: {hint}"
+
+
+@contextmanager
+def explain_missing_extras() -> Iterator[None]:
+    """Convert the failed import of an optional package to an error that says how to install it.
+
+    Raises:
+        MissingDependencyError: If the block or the decorated function imports an optional package
+            that is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        text = missing_extra(error)
+        if text is None:
+            raise
+        raise MissingDependencyError(text) from error
