@@ -15,7 +15,7 @@ from morphgen.benchmark.split import Member, compose_member
 from morphgen.errors import TaskError
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library, default_library
-from morphgen.grammar.robot_source import find_robot, read_source
+from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
@@ -94,7 +94,7 @@ def default_configs() -> tuple[TaskConfig, ...]:
 
 
 def load_robot(
-    source: str | Path | Robot,
+    source: RobotLike,
     geometry: Literal["primitive", "mesh"] = "primitive",
     library: Iterable[Path] = (),
 ) -> Robot:
@@ -115,7 +115,7 @@ def load_robot(
         MorphgenError: If the words name something unknown.
     """
     parts = default_library(library)
-    robot = source if isinstance(source, Robot) else read_source(find_robot(source), parts)
+    robot = resolve_robot(source, parts)
     return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError, nearest
-from morphgen.model.robot import Robot
+from morphgen.grammar.robot_source import RobotLike
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.channels import KINEMATIC_CHANNELS
@@ -73,7 +73,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     def __init__(
         self,
         task: str,
-        robot: str | Path | Robot = "ur5-plane",
+        robot: RobotLike = "ur5-plane",
         *,
         sim: str | None = None,
         obstacles: bool = False,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 
 import torch
 
 from morphgen.benchmark.split import Side, Split
-from morphgen.benchmark.tokens import MAX_LINKS
+from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import TaskError, nearest
 from morphgen.grammar.library import default_library
+from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
@@ -49,7 +51,7 @@ class BatchOptions(TypedDict, total=False):
 
 def make_batch(
     task: str | Sequence[str],
-    robots: Sequence[Robot | str | Path],
+    robots: Sequence[RobotLike],
     num_envs: int,
     *,
     obstacles: bool | Sequence[bool] = False,
@@ -83,7 +85,7 @@ def make_batch(
         MissingDependencyError: If the simulator is not installed.
         MorphgenError: If a robot cannot be composed or read.
     """
-    if isinstance(robots, (str, Path, Robot)):
+    if isinstance(robots, Robot | str | PathLike):
         raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
     _require_env_for_each(num_envs, len(robots))
     folders = tuple(library)
@@ -201,7 +203,7 @@ def batch_from_specs(
     _require_contacts(simulator, specs)
     robots = [spec.robot for spec in specs]
     if max_links is None:
-        max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
+        max_links = default_max_links(len(robot.links) for robot in robots)
     tables = build_robot_tables(
         robots, default_library(tuple(library)).folders, max_links=max_links, device=device
     )

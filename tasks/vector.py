@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.model.robot import Robot
+from morphgen.grammar.robot_source import RobotLike
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.make import make_batch
@@ -151,8 +150,8 @@ def task_vector(
     num_envs: int,
     *,
     task: str,
-    robot: str | Path | Robot = "ur5-plane",
-    robots: Sequence[str | Path | Robot] = (),
+    robot: RobotLike = "ur5-plane",
+    robots: Sequence[RobotLike] = (),
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
     """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``.

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.benchmark.similarity import MEASURES, features
-from morphgen.benchmark.tokens import MAX_LINKS, tokens
+from morphgen.benchmark.token_layout import default_max_links
+from morphgen.benchmark.tokens import tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
@@ -102,7 +103,7 @@ def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparis
     library = Library(folders)
     shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
     # Splits fix the number of links; here the largest robot does.
-    max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
+    max_links = default_max_links(len(robot.links) for robot in robots)
     pairs = list(zip(robots, shapes, strict=True))
     all_features = [features(robot, shape, max_links=max_links) for robot, shape in pairs]
     return Comparison(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +76,11 @@ POSITION = Field(
 )
 LAYOUT = (INDEX, PARENT, TOOL, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITION)
 """The fields of a token, in order."""
+
+
+def default_max_links(link_counts: Iterable[int]) -> int:
+    """Return the number of links that robots are padded to: the paper's, or the largest count."""
+    return max(MAX_LINKS, *link_counts)
 
 
 def require_max_links(n_links: int, what: str, max_links: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
@@ -54,6 +53,8 @@ def goals(args: argparse.Namespace) -> int:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
+        from morphgen.benchmark.split_source import read_split_or_folder
+
         split, _ = read_split_or_folder(args.words[0])
         results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
     else:
@@ -86,22 +87,6 @@ def make_goals(
         return sample_split_goals(
             split, opt.library_of(args), config, jobs=args.jobs, certified=certify, progress=update
         )
-
-
-def read_split_or_folder(name: str) -> tuple[Split, Path | None]:
-    """Return a split by its name, its file or its built folder; and that folder.
-
-    Raises:
-        BenchmarkError: If there is no such split.
-    """
-    from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.split_folder import SPLIT_FILE, require_split_folder
-
-    folder = Path(name)
-    if not folder.is_dir():
-        return read_split(name), None
-    require_split_folder(folder)
-    return read_split(folder / SPLIT_FILE), folder
 
 
 def _text(results: Sequence[GoalResult], seed: int) -> str:

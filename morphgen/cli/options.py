@@ -168,10 +168,10 @@ def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
     Raises:
         BenchmarkError: If a robot has more links than ``--max-links``.
     """
-    from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
+    from morphgen.benchmark.token_layout import default_max_links, require_max_links
 
     if args.max_links is None:
-        return max(MAX_LINKS, *(len(robot.links) for robot in robots))
+        return default_max_links(len(robot.links) for robot in robots)
     for robot in robots:
         require_max_links(len(robot.links), f"robot {robot.name!r}", args.max_links)
     return int(args.max_links)

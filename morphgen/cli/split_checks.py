@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option
-from morphgen.cli.goals import make_goals, read_split_or_folder
+from morphgen.cli.goals import make_goals
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
 
@@ -51,6 +51,7 @@ def _goal_seed(help: str) -> Option:
 def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
     from morphgen.benchmark.audit import audit
+    from morphgen.benchmark.split_source import read_split_or_folder
 
     near = _near(args.near)
     split, folder = read_split_or_folder(args.split)

@@ -283,13 +283,13 @@ def _max_links(source: RobotSource) -> int:
     robot's links if these are more, as for a robot with two arms.
     """
     from morphgen.benchmark.split_file import parse_split
-    from morphgen.benchmark.token_layout import MAX_LINKS
+    from morphgen.benchmark.token_layout import default_max_links
     from morphgen.tasks.env_specs import load_robot
 
     if source.split:
         return parse_split(source.split, Path(source.name)).split.max_links
     robot = load_robot(source.name, library=map(Path, source.library))
-    return max(MAX_LINKS, len(robot.links))
+    return default_max_links([len(robot.links)])
 
 
 def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskConfig, ...]:

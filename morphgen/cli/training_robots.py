@@ -84,7 +84,7 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
             that a built split ships.
         MorphgenError: If the split or the robot is unknown.
     """
-    from morphgen.cli.goals import read_split_or_folder
+    from morphgen.benchmark.split_source import read_split_or_folder
     from morphgen.rl.robot_source import robot_source, split_source
     from morphgen.tasks.split_goals import has_goals, read_split_goals
 
@@ -156,7 +156,7 @@ def draw_robots(
         of the splits of ``--held-out`` and the links of the largest robot.
     """
     from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.token_layout import MAX_LINKS
+    from morphgen.benchmark.token_layout import default_max_links
     from morphgen.rl.drawn_robots import draw
 
     with closing(TrainingProgress()) as display:
@@ -165,7 +165,7 @@ def draw_robots(
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
     held_out = (read_split(name).max_links for name in source.held_out)
-    max_links = args.max_links or max(MAX_LINKS, robots.most_links, *held_out)
+    max_links = args.max_links or default_max_links([robots.most_links, *held_out])
     return replace(source, drawn_hash=robots.hash), max_links
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
+from morphgen.errors import FitError
 from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, sample_solid
@@ -28,12 +29,17 @@ class FitOptions:
     """Seed of the sample points and of the clusterings."""
 
     def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            FitError: If one is out of its range.
+        """
         if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
-            raise ValueError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
+            raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
         if not 0 < self.iou <= 1:
-            raise ValueError(f"IoU {self.iou}: expected more than 0, at most 1")
+            raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
         if self.seed < 0:
-            raise ValueError(f"seed {self.seed}: expected 0 or more")
+            raise FitError(f"seed {self.seed}: expected 0 or more")
 
 
 @dataclass(frozen=True)

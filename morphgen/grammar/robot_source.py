@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
+from typing import TypeAlias
 
 from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
@@ -25,6 +27,9 @@ from morphgen.model.tree import rename, subtree
 
 DESCRIPTION_SUFFIXES = (".urdf", ".xacro")
 """File name suffixes of robot descriptions."""
+
+RobotLike: TypeAlias = Robot | str | PathLike[str]
+"""A robot, or its name: words of ``morphgen compose``, parts joined by dashes, or a path."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +83,18 @@ def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
     return list(dict.fromkeys(sources))
 
 
-def find_robot(text: str | Path) -> RobotSource:
+def find_robot(text: str | PathLike[str]) -> RobotSource:
     """Return the one robot that a text names; see ``find_robots``.
 
     Raises:
-        CompositionError: If it names several robots.
+        CompositionError: If it names several robots, or is not a text.
         FormatError: If a path does not exist, or holds no robot.
     """
-    if isinstance(text, Path) or is_robot_file(text):
+    if not isinstance(text, str | PathLike):
+        raise CompositionError(
+            f"{text!r} is no robot; expected a Robot, a path, or a name such as ur5-plane"
+        )
+    if not isinstance(text, str) or is_robot_file(text):
         sources = _file_sources(Path(text))
     else:
         sources = [_request_source(text.split())]
@@ -122,6 +131,16 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
     if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
         return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
     return robot
+
+
+def resolve_robot(robot: RobotLike, library: Library, root: Path | None = None) -> Robot:
+    """Return a robot that is given itself or by its name; see ``find_robot`` and ``read_source``.
+
+    Raises:
+        CompositionError: If it is neither, or names several robots.
+        MorphgenError: As ``read_source``.
+    """
+    return robot if isinstance(robot, Robot) else read_source(find_robot(robot), library, root)
 
 
 def light_derivation(folder: Path) -> Derivation | None:

@@ -145,7 +145,7 @@ def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
     ],
 )
 def test_options_out_of_range_are_errors(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(FitError, match=message):
         FitOptions(**options)
 
 

@@ -1,0 +1,23 @@
+"""Find a split by its name, its file or the folder where it was built."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from morphgen.benchmark.split import Split
+from morphgen.benchmark.split_file import read_split
+from morphgen.benchmark.split_folder import SPLIT_FILE, require_split_folder
+
+
+def read_split_or_folder(name: str | PathLike[str]) -> tuple[Split, Path | None]:
+    """Return a split by its name, its file or its built folder; and that folder.
+
+    Raises:
+        BenchmarkError: If there is no such split.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        return read_split(str(name)), None
+    require_split_folder(folder)
+    return read_split(folder / SPLIT_FILE), folder
