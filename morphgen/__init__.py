@@ -12,10 +12,14 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from morphgen import tasks
-    from morphgen.api import check, compose, fix, read, sample, write
+    from morphgen import tasks as tasks
+    from morphgen.api.benchmark import similarity, split, tokens
+    from morphgen.api.checks import check, conform, fix
+    from morphgen.api.fitting import fit
+    from morphgen.api.robots import compose, read, sample, write
     from morphgen.errors import MorphgenError
     from morphgen.model.robot import Robot
+    from morphgen.tasks.make_env import make_env
 
     __version__: str
 
@@ -25,27 +29,52 @@ __all__ = [
     "__version__",
     "check",
     "compose",
+    "conform",
+    "fit",
     "fix",
+    "make_env",
     "read",
     "sample",
-    "tasks",
+    "similarity",
+    "split",
+    "tokens",
     "write",
 ]
 
+_MODULES = {
+    "MorphgenError": "morphgen.errors",
+    "Robot": "morphgen.model.robot",
+    "check": "morphgen.api.checks",
+    "compose": "morphgen.api.robots",
+    "conform": "morphgen.api.checks",
+    "fit": "morphgen.api.fitting",
+    "fix": "morphgen.api.checks",
+    "make_env": "morphgen.tasks.make_env",
+    "read": "morphgen.api.robots",
+    "sample": "morphgen.api.robots",
+    "similarity": "morphgen.api.benchmark",
+    "split": "morphgen.api.benchmark",
+    "tokens": "morphgen.api.benchmark",
+    "write": "morphgen.api.robots",
+}
+"""Module of each public name."""
+_UNLISTED = ("MorphgenError", "Robot", "fix")
+"""Public names that ``dir`` leaves out: a user meets them through the functions, in an ``except``,
+an annotation or a finding that says it can be repaired."""
 
-def __getattr__(name: str) -> object:
-    if name == "__version__":
-        return _import_module("importlib.metadata").version("morphgen")
-    if name == "tasks":
-        return _import_module("morphgen.tasks")
-    if name not in __all__:
-        raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
-    modules = {"MorphgenError": "morphgen.errors", "Robot": "morphgen.model.robot"}
-    return getattr(_import_module(modules.get(name, "morphgen.api")), name)
+if not TYPE_CHECKING:  # to type checkers, a name that is not imported above is an error
 
+    def __getattr__(name: str) -> object:
+        if name == "__version__":
+            return _import_module("importlib.metadata").version("morphgen")
+        if name == "tasks":
+            return _import_module("morphgen.tasks")
+        if name not in _MODULES:
+            raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
+        return getattr(_import_module(_MODULES[name]), name)
 
-def __dir__() -> list[str]:
-    return __all__
+    def __dir__() -> list[str]:
+        return [name for name in __all__ if name not in _UNLISTED]
 
 
 if "gymnasium" in _sys.modules:

@@ -1,13 +1,32 @@
 """``import morphgen`` gives the public API and loads packages only when used."""
 
+import ast
 import doctest
 import subprocess
 import sys
+from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
+import trimesh
 
 import morphgen
 from morphgen.errors import MorphgenError
+
+FUNCTIONS = (
+    "check",
+    "compose",
+    "conform",
+    "fit",
+    "make_env",
+    "read",
+    "sample",
+    "similarity",
+    "split",
+    "tokens",
+    "write",
+)
 
 
 def test_compose_write_read_and_check(tmp_path):
@@ -32,13 +51,28 @@ def test_parts_may_be_keywords_or_joined_by_dashes(request_text, words):
     assert (robot.name, robot.links, robot.joints) == (same.name, same.links, same.joints)
 
 
-def test_dir_lists_the_public_names():
-    assert dir(morphgen) == sorted(morphgen.__all__)
-    assert {"Robot", "MorphgenError", "__version__", "compose", "tasks"} <= set(dir(morphgen))
-    assert all(getattr(morphgen, name) is not None for name in dir(morphgen))
+def test_dir_lists_the_public_functions():
+    assert set(dir(morphgen)) == {*FUNCTIONS, "__version__"}
+    assert set(morphgen.__all__) == {*dir(morphgen), "MorphgenError", "Robot", "fix"}
+    assert all(getattr(morphgen, name) is not None for name in morphgen.__all__)
     assert morphgen.MorphgenError is MorphgenError
+    assert morphgen.tasks.make_batch
     with pytest.raises(AttributeError, match="no attribute 'composed'"):
         _ = morphgen.composed
+
+
+def test_type_checkers_see_every_public_name():
+    tree = ast.parse(Path(morphgen.__file__).read_text(encoding="utf-8"))
+    (block,) = (
+        node
+        for node in tree.body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    imported = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    modules = {alias.name: node.module for node in imported for alias in node.names}
+    assert modules.pop("tasks") == "morphgen"
+    assert modules == morphgen._MODULES
+    assert set(morphgen.__all__) == {*modules, "__version__"}
 
 
 def test_a_robot_prints_as_one_line():
@@ -49,17 +83,89 @@ def test_a_robot_prints_as_one_line():
     )
 
 
-@pytest.mark.parametrize("name", ["compose", "sample", "read", "write"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name == "fit")) for name in FUNCTIONS],
+)
 def test_documentation_examples_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder().find(getattr(morphgen, name), name, globs={})
+    assert example.examples
     example.globs["morphgen"] = morphgen
     assert doctest.DocTestRunner().run(example).failed == 0
 
 
-def test_invalid_arguments_give_one_clear_error():
-    with pytest.raises(MorphgenError, match="did you mean 'lwr'"):
-        morphgen.compose("arm=lwrr")
+def test_robots_may_be_named(tmp_path):
+    robot = morphgen.compose("arm3-stick")
+    folder = morphgen.write(robot, tmp_path, picture=False)
+    tables = [morphgen.tokens(each) for each in (robot, "arm3-stick", folder, str(folder))]
+    assert all(np.array_equal(table, tables[0]) for table in tables)
+    assert morphgen.check(robot) == morphgen.check("arm3-stick") == morphgen.check(folder)
+    (folder / "robot.urdf").write_text("<robot/>")
+    assert "error" in {finding.severity for finding in morphgen.check(folder)}
+    reports = [morphgen.conform(each, samples=2) for each in ("arm3-stick", robot)]
+    assert reports[0] == reports[1]
+
+
+def test_fit_returns_robot_and_report(tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.export(tmp_path / "box.stl")
+    fitted = morphgen.fit(tmp_path / "box.stl")
+    ((shape,),) = (link.collisions for link in fitted.robot.links)
+    assert sorted(shape.geometry.size) == pytest.approx([0.1, 0.2, 0.3], abs=2e-3)
+    assert fitted.report.mean.iou > 0.95
+    assert fitted.source.name == fitted.robot.name == "box"
+    assert fitted.agreement(configurations=3)[0].accuracy == 1.0
+
+
+def test_library_may_be_one_folder(tmp_path):
+    (tmp_path / "two.grammar").write_text("robot -> base arm3\nbase -> fixed\n")
+    (robot,) = morphgen.sample("two", 1, library=str(tmp_path))
+    assert robot.name == "two-000000"
+
+
+def test_split_has_robots_statistics_and_audit():
+    scenario = morphgen.split("interpolation/panda/reach")
+    assert scenario.name == "interpolation/panda/reach"
+    assert [robot.name for robot in scenario.train] == [m.name for m in scenario.definition.train]
+    assert scenario.train is scenario.train
+    assert scenario.statistics() == scenario.definition.statistics
+    assert scenario.audit().split == scenario.name
+
+
+def test_vector_environments_of_one_keep_their_axis():
+    env = morphgen.make_env("reach", "arm3-stick", sim="kinematic")
+    (vector,) = (morphgen.make_env("reach", "arm3-stick", num_envs=1, sim="kinematic"),)
+    assert isinstance(env, gymnasium.Env)
+    assert isinstance(vector, gymnasium.vector.VectorEnv)
+    assert vector.action_space.shape == (1, 23)
+    env.close()
+    vector.close()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: morphgen.compose("arm=lwrr"), "did you mean 'lwr'"),
+        (lambda: morphgen.check(3), "3 is no robot; expected a Robot, a path, or a name"),
+        (lambda: morphgen.conform("no/such/folder"), "no/such/folder: no such file or folder"),
+        (lambda: morphgen.fit("arm3-stick", max_primitives=0), "0 primitives: expected 1 to 32"),
+        (lambda: morphgen.fit("none.stl"), "none.stl"),
+        (lambda: morphgen.tokens("arm3-stick", max_links=2), "more than max_links 2"),
+        (lambda: morphgen.similarity("arm3-stick"), "1 robots to compare; expected a list"),
+        (lambda: morphgen.similarity(["prims", "z1"], ["tee"]), "did you mean 'tree'"),
+        (lambda: morphgen.split("interpolation/arm3"), "did you mean 'interpolation/arm3/"),
+        (lambda: morphgen.make_env("reech"), "did you mean 'reach'"),
+        (lambda: morphgen.make_env("reach", workers=2), "unknown option 'workers'"),
+        (lambda: morphgen.make_env("reach", ["prims"]), "name several with num_envs"),
+        (lambda: morphgen.make_env("reach", num_envs=2, size=(1, 1)), "unknown option 'size'"),
+        (lambda: morphgen.make_env("reach", "prims", num_envs=0), "0 environments"),
+    ],
+)
+def test_invalid_arguments_give_one_clear_error(call, message):
+    with pytest.raises(MorphgenError, match=message) as caught:
+        call()
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_importing_morphgen_loads_no_heavy_package():

@@ -233,3 +233,21 @@ def test_missing_extra_error_says_how_to_install_it(words, extra, tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert f"pip install 'morphgen[{extra}]'" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("call", "extra"), [('fit("z1")', "fit"), ('make_env("reach", "prims")', "tasks")]
+)
+def test_missing_extra_is_the_same_error_in_python(call, extra, tmp_path):
+    statements = f"""
+import morphgen
+assert all(getattr(morphgen, name) for name in dir(morphgen))
+try:
+    morphgen.{call}
+except morphgen.MorphgenError as error:
+    print(type(error).__name__, error)
+"""
+    done = python_without_extras(tmp_path, statements)
+    assert done.stderr == ""
+    assert done.stdout.startswith("MissingDependencyError the package ")
+    assert f"pip install 'morphgen[{extra}]'" in done.stdout

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from morphgen.checks import check
 from morphgen.checks.readers import LOADERS, Loader
 from morphgen.errors import FormatError
-from morphgen.formats.bundle import read_bundle
+from morphgen.formats.bundle import bundle_folder, read_bundle, write_bundle
 from morphgen.formats.urdf_text import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot
@@ -82,6 +84,18 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
         FormatError: If ``bundle_dir`` is not a bundle.
     """
     return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
+
+
+def robot_conformance(robot: Robot, samples: int = 100, seed: int = 0) -> ConformanceReport:
+    """Write a robot's bundle to a temporary folder and compare its loaders; see ``conformance``.
+
+    Raises:
+        FormatError: If the robot's name cannot be that of a folder, or a bundle cannot hold it.
+    """
+    with TemporaryDirectory() as folder:
+        bundle = bundle_folder(Path(folder), robot.name)
+        write_bundle(robot, bundle, check(robot), picture=False)
+        return conformance(bundle, samples, seed)
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
@@ -16,7 +15,6 @@ from morphgen.cli.progress import track
 from morphgen.errors import one_line
 
 if TYPE_CHECKING:
-    from morphgen.checks.conformance import ConformanceReport
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.findings import Finding
@@ -57,23 +55,21 @@ def _findings(
     source: RobotSource, library: Library, args: argparse.Namespace
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
     """Return a robot's findings, and those that its repair into ``--fix`` removed."""
+    from morphgen.api.checks import bundle_of, check_source
     from morphgen.checks import check, fix
-    from morphgen.formats.bundle import CARD, bundle_folder, file_findings, write_bundle
+    from morphgen.formats.bundle import bundle_folder, write_bundle
     from morphgen.formats.urdf import UnsoundError
     from morphgen.grammar.robot_source import read_source
 
+    if args.fix is None:
+        return check_source(source, library, args.root), ()
     try:
         robot = read_source(source, library, args.root)
     except UnsoundError as error:
         return error.findings, ()
-    folder = source.path if source.path is None or source.path.is_dir() else source.path.parent
-    is_bundle = folder is not None and (folder / CARD).is_file()
-    tool_required = is_bundle or source.path is None
-    if args.fix is None:
-        in_files = file_findings(folder) if folder is not None and is_bundle else ()
-        return (*check(robot, tool_required=tool_required), *in_files), ()
     robot, repaired = fix(robot)
-    findings = check(robot, tool_required=tool_required)
+    is_robot = source.path is None or bundle_of(source) is not None
+    findings = check(robot, tool_required=is_robot)
     written = bundle_folder(args.fix, robot.name)
     write_bundle(robot, written, findings)
     print(f"written: {written}", file=sys.stderr)
@@ -116,9 +112,13 @@ def conform(args: argparse.Namespace) -> int:
     """Print a row per robot and loader."""
     from tabulate import tabulate
 
+    from morphgen.api.checks import conform_source
+
     library, sources = opt.library_of(args), opt.sources_of(args)
     reports = {
-        source.label: _conformance(source, library, args)
+        source.label: conform_source(
+            source, library, args.root, samples=args.samples, seed=args.seed
+        )
         for source in track(sources, args, "loading", "robot", len(sources))
     }
     rows = [
@@ -129,21 +129,3 @@ def conform(args: argparse.Namespace) -> int:
     data = [asdict(report) for report in reports.values()]
     opt.print_result(args, data, lambda: tabulate(rows, headers="keys", floatfmt=".2g"))
     return int(not all(report.passed for report in reports.values()))
-
-
-def _conformance(
-    source: RobotSource, library: Library, args: argparse.Namespace
-) -> ConformanceReport:
-    """Compare the loaders on a bundle; a robot without one is written to a temporary folder."""
-    from morphgen.checks import check
-    from morphgen.checks.conformance import conformance
-    from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
-    from morphgen.grammar.robot_source import read_source
-
-    if source.path is not None and (source.path / CARD).is_file():
-        return conformance(source.path, args.samples, args.seed)
-    robot = read_source(source, library, args.root)
-    with TemporaryDirectory() as folder:
-        bundle = bundle_folder(Path(folder), robot.name)
-        write_bundle(robot, bundle, check(robot), picture=False)
-        return conformance(bundle, args.samples, args.seed)

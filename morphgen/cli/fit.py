@@ -98,11 +98,8 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
-    try:
-        max_primitives = 1 if args.max_primitives is None else args.max_primitives
-        options = FitOptions(max_primitives, args.iou, args.enclose, args.seed)
-    except ValueError as error:
-        raise MorphgenError(str(error)) from error
+    max_primitives = 1 if args.max_primitives is None else args.max_primitives
+    options = FitOptions(max_primitives, args.iou, args.enclose, args.seed)
     if args.all:
         _fit_all_parts(args)
         return
@@ -188,11 +185,8 @@ def _fit_robot(
 ) -> dict[str, object]:
     """Fit one robot, write its bundle if a folder is given, and return the data of ``--json``."""
     from morphgen.checks import check
-    from morphgen.fitting.agreement import agreement
-    from morphgen.fitting.part_fits import fits_of
-    from morphgen.fitting.replace_collision import with_fits, with_primitives
+    from morphgen.fitting.fitted_robot import FittedRobot, apply_fit
     from morphgen.formats.bundle import write_bundle
-    from morphgen.formats.fits import read_stored_fits
 
     robot = target.robot
     report = _fit_links(target, options, args)
@@ -200,15 +194,11 @@ def _fit_robot(
         print(_report_text(report))
     if folder is None:
         return report.as_dict()
-    primitives = {row.link: row.fit.primitives for row in report.links}
-    fits = fits_of(robot, report, read_stored_fits(opt.library_of(args).folders))
-    fitted = replace(
-        with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
-        name=folder.name,
-        provenance={**robot.provenance, "primitives": report.without_times()},
-    )
+    folders = opt.library_of(args).folders
+    fitted = replace(apply_fit(robot, report, folders, visual=args.visual), name=folder.name)
+    fit = FittedRobot(robot, fitted, report)
     with status(args, f"comparing collisions in {args.configurations} configurations"):
-        of_primitives, of_hulls = agreement(robot, fitted, args.configurations, args.seed)
+        of_primitives, of_hulls = fit.agreement(args.configurations, args.seed)
     findings = check(fitted, tool_required=not target.is_part)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:
@@ -221,11 +211,10 @@ def _fit_robot(
 
 
 def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
+    from morphgen.fitting.fitted_robot import require_shapes
     from morphgen.fitting.robot_fit import fit_links
-    from morphgen.formats.fits import shapes_to_fit
 
-    if not any(map(shapes_to_fit, target.robot.links)):
-        raise FitError(f"{target.label}: no link has a shape")
+    require_shapes(target.robot, target.label)
     with bar(args, f"fitting {target.label}", "link") as shown:
         return fit_links(target.robot, options, jobs=args.jobs, progress=shown)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers.robots import arm
-from morphgen.api import compose
+from morphgen.api.robots import compose
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import (
     BANDWIDTH,

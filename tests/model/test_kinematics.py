@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.robots import arm
-from morphgen.api import compose
+from morphgen.api.robots import compose
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,

@@ -1,33 +1,33 @@
-"""The functions of ``import morphgen``: compose, sample, read, write, check and fix robots."""
+"""Compose, sample, read and write robots."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from morphgen.checks import check, fix
+from morphgen.api.library import LibraryFolders, open_library
+from morphgen.checks import check
+from morphgen.extras import explain_missing_extras
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
-from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
-__all__ = ["check", "compose", "fix", "read", "sample", "write"]
 
-
+@explain_missing_extras()
 def compose(
     request: str = "",
     *,
     name: str | None = None,
     geometry: Literal["mesh", "primitive"] = "mesh",
-    library: Iterable[Path] = (),
+    library: LibraryFolders = (),
     **words: str | float,
 ) -> Robot:
     """Compose a robot from parts.
@@ -49,10 +49,11 @@ def compose(
         **words: More ``key=value`` words. Values without a unit are in SI units.
 
     Raises:
+        MissingDependencyError: If primitives have to be fitted and the extra ``fit`` is missing.
         MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
             value is out of range; the message lists what is valid.
     """
-    parts = default_library(library)
+    parts = open_library(library)
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
     derivation, default_name = parse_words(request_words, parts)
     robot = compose_derivation(derivation, parts, name or default_name)
@@ -65,7 +66,7 @@ def sample(
     *,
     seed: int = 0,
     where: str | None = None,
-    library: Iterable[Path] = (),
+    library: LibraryFolders = (),
 ) -> Iterator[Robot]:
     """Draw robots from a grammar; each is drawn when the iterator reaches it.
 
@@ -86,7 +87,7 @@ def sample(
         GrammarError: If the grammar or the condition is invalid.
         SamplingError: While iterating, if no robot meets the conditions in 500 draws.
     """
-    parts = default_library(library)
+    parts = open_library(library)
     loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:

@@ -1,0 +1,134 @@
+"""Encode and compare robots, and load splits of train and test robots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from os import PathLike
+
+from numpy.typing import ArrayLike
+
+from morphgen.api.library import LibraryFolders, open_library
+from morphgen.benchmark import tokens as encoding
+from morphgen.benchmark.loaded_split import LoadedSplit
+from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
+from morphgen.benchmark.split_source import read_split_or_folder
+from morphgen.benchmark.token_layout import default_max_links
+from morphgen.errors import BenchmarkError
+from morphgen.extras import explain_missing_extras
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.robot_source import RobotLike, resolve_robot
+from morphgen.model.robot import Robot
+from morphgen.typing import Array
+
+
+@explain_missing_extras()
+def tokens(
+    robot: RobotLike,
+    q: ArrayLike | None = None,
+    *,
+    max_links: int | None = None,
+    library: LibraryFolders = (),
+) -> Array:
+    """Encode a robot as 48 numbers per link, the input of the paper's policies.
+
+    Example:
+        >>> robot = morphgen.compose("ur5-plane")
+        >>> morphgen.tokens(robot).shape == (len(robot.links), 48)
+        True
+
+    Args:
+        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``.
+        q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
+        max_links: Number that link indices are relative to, the same for all robots that are
+            compared; by default the paper's 23, or the links of the robot if it has more.
+        library: Folders of your own parts.
+
+    Returns:
+        Tokens of the links, root first, shape (..., n_links, 48);
+        ``morphgen.benchmark.tokens.LAYOUT`` describes their fields.
+
+    Raises:
+        BenchmarkError: If the robot has more links than ``max_links`` or cannot be encoded.
+        MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
+        MorphgenError: If the robot cannot be composed or read.
+        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
+    """
+    parts = open_library(library)
+    loaded = resolve_robot(robot, parts)
+    size = default_max_links([len(loaded.links)]) if max_links is None else max_links
+    return encoding.tokens(loaded, token_shapes(loaded, parts.folders), q, max_links=size)
+
+
+@explain_missing_extras()
+def similarity(
+    robots: Iterable[RobotLike],
+    measures: Sequence[str] = tuple(MEASURES),
+    *,
+    max_links: int | None = None,
+    library: LibraryFolders = (),
+) -> dict[str, Array]:
+    """Compare all pairs of robots by their tokens, kinematic trees and workspaces.
+
+    Example:
+        >>> values = morphgen.similarity(["ur5-plane", "ur10-plane", "arm3-stick"])
+        >>> list(values)
+        ['cosine', 'tree', 'workspace']
+        >>> bool(values["tree"][0, 1] < values["tree"][0, 2])
+        True
+
+    Args:
+        robots: Two or more robots, each given itself or named as for ``tokens``.
+        measures: Names of measures: ``cosine`` of the tokens, ``tree``, the edit distance of the
+            kinematic trees, and ``workspace``, the overlap of the tool positions.
+        max_links: See ``tokens``; by default at least the links of the largest robot.
+        library: Folders of your own parts.
+
+    Returns:
+        A symmetric matrix by measure, shape (n, n), in the order of the robots. 1 means equal for
+        ``cosine`` and ``workspace``, 0 for the distance ``tree``.
+
+    Raises:
+        BenchmarkError: If a measure is unknown, there are fewer than two robots, or a robot has
+            no movable tool.
+        MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
+        MorphgenError: If a robot cannot be composed or read.
+    """
+    names = [measures] if isinstance(measures, str) else measures
+    for name in names:
+        get_measure(name)
+    several = [robots] if isinstance(robots, Robot | str | PathLike) else robots
+    parts = open_library(library)
+    loaded = [resolve_robot(robot, parts) for robot in several]
+    if len(loaded) < 2:
+        raise BenchmarkError(f"{len(loaded)} robots to compare; expected a list of two or more")
+    size = default_max_links(len(each.links) for each in loaded) if max_links is None else max_links
+    compared = [
+        features(each, token_shapes(each, parts.folders), max_links=size) for each in loaded
+    ]
+    return {name: similarity_matrix(compared, name) for name in names}
+
+
+def split(name: str | PathLike[str], *, library: LibraryFolders = ()) -> LoadedSplit:
+    """Load a split of train and test robots.
+
+    Example:
+        >>> scenario = morphgen.split("interpolation/arm3/reach")
+        >>> len(scenario.train), len(scenario.test)
+        (10, 1)
+        >>> scenario.audit().passed()
+        True
+
+    Args:
+        name: Name of a split that comes with morphgen, such as ``interpolation/arm3/reach``; a
+            split's file; or the folder where a split was built.
+        library: Folders of your own parts.
+
+    Returns:
+        The split. Its ``train`` and ``test`` robots are composed when first used; ``statistics()``
+        and ``audit()`` measure and compare all of them, which takes seconds.
+
+    Raises:
+        BenchmarkError: If the split does not exist or is malformed.
+    """
+    definition, _ = read_split_or_folder(name)
+    return LoadedSplit(definition, open_library(library))

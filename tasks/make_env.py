@@ -1,0 +1,130 @@
+"""Gymnasium environments of robots at a task, in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, overload
+
+from morphgen.api.library import LibraryFolders, library_folders
+from morphgen.errors import TaskError, nearest
+from morphgen.extras import explain_missing_extras
+from morphgen.model.robot import Robot
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from morphgen.grammar.robot_source import RobotLike
+    from morphgen.processes import Progress
+    from morphgen.tasks.actions import ActionKind
+    from morphgen.tasks.gym_env import TaskEnv
+    from morphgen.tasks.observation import ObservationConfig
+    from morphgen.tasks.obstacles import LayoutSide
+    from morphgen.tasks.sim.base import Contacts
+    from morphgen.tasks.task import TaskConfig
+    from morphgen.tasks.vector import TaskVector
+
+
+class SharedOptions(TypedDict, total=False):
+    """Keyword arguments of one environment and of vector environments."""
+
+    sim: str | None
+    kind: ActionKind
+    observe: ObservationConfig | None
+    contacts: Contacts | None
+    layouts: LayoutSide
+    goal_seed: int
+    cache: Path | None
+    library: LibraryFolders
+    max_links: int | None
+    progress: Progress
+
+
+class EnvOptions(SharedOptions, total=False):
+    """Keyword arguments of one environment; ``TaskEnv`` explains them."""
+
+    obstacles: bool
+    config: TaskConfig | None
+    render_mode: str | None
+    size: tuple[int, int]
+
+
+class VectorOptions(SharedOptions, total=False):
+    """Keyword arguments of vector environments; ``make_batch`` explains them."""
+
+    obstacles: bool | Sequence[bool]
+    configs: Sequence[TaskConfig]
+    seed: int
+    workers: int
+    device: str
+
+
+@overload
+def make_env(
+    task: str, robot: RobotLike = ..., *, num_envs: None = None, **options: Unpack[EnvOptions]
+) -> TaskEnv: ...
+@overload
+def make_env(
+    task: str,
+    robot: RobotLike | Sequence[RobotLike] = ...,
+    *,
+    num_envs: int,
+    **options: Unpack[VectorOptions],
+) -> TaskVector: ...
+@explain_missing_extras()
+def make_env(
+    task: str,
+    robot: RobotLike | Sequence[RobotLike] = "ur5-plane",
+    *,
+    num_envs: int | None = None,
+    **options: Any,
+) -> TaskEnv | TaskVector:
+    """Make a Gymnasium environment of a robot at a task, or a vector environment of several.
+
+    Example:
+        >>> env = morphgen.make_env("reach", "arm=ur5 ee=plane", sim="mujoco")
+        >>> observation, info = env.reset(seed=0)
+        >>> action = env.action_space.sample()
+        >>> observation, reward, terminated, truncated, info = env.step(action)
+        >>> terminated, truncated
+        (False, False)
+        >>> env.close()
+        >>> envs = morphgen.make_env("reach", ["ur5-plane", "arm3-stick"], num_envs=4, sim="mujoco")
+        >>> envs.reset(seed=0)[0]["tokens"].shape
+        (4, 23, 48)
+        >>> envs.close()
+
+    Args:
+        task: Name of a task, such as ``reach`` or ``push``.
+        robot: A robot, or its name: words of ``compose``, parts joined by dashes, a bundle's folder
+            or a URDF. For vector environments it may be a list: environment i has robot i modulo
+            their number.
+        num_envs: None for one environment without a batch axis, ``TaskEnv``; a number, also 1, for
+            that many in a vector environment, ``TaskVector``.
+        **options: The simulator (``sim="mujoco"``), ``obstacles=True``, ``kind="discrete"``,
+            ``library`` and others: for one environment those of ``TaskEnv``, such as
+            ``render_mode="rgb_array"``; for vector environments those of ``make_batch``, such as
+            ``workers=2``.
+
+    Raises:
+        TaskError: If an argument is unknown or invalid.
+        MissingDependencyError: If the extra ``tasks`` or the simulator is not installed.
+        MorphgenError: If a robot cannot be composed or read, or cannot do the task.
+    """
+    valid = (EnvOptions if num_envs is None else VectorOptions).__optional_keys__
+    for name in options:
+        if name not in valid:
+            kind = "one environment" if num_envs is None else "vector environments"
+            raise TaskError(f"{kind}: unknown option {name!r}{nearest(name, valid)}")
+    options["library"] = library_folders(options.get("library", ()))
+    if num_envs is None:
+        from morphgen.tasks.gym_env import TaskEnv
+
+        if not isinstance(robot, Robot | str | PathLike):
+            raise TaskError(f"robot {robot!r}: expected one robot; name several with num_envs")
+        return TaskEnv(task, robot, **options)
+    from morphgen.tasks.vector import task_vector
+
+    several = [robot] if isinstance(robot, Robot | str | PathLike) else robot
+    return task_vector(num_envs, task=task, robots=several, **options)
