@@ -147,6 +147,7 @@ def test_vector_environments_of_one_keep_their_axis():
     ("call", "message"),
     [
         (lambda: morphgen.compose("arm=lwrr"), "did you mean 'lwr'"),
+        (lambda: morphgen.compose("prims", geometry="meshes"), "did you mean 'mesh'"),
         (lambda: morphgen.check(3), "3 is no robot; expected a Robot, a path, or a name"),
         (lambda: morphgen.conform("no/such/folder"), "no/such/folder: no such file or folder"),
         (lambda: morphgen.fit("arm3-stick", max_primitives=0), "0 primitives: expected 1 to 32"),

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Literal
 
 from morphgen.api.library import LibraryFolders, open_library
 from morphgen.checks import check
+from morphgen.errors import CompositionError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import read_robot, write_bundle
@@ -20,13 +20,16 @@ from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
+GEOMETRIES = ("mesh", "primitive")
+"""Collision shapes of real parts that ``compose`` can give a robot."""
+
 
 @explain_missing_extras()
 def compose(
     request: str = "",
     *,
     name: str | None = None,
-    geometry: Literal["mesh", "primitive"] = "mesh",
+    geometry: str = "mesh",
     library: LibraryFolders = (),
     **words: str | float,
 ) -> Robot:
@@ -44,7 +47,8 @@ def compose(
             dashes, such as ``ur5-plane``; or a grammar and pinned choices, such as
             ``chain beads=5``.
         name: Name of the robot; by default it is made from the parts.
-        geometry: Collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres.
+        geometry: Collision shapes of real parts: ``mesh``, or ``primitive`` for fitted boxes,
+            cylinders and spheres.
         library: Folders of your own parts and grammars.
         **words: More ``key=value`` words. Values without a unit are in SI units.
 
@@ -53,6 +57,8 @@ def compose(
         MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
             value is out of range; the message lists what is valid.
     """
+    if geometry not in GEOMETRIES:
+        raise CompositionError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
     parts = open_library(library)
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
     derivation, default_name = parse_words(request_words, parts)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from morphgen.benchmark.audit import NEAR_THRESHOLDS, Audit, NearThresholds, audit
 from morphgen.benchmark.split import Split, compose_side
@@ -45,7 +46,7 @@ class LoadedSplit:
         """
         return tuple(compose_side(self.definition, "test", self.library))
 
-    def statistics(self, *, jobs: int = 1, progress: Progress = no_progress) -> dict[str, object]:
+    def statistics(self, *, jobs: int = 1, progress: Progress = no_progress) -> dict[str, Any]:
         """Compute sizes of the robots, and the similarity of test and train robots.
 
         Args:
