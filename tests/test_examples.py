@@ -1,7 +1,11 @@
 """The examples run; an external task supports everything that the built-in tasks do."""
 
+import ast
 import importlib.util
+import re
+import runpy
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +23,72 @@ from morphgen.viewer.page_play_controls import parse_rollout
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
 
-CUSTOM_TASK = Path(__file__).parents[1] / "examples" / "custom_task.py"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+CUSTOM_TASK = EXAMPLES / "09_custom_task.py"
+SCRIPTS = sorted(EXAMPLES.glob("*.py"))
+OUTPUTS = {
+    "01_compose": ([], "tool after 0.5 s: z = 0.352 m"),
+    "02_own_part": ([], "error: .*length.*2"),
+    "03_grammar": (["20"], "20 robots, last links: {'ee_plate': "),
+    "05_split": ([], "passed: True, 0 findings"),
+    "06_gymnasium": ([], "jacobian controller: .* m from the goals"),
+    "09_custom_task": (["goals", "planar-cube", "--task", "follow"], "1 of 1 goal sets"),
+    "10_viewer": (["0"], "http://127.0.0.1:[0-9]+ "),
+    "11_goal_set": ([], r"faults: \[\]\nfaults: \['goal 0: the tool"),
+}
+"""Arguments of each example, and a pattern that its output has."""
+SLOW_OUTPUTS = {
+    "04_fit": ([], "ee_right_gripper_base_link: Cylinder, IoU 0.99"),
+    "07_stable_baselines3": (["512"], "after 512 steps: .* m from the goals"),
+    "08_train": (["4096"], "film: reach.mp4"),
+}
 RUN = "runs/planar-cube-follow/me-graph/seed0"
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Return a function that runs an example in an empty folder and returns what it prints."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+
+    def run_example(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        with suppress(SystemExit):
+            runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_example
+
+
+@pytest.mark.parametrize(
+    "name", [*OUTPUTS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_OUTPUTS)]
+)
+def test_example_prints_what_it_says(name, run):
+    arguments, pattern = (OUTPUTS | SLOW_OUTPUTS)[name]
+    assert re.search(pattern, run(name, *arguments))
+
+
+def test_every_example_is_run_and_listed():
+    names = {path.stem for path in SCRIPTS}
+    assert names == OUTPUTS.keys() | SLOW_OUTPUTS.keys()
+    readme = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"(?m)^\| \[(\w+)\.py\]", readme) == sorted(names)
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_example_is_short_and_says_what_it_prints(path):
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 80
+    assert "Prints" in ast.get_docstring(ast.parse(text))
+
+
+def test_notebooks_are_up_to_date():
+    build = runpy.run_path(str(EXAMPLES / "notebooks" / "build.py"))
+    folder = EXAMPLES / "notebooks"
+    stored = {path.stem: path.read_text(encoding="utf-8") for path in folder.glob("*.ipynb")}
+    made = {name: build["notebook_text"](each) for name, each in build["NOTEBOOKS"].items()}
+    assert stored == made, "run examples/notebooks/build.py"
 
 
 @pytest.fixture
@@ -37,7 +105,6 @@ def follow(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys, monkeypatch):
-    assert len(CUSTOM_TASK.read_text(encoding="utf-8").splitlines()) < 150
     few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")
     robot, sim = "planar-cube", ("--sim", "mujoco")
     monkeypatch.setattr(sys, "argv", ["follow.py"])

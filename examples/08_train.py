@@ -1,0 +1,61 @@
+"""Train a policy that comes with morphgen, evaluate it in MuJoCo, and film an episode.
+
+    python examples/08_train.py [STEPS]
+
+Prints success rate and distance of the trained and of the random policy, and the path of the film.
+The default of 200,000 steps takes a few minutes on a CPU. `morphgen train`, `eval` and `play` do
+the same from the command line.
+"""
+
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import morphgen
+from morphgen.rl.agent_spec import configs_of, parse_agent
+from morphgen.rl.evaluation import eval_config_of, evaluate_run
+from morphgen.rl.play import FPS, interface_of, make_controller, play
+from morphgen.rl.presets import preset_of
+from morphgen.rl.robot_source import robot_source
+from morphgen.rl.runs import RunConfig
+from morphgen.rl.training import ExecutionConfig, train
+from morphgen.tasks.renderer import write_video
+
+# %%
+# A run is described by its robots, its agent and the hyperparameters of PPO.
+steps = int(sys.argv[1]) if len(sys.argv) > 1 else 200_000
+agent = parse_agent("me-graph")
+preset = preset_of(None, agent.agent)
+agent = replace(agent, switches={**preset.switches, **agent.switches})
+source = robot_source("arm3-stick", "reach")
+policy, ppo = configs_of(agent, ["reach"], preset.constants, steps)
+config = RunConfig(source, policy, ppo, sim="kinematic", num_envs=preset.num_envs)
+
+# %%
+# The folder gets the checkpoint and the metrics; `resume=True` continues an interrupted run.
+folder = Path("runs/arm3-stick")
+train(folder, config, resume=folder.exists(), execution=ExecutionConfig(tensorboard=False))
+
+# %%
+# The kinematic simulator has no contacts, so that the policy is evaluated in MuJoCo.
+(score,) = evaluate_run(folder, "train", eval_config_of(config, episodes=4), "deterministic")
+print(f"success {score.success:.0%} (random policy: {score.random_success:.0%})")
+print(f"final distance {score.distance:.3f} m, score {score.score:.1f}")
+
+# %%
+# A policy needs the observations that it was trained with.
+interface = interface_of(str(folder))
+env = morphgen.make_env(
+    "reach",
+    "arm3-stick",
+    sim="mujoco",
+    kind=interface.kind,
+    observe=interface.channels,
+    max_links=interface.max_links,
+    render_mode="rgb_array",
+)
+with closing(env):
+    controller = make_controller(str(folder), env, seed=0)
+    write_video(play(env, controller, 1, 0, lambda episode: None), Path("reach.mp4"), FPS)
+print("film: reach.mp4")
