@@ -150,6 +150,7 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.compose("prims", geometry="meshes"), "did you mean 'mesh'"),
         (lambda: morphgen.check(3), "3 is no robot; expected a Robot, a path, or a name"),
         (lambda: morphgen.conform("no/such/folder"), "no/such/folder: no such file or folder"),
+        (lambda: morphgen.conform("prims", samples=0), "0 samples, seed 0: expected 1 sample"),
         (lambda: morphgen.fit("arm3-stick", max_primitives=0), "0 primitives: expected 1 to 32"),
         (lambda: morphgen.fit("none.stl"), "none.stl"),
         (lambda: morphgen.tokens("arm3-stick", max_links=2), "more than max_links 2"),

@@ -107,7 +107,8 @@ def conform(
         The report; ``rows`` has an entry for each loader.
 
     Raises:
-        FormatError: If ``samples`` is below 1, or the robot has no valid folder name.
+        FormatError: If ``samples`` is below 1, ``seed`` is below 0, or the robot's name cannot be
+            that of a folder.
         MorphgenError: If the robot cannot be composed or read.
     """
     if isinstance(robot, Robot):

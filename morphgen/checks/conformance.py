@@ -81,7 +81,7 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
         seed: Seed of the configurations.
 
     Raises:
-        FormatError: If ``bundle_dir`` is not a bundle.
+        FormatError: If ``bundle_dir`` is not a bundle, ``samples`` is below 1 or ``seed`` below 0.
     """
     return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
 
@@ -99,7 +99,15 @@ def robot_conformance(robot: Robot, samples: int = 100, seed: int = 0) -> Confor
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
-    """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``."""
+    """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``.
+
+    Raises:
+        FormatError: If there are no samples, or the seed is negative.
+    """
+    if samples < 1 or seed < 0:
+        raise FormatError(
+            f"{samples} samples, seed {seed}: expected 1 sample or more, and a seed of 0 or more"
+        )
     frame = next((frame for frame in robot.frames if frame.name == TOOL), None)
     if frame is None:
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
