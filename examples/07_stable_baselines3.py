@@ -3,7 +3,8 @@
     python examples/07_stable_baselines3.py [STEPS]
 
 Needs `pip install stable-baselines3`. Prints the mean distance to the goal after an episode of the
-untrained and of the trained policy. The default of 100,000 steps takes a few minutes on a CPU.
+untrained and of the trained policy: with the default of 30,000 steps, which take half a minute on a
+CPU, from about 0.9 m to less than 0.2 m.
 """
 
 import sys
@@ -13,13 +14,17 @@ import numpy as np
 from stable_baselines3 import PPO
 
 import morphgen
+from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.sb3 import SB3Vector
 
 # %%
 # Robots share one space: observations are padded and masked, actions of missing joints are ignored.
-steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
+# Channels of kinematics tell the policy what each joint does to the tool: it learns in seconds.
+steps = int(sys.argv[1]) if len(sys.argv) > 1 else 30_000
 robots = ["arm3-stick", "chain beads=3"]
-envs = SB3Vector(morphgen.make_env("reach", robots, num_envs=16, sim="kinematic", seed=0))
+channels = ObservationConfig(jacobian=True, dls=True)
+vector = morphgen.make_env("reach", robots, num_envs=16, sim="kinematic", observe=channels, seed=0)
+envs = SB3Vector(vector)
 
 
 def mean_distance(model: PPO, duration: int = 150) -> float:
@@ -33,7 +38,7 @@ def mean_distance(model: PPO, duration: int = 150) -> float:
 
 
 # %%
-model = PPO("MultiInputPolicy", envs, n_steps=32, batch_size=128, n_epochs=4, seed=0)
+model = PPO("MultiInputPolicy", envs, n_steps=32, batch_size=128, n_epochs=4, gamma=0.95, seed=0)
 print(f"untrained: {mean_distance(model):.2f} m from the goals")
 
 # %%
