@@ -12,10 +12,9 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-import morphgen
 from morphgen.rl.agent_spec import configs_of, parse_agent
 from morphgen.rl.evaluation import eval_config_of, evaluate_run
-from morphgen.rl.play import FPS, interface_of, make_controller, play
+from morphgen.rl.play import FPS, make_env, play, read_controller
 from morphgen.rl.presets import preset_of
 from morphgen.rl.robot_source import robot_source
 from morphgen.rl.runs import RunConfig
@@ -44,18 +43,9 @@ print(f"success {score.success:.0%} (random policy: {score.random_success:.0%})"
 print(f"final distance {score.distance:.3f} m, score {score.score:.1f}")
 
 # %%
-# A policy needs the observations that it was trained with.
-interface = interface_of(str(folder))
-env = morphgen.make_env(
-    "reach",
-    "arm3-stick",
-    sim="mujoco",
-    kind=interface.kind,
-    observe=interface.channels,
-    max_links=interface.max_links,
-    render_mode="rgb_array",
-)
+# A policy needs the observations that it was trained with: `make_env` makes such an environment.
+controller = read_controller(str(folder), "reach")
+env, act = make_env(controller, "arm3-stick", 0, sim="mujoco", render_mode="rgb_array")
 with closing(env):
-    controller = make_controller(str(folder), env, seed=0)
-    write_video(play(env, controller, 1, 0, lambda episode: None), Path("reach.mp4"), FPS)
+    write_video(play(env, act, 1, 0, lambda episode: None), Path("reach.mp4"), FPS)
 print("film: reach.mp4")

@@ -28,3 +28,135 @@ BLOCK = re.compile(
 
 SLOW_PAGES = ("similarity", "splits", "tasks")
 """Pages whose Python examples take seconds."""
+
+
+def codes_in_source():
+    codes = set()
+    for room in ("checks", "formats"):
+        for path in (ROOT / "morphgen" / room).glob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            codes |= set(re.findall(r'"([a-z]+(?:-[a-z]+)+)",\s+"(?:error|warning|info)"', text))
+            codes |= set(re.findall(r'finding\(\s*\w+,\s*"([a-z]+(?:-[a-z]+)*)"', text))
+    return codes
+
+
+def test_every_finding_code_is_documented():
+    page = (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")
+    codes = codes_in_source()
+    assert len(codes) > 30
+    assert {code for code in codes if f"`{code}`" not in page} == set()
+
+
+def test_readme_part_counts_are_correct():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    arms, ees = re.search(r"(\d+) arms and (\d+) end-effectors", text).groups()
+    library = default_library()
+    assert int(arms) == len(library.names("arm"))
+    assert int(ees) == len(set(library.names("ee")) - {"none"})
+
+
+@pytest.fixture(scope="module")
+def parser():
+    return build_parser()
+
+
+def blocks(page):
+    """Return the matches of ``BLOCK`` in a page; comments of HTML are no part of it."""
+    return list(BLOCK.finditer(page.read_text(encoding="utf-8")))
+
+
+def code(page, language):
+    return [block["code"] for block in blocks(page) if block["language"] == language]
+
+
+def commands(block):
+    """Return the morphgen commands of a block, without comments and placeholders."""
+    text = (block["commands"] or (block["code"] if not block["language"] else "")) or ""
+    lines = text.replace("\\\n", " ").splitlines()
+    found = [re.match(r"\s*(?:\$ )?(?:\w+=\S+ )*morphgen (.*)", line) for line in lines]
+    texts = [re.sub(r"\[--.*?\]| \.\.\.", "", match[1]) for match in found if match]
+    return [shlex.split(text, comments=True) for text in texts]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_between_pages_are_valid(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("https://"):
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_documented_commands_have_valid_options(page, parser):
+    for block in blocks(page):
+        for words in commands(block):
+            # `play` accepts a path as policy only if it exists.
+            words = [str(ROOT) if re.match("(runs|study)/", word) else word for word in words]
+            if words != ["COMMAND", "--help"]:
+                parse(parser, words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_yaml_and_toml_can_be_read(page):
+    assert all(yaml.safe_load(text) or text.startswith("#") for text in code(page, "yaml"))
+    assert all(tomllib.loads(text) for text in code(page, "toml"))
+
+
+EXAMPLES = [
+    pytest.param(text, id=f"{page.stem}-{i}", marks=[pytest.mark.slow] * (page.stem in SLOW_PAGES))
+    for page in PAGES
+    for i, text in enumerate(code(page, "python"))
+    if page.stem not in ("own-parts", "tutorial")  # their examples need each other
+]
+
+
+@pytest.mark.parametrize("text", EXAMPLES)
+def test_python_examples_run(text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    if "data/" in text:
+        assert main(["split", "build", "extrapolation/arms/reach", "--goals", "--light"]) == 0
+    if "import gymnasium" in text:  # which finds the environments if it is imported first
+        register_gym_envs()
+    if "cuda" in text and not pytest.importorskip("torch").cuda.is_available():
+        text = text.replace('device="cuda"', 'device="cpu"')
+    exec(text, {"__name__": "__main__"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["own-parts", "tutorial"])
+def test_pages_work_from_top_to_bottom(name, tmp_path, monkeypatch):
+    """Save the files of a page, run its commands and examples; training is shortened."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    _, _, text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").partition("\n## ")
+    for block in BLOCK.finditer(text):
+        if block["file"]:
+            path = Path(block["file"].strip("`"))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block["code"], encoding="utf-8")
+        elif block["language"] == "python":
+            exec(block["code"], {"__name__": "__main__"})
+        for words in commands(block):
+            short = ["--steps", "640", "--envs", "10"] if words[0] == "train" else []
+            short += ["--steps", "300"] if words[0] == "eval" else []
+            assert main([*words, *short]) == 0, words
+
+
+def test_part_manifest_page_is_current():
+    script = runpy.run_path(str(ROOT / "docs" / "part_manifest.py"))
+    assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
+
+
+def test_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=quiet)
+    assert done.returncode == 0, done.stderr
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in tmp_path.glob("*.html")}
+    assert {page.stem for page in PAGES[1:]} <= set(pages)
+    for text in pages.values():
+        assert re.findall(r"<(?:script|img|iframe)[^>]* src=\"?(?:https?:)?//[^>]*>", text) == []
+        assert re.findall(r"<link[^>]* href=\"?(?:https?:)?//[^>]*>", text) == []
+    commands = build_parser()._subparsers._group_actions[0].choices
+    assert all(f'id="{name}"' in pages["cli"] for name in commands)
+    assert 'id="morphgen.compose"' in pages["api"]
