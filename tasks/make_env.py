@@ -82,7 +82,7 @@ def make_env(
 ) -> TaskEnv | TaskVector:
     """Make a Gymnasium environment of a robot at a task, or a vector environment of several.
 
-    Example:
+    Examples:
         >>> env = morphgen.make_env("reach", "arm=ur5 ee=plane", sim="mujoco")
         >>> observation, info = env.reset(seed=0)
         >>> action = env.action_space.sample()

@@ -31,7 +31,7 @@ def tokens(
 ) -> Array:
     """Encode a robot as 48 numbers per link, the input of the paper's policies.
 
-    Example:
+    Examples:
         >>> robot = morphgen.compose("ur5-plane")
         >>> morphgen.tokens(robot).shape == (len(robot.links), 48)
         True
@@ -69,7 +69,7 @@ def similarity(
 ) -> dict[str, Array]:
     """Compare all pairs of robots by their tokens, kinematic trees and workspaces.
 
-    Example:
+    Examples:
         >>> values = morphgen.similarity(["ur5-plane", "ur10-plane", "arm3-stick"])
         >>> list(values)
         ['cosine', 'tree', 'workspace']
@@ -111,7 +111,7 @@ def similarity(
 def split(name: str | PathLike[str], *, library: LibraryFolders = ()) -> LoadedSplit:
     """Load a split of train and test robots.
 
-    Example:
+    Examples:
         >>> scenario = morphgen.split("interpolation/arm3/reach")
         >>> len(scenario.train), len(scenario.test)
         (10, 1)

@@ -28,7 +28,7 @@ def check(
 ) -> tuple[Finding, ...]:
     """Find faults of a robot, with a repair for each.
 
-    Example:
+    Examples:
         >>> findings = morphgen.check("ur5-plane")
         >>> [finding.code for finding in findings if finding.severity == "error"]
         []
@@ -89,7 +89,7 @@ def conform(
 
     The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio.
 
-    Example:
+    Examples:
         >>> report = morphgen.conform("ur5-plane", samples=10)
         >>> report.passed
         True

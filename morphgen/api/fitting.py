@@ -30,7 +30,7 @@ def fit(
 ) -> FittedRobot:
     """Replace the meshes of a robot by boxes, cylinders and spheres, and measure the fit.
 
-    Example:
+    Examples:
         >>> fitted = morphgen.fit("rethink", max_primitives=2)
         >>> [len(link.fit.primitives) for link in fitted.report.links]
         [1, 2, 1, 2, 1]
