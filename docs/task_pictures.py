@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from morphgen.rl.baselines import baselines_for
-from morphgen.rl.play import make_env, play, read_controller
+from morphgen.rl.play import make_env_and_controller, play, read_controller
 from morphgen.tasks.registry import TASKS
 
 ROBOTS = ("ur5-plane", "prims", "chain beads=3")
@@ -43,7 +43,7 @@ def main() -> int:
 
 def _row(task: str, robot: str, seed: int) -> np.ndarray:
     spec = read_controller(baselines_for(task)[0], task)
-    env, controller = make_env(spec, robot, seed, render_mode="rgb_array", size=SIZE)
+    env, controller = make_env_and_controller(spec, robot, seed, render_mode="rgb_array", size=SIZE)
     with closing(env):
         frames = list(play(env, controller, 1, seed, lambda episode: print(robot, episode)))
     # A push ends with success; a reach is stationary after a quarter of its time.

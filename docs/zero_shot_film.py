@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.rl.play import FPS, make_env, play, read_controller
+from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
 from morphgen.tasks.renderer import write_video
 
 ROBOTS = (
@@ -54,7 +54,9 @@ def main() -> int:
 def film(robot: str, seed: int) -> np.ndarray:
     """Return the frames of a robot's episodes, shape (n, height, width, 3)."""
     spec = read_controller("zero-shot", "reach")
-    env, controller = make_env(spec, robot, seed, sim="mujoco", render_mode="rgb_array", size=SIZE)
+    env, controller = make_env_and_controller(
+        spec, robot, seed, sim="mujoco", render_mode="rgb_array", size=SIZE
+    )
     with closing(env):
         frames = play(env, controller, EPISODES, seed, lambda e: print(robot, e), REST)
         return np.stack(list(frames)[::STRIDE])

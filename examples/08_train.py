@@ -2,7 +2,8 @@
 
     python examples/08_train.py [STEPS]
 
-Prints success rate and distance of the trained and of the random policy, and the path of the film.
+Prints the success rates of the trained and of the random policy, the trained one's distance and
+score, and the path of the film.
 The default of 50,000 steps takes about a minute on a CPU and reaches most goals. `morphgen train`,
 `eval` and `play` do the same from the command line.
 """
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from morphgen.rl.agent_spec import configs_of, parse_agent
 from morphgen.rl.evaluation import eval_config_of, evaluate_run
-from morphgen.rl.play import FPS, make_env, play, read_controller
+from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
 from morphgen.rl.presets import preset_of
 from morphgen.rl.robot_source import robot_source
 from morphgen.rl.runs import RunConfig
@@ -33,7 +34,7 @@ config = RunConfig(source, policy, ppo, sim="kinematic", num_envs=preset.num_env
 
 # %%
 # The folder gets the checkpoint and the metrics; `resume=True` continues an interrupted run.
-folder = Path("runs/arm3-stick")
+folder = Path(f"runs/arm3-stick-{steps}")
 train(folder, config, resume=folder.exists(), execution=ExecutionConfig(tensorboard=False))
 
 # %%
@@ -43,9 +44,12 @@ print(f"success {score.success:.0%} (random policy: {score.random_success:.0%})"
 print(f"final distance {score.distance:.3f} m, score {score.score:.1f}")
 
 # %%
-# A policy needs the observations that it was trained with: `make_env` makes such an environment.
+# A policy needs the observations that it was trained with: this call makes such an
+# environment.
 controller = read_controller(str(folder), "reach")
-env, act = make_env(controller, "arm3-stick", 0, sim="mujoco", render_mode="rgb_array")
+env, act = make_env_and_controller(
+    controller, "arm3-stick", 0, sim="mujoco", render_mode="rgb_array"
+)
 with closing(env):
     write_video(play(env, act, 1, 0, lambda episode: None), Path("reach.mp4"), FPS)
 print("film: reach.mp4")

@@ -46,7 +46,7 @@ class ControllerSpec:
 
 
 def read_controller(name: str, task: str) -> ControllerSpec:
-    """Return the controller of a name; ``make_env`` makes it.
+    """Return the controller of a name; ``make_env_and_controller`` makes it.
 
     Args:
         name: Name of a baseline or a shipped policy; or the path of a checkpoint or of a run's
@@ -72,7 +72,7 @@ def read_controller(name: str, task: str) -> ControllerSpec:
     return ControllerSpec(name, task, config, run.interface, learner)
 
 
-def make_env(
+def make_env_and_controller(
     spec: ControllerSpec,
     robot: str | Robot,
     seed: int,
@@ -81,6 +81,8 @@ def make_env(
     **options: Any,  # noqa: ANN401
 ) -> tuple[TaskEnv, Controller]:
     """Make an environment that suits a controller, and the controller.
+
+    Unless ``config`` is given, the task has the constants that the controller is evaluated with.
 
     Args:
         spec: The controller.
@@ -98,6 +100,7 @@ def make_env(
         if kind not in (None, interface.kind):
             raise TaskError(f"{spec.name}: its actions are {interface.kind}, not {kind}")
         policy = Policy(spec.learner, "deterministic", seed)
+    options.setdefault("config", spec.task_config)
     env = TaskEnv(
         spec.task,
         robot,

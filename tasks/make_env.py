@@ -127,4 +127,6 @@ def make_env(
     from morphgen.tasks.vector import task_vector
 
     several = [robot] if isinstance(robot, Robot | str | PathLike) else robot
+    if not several:
+        raise TaskError("robot []: expected at least one robot")
     return task_vector(num_envs, task=task, robots=several, **options)

@@ -160,6 +160,7 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.make_env("reech"), "did you mean 'reach'"),
         (lambda: morphgen.make_env("reach", workers=2), "unknown option 'workers'"),
         (lambda: morphgen.make_env("reach", ["prims"]), "name several with num_envs"),
+        (lambda: morphgen.make_env("reach", [], num_envs=2), "expected at least one robot"),
         (lambda: morphgen.make_env("reach", num_envs=2, size=(1, 1)), "unknown option 'size'"),
         (lambda: morphgen.make_env("reach", "prims", num_envs=0), "0 environments"),
     ],

@@ -18,7 +18,7 @@ from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.drawn_robots import FILE, read_drawn
-from morphgen.rl.play import ControllerSpec, make_env, read_controller
+from morphgen.rl.play import ControllerSpec, make_env_and_controller, read_controller
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
@@ -235,13 +235,12 @@ def _start_robot(
 ) -> _SimulatedRobot:
     """Begin the episode of a robot in an environment of its own."""
     robot = read_robot_uri(uri, files)
-    env, controller = make_env(
+    env, controller = make_env_and_controller(
         spec,
         as_primitives(with_library_meshes(robot, files.library), files.library_folders),
         config.seed,
         sim=config.simulator,
         obstacles=config.obstacles,
-        config=spec.task_config,
         library=files.library_folders,
     )
     with contextlib.ExitStack() as stack:

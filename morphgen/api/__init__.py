@@ -1,1 +1,1 @@
-"""The functions of ``import morphgen``; each calls what its command of the command line calls."""
+"""The functions of ``import morphgen``; the command line uses the same code."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.benchmark.extrapolation import parse_bound
-from morphgen.benchmark.holdout_audit import hold_out_findings, says_what_is_held_out
+from morphgen.benchmark.holdout_audit import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import SIDES, Member, Side, Split
@@ -205,7 +205,7 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
 
 def _repeated(split: Split) -> Iterator[Finding]:
     """Yield robots that a side has twice."""
-    severity: Severity = "error" if says_what_is_held_out(split) else "warning"
+    severity: Severity = "error" if has_hold_out_rules(split) else "warning"
     for side in SIDES:
         first: dict[tuple[object, ...], str] = {}
         for member in split.side(side):
@@ -226,7 +226,7 @@ def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ..
         return ()
     split = replace(survey.split, train=tuple(composable["train"]), test=tuple(composable["test"]))
     findings = regime_findings(split, library)
-    if says_what_is_held_out(survey.split):
+    if has_hold_out_rules(survey.split):
         findings += hold_out_findings(split, library)
     return findings
 

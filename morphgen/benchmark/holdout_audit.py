@@ -13,7 +13,7 @@ from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
 
 
-def says_what_is_held_out(split: Split) -> bool:
+def has_hold_out_rules(split: Split) -> bool:
     """Return whether a split claims to hold something out."""
     return split.regime == HOLD_OUT or HOLD_OUT_KEY in split.provenance
 

@@ -185,8 +185,11 @@ def _with_values(
         yield derivation
         return
     rng = np.random.default_rng(np.random.SeedSequence([maker.seed, *str(derivation).encode()]))
-    for _ in range(num_values):
-        yield _replace_values(derivation, choices, rng, inside=True)
+    for i in range(num_values):
+        # Of several ranges of one parameter the last one counts: each takes its turn.
+        turn = i % len(choices)
+        in_turn = [*choices[turn:], *choices[:turn]]
+        yield _replace_values(derivation, in_turn, rng, inside=True)
         for _ in range(MAX_VALUE_DRAWS):
             drawn = _replace_values(derivation, choices, rng, inside=False)
             if not any(rule.holds(drawn, maker.library) for rule in maker.rules):

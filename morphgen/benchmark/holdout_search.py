@@ -28,7 +28,7 @@ class _Unfit:
 
 
 @dataclass(frozen=True)
-class Workshop:
+class ComposeDraft:
     """Compose drafts; can be pickled and sent to a worker process."""
 
     factory: RobotFactory
@@ -47,7 +47,7 @@ class HoldoutSearch:
 
     request: SplitRequest
     maker: DraftMaker
-    workshop: Workshop
+    workshop: ComposeDraft
     pool: dict[int, Draft]
     robots: dict[int, Candidate] = field(default_factory=dict)
     """Composed robots by their number in the pool."""
@@ -169,7 +169,7 @@ class HoldoutSearch:
             if number in self.robots and number not in self.rejected:
                 earlier = first.setdefault(self.robots[number].hash, number)
                 if earlier != number:
-                    self.rejected[number] = "the body of another"
+                    self.rejected[number] = "the same hash as another robot"
 
     def _reject_near(self, test: Sequence[int], train: Sequence[int]) -> None:
         """Reject train robots that the audit would call nearly the same as a test robot."""
@@ -177,7 +177,7 @@ class HoldoutSearch:
             if pair not in self._compared and all(n in self.robots for n in pair):
                 self._compared[pair] = self._is_near(*pair)
             if self._compared.get(pair) and not self.rejected.keys() & set(pair):
-                self.rejected[pair[1]] = "nearly the body of a test robot"
+                self.rejected[pair[1]] = "almost the sizes of a test robot"
 
     def _is_near(self, a: int, b: int) -> bool:
         x, y = self.robots[a].features, self.robots[b].features

@@ -9,6 +9,7 @@ from typing import Any
 from morphgen.benchmark.audit import NEAR_THRESHOLDS, Audit, NearThresholds, audit
 from morphgen.benchmark.split import Split, compose_side
 from morphgen.benchmark.statistics import statistics
+from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
@@ -46,6 +47,7 @@ class LoadedSplit:
         """
         return tuple(compose_side(self.definition, "test", self.library))
 
+    @explain_missing_extras()
     def statistics(self, *, jobs: int = 1, progress: Progress = no_progress) -> dict[str, Any]:
         """Compute sizes of the robots, and the similarity of test and train robots.
 
@@ -58,9 +60,11 @@ class LoadedSplit:
 
         Raises:
             BenchmarkError: If a robot cannot be composed, or train or test is empty.
+            MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
         return statistics(self.definition, self.library, jobs=jobs, progress=progress)
 
+    @explain_missing_extras()
     def audit(
         self,
         *,
@@ -77,5 +81,6 @@ class LoadedSplit:
 
         Raises:
             BenchmarkError: If the provenance of the split is malformed.
+            MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
         return audit(self.definition, self.library, near=near, jobs=jobs, progress=progress)

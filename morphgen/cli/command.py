@@ -125,8 +125,10 @@ class Command:
         """Add the command's parser to those of its group."""
         parser = parsers.add_parser(self.name, help=self.summary, **self._texts())
         if self.commands:
-            is_required = self.run is None
-            add_commands(parser, self.commands, required=is_required, dest="subcommand")
+            runs = self.run is not None
+            add_commands(
+                parser, self.commands, required=not runs, dest="subcommand", has_options=runs
+            )
         if self.run is None:
             return
         for entry in self.options:
@@ -174,16 +176,50 @@ class Parser(argparse.ArgumentParser):
             )
 
 
+class _CommandAfterOptions(argparse._SubParsersAction):  # type: ignore[type-arg]  # not at run time
+    """Chooses a command of a group that has options of its own.
+
+    The command's defaults would replace options that stand before it, so they are refused.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Refuse options before the command, then parse what follows it."""
+        for action in parser._actions:
+            if (
+                action.option_strings
+                and getattr(namespace, action.dest, action.default) != action.default
+            ):
+                name = values[0] if values else self.dest
+                parser.error(f"{action.option_strings[-1]} before {name}: options stand after it")
+        super().__call__(parser, namespace, values, option_string)
+
+
 def add_commands(
     parser: argparse.ArgumentParser,
     commands: Sequence[Command],
     *,
     required: bool = False,
     dest: str = "command",
+    has_options: bool = False,
 ) -> None:
-    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest."""
+    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest.
+
+    Args:
+        parser: Parser of the group.
+        commands: Commands of the group.
+        required: Whether one of them must be given.
+        dest: Attribute for the name of the chosen one.
+        has_options: Whether the group can run without a command and has options for that.
+    """
+    action = _CommandAfterOptions if has_options else argparse._SubParsersAction
     parsers = parser.add_subparsers(
-        metavar="COMMAND", dest=dest, required=required, parser_class=Parser
+        metavar="COMMAND", dest=dest, required=required, parser_class=Parser, action=action
     )
     for entry in commands:
         entry.add_to(parsers)

@@ -69,7 +69,7 @@ def _policy(text: str) -> str:
 def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
     with status(args, "loading"):
-        from morphgen.rl.play import FPS, make_env, play, read_controller
+        from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
         from morphgen.tasks.renderer import require_video_path, write_video
 
     spec = read_controller(args.policy, args.task)
@@ -88,7 +88,7 @@ def play(args: argparse.Namespace) -> None:
         )
 
     with bar(args, f"preparing {robot} and its goals") as progress:
-        env, controller = make_env(
+        env, controller = make_env_and_controller(
             spec,
             robot,
             args.seed,

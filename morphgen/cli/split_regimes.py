@@ -11,7 +11,6 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import (
     Command,
     Option,
-    UsageError,
     flag,
     number,
     option,
@@ -33,16 +32,6 @@ def new_hold_out(args: argparse.Namespace) -> None:
     """Make a split from what it holds out."""
     if not args.hold_out:
         args.parser.error("the following arguments are required: --hold-out, or COMMAND")
-    new_split(args)
-
-
-def _new_in_regime(args: argparse.Namespace) -> None:
-    """Make a split by the rules of a regime."""
-    if args.hold_out:
-        raise UsageError(
-            f"--hold-out {args.hold_out[0]}: cannot be joined with {args.regime}; give --hold-out "
-            "without a regime"
-        )
     new_split(args)
 
 
@@ -169,7 +158,7 @@ REGIMES = (
             ),
             *split_options("10"),
         ),
-        _new_in_regime,
+        new_split,
         examples=("split new interpolation --grammar arm3 --train 10 --test 1 --hull inside",),
         defaults={
             "generate": _interpolation,
@@ -191,7 +180,7 @@ REGIMES = (
             ),
             *split_options("", "all robots that may be trained on"),
         ),
-        _new_in_regime,
+        new_split,
         details="Every part of a test robot is in a train robot; its combination is in none. With "
         "several tasks, robot and task are combined: the end-effector of a test robot is trained "
         "at other tasks only.",
@@ -227,7 +216,7 @@ REGIMES = (
             ),
             *split_options("10"),
         ),
-        _new_in_regime,
+        new_split,
         details="Neither the category nor the structure of a test robot is trained.",
         examples=(
             "split new extrapolation --train-category stick,nlink,prims --test-category chain "

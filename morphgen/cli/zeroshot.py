@@ -88,11 +88,11 @@ def _table(results: list[ZeroShotResult]) -> str:
 
 
 def _film(source: RobotSource, policy: Path, args: argparse.Namespace) -> None:
-    from morphgen.rl.play import FPS, make_env, play, read_controller
+    from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
     from morphgen.tasks.renderer import write_video
     from morphgen.tasks.sim.base import CONTROL_PERIOD
 
-    env, controller = make_env(
+    env, controller = make_env_and_controller(
         read_controller(str(policy), "reach"),
         source.name,
         args.seed,

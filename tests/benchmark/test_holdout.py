@@ -125,6 +125,15 @@ def test_a_range_of_a_parameter_is_held_out(source):
     assert len(set(values["train"])) == 5
 
 
+def test_two_ranges_of_a_parameter_both_have_test_robots():
+    rules = ["arm3.length=0.15..0.2", "arm3.length=0.4..0.45"]
+    example = made(rules, 3, test=2, patterns=("arm=arm3 ee={cube,plane}",))
+    require_sound(example, rules)
+    low, high = sorted(v["1.length"] for v in lengths(example.test))
+    assert 0.15 <= low <= 0.2
+    assert 0.4 <= high <= 0.45
+
+
 def test_values_that_a_pattern_sets_are_kept():
     pattern = "arm=arm3 arm.length={0.2,0.35} ee={cube,plane}"
     example = made(["arm3.length=0.3..0.4"], 2, test=2, patterns=(pattern,))
@@ -155,13 +164,13 @@ def test_repeated_robots_of_a_grammar_are_not_drawn():
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):
-    workshop = holdout_search.Workshop.__call__
+    workshop = holdout_search.ComposeDraft.__call__
 
     def with_equal_hashes(self, draft):
         robot = workshop(self, draft)
         return replace(robot, hash="0" * 32) if "cube" in robot.name else robot
 
-    monkeypatch.setattr(holdout_search.Workshop, "__call__", with_equal_hashes)
+    monkeypatch.setattr(holdout_search.ComposeDraft, "__call__", with_equal_hashes)
     with pytest.raises(BenchmarkError) as caught:
         made(["arm=lwr"], 9, patterns=("arm={arm3,arm5,arm_ed,lwr} ee={cube,plane,stick}",))
     assert (
@@ -236,7 +245,7 @@ def test_robots_with_too_many_links_are_left_out_and_counted():
         made(["ee=hand"], 2, max_links=10, patterns=patterns)
 
 
-def test_the_file_says_what_is_held_out(tmp_path):
+def test_the_file_has_hold_out_rules(tmp_path):
     example = made(["ee=plane,arm3.length=30cm..0.4"], 4, test=2)
     text = split_text(example)
     assert "  hold_out: [ee=plane, arm3.length=0.3..0.4]\n" in text

@@ -254,7 +254,11 @@ def test_interrupted_run_leaves_no_files(run, tmp_path, monkeypatch):
         ((*HOLD_OUT, "--test", "3"), "--test 3: only 2 different robots with ee=plane, whose oth"),
         ((*HOLD_OUT, "--grammar", "arm33"), "'arm33'; did you mean 'arm3'?"),
         ((*HOLD_OUT, "--name", "../x"), "name '../x': use letters, digits"),
-        ((*HOLD_OUT, *COMPOSITION[2:]), "--hold-out ee=plane: cannot be joined with composition"),
+        ((*HOLD_OUT, *COMPOSITION[2:]), "--hold-out before composition: options stand after it"),
+        (
+            ("split", "new", "--seed", "5", *COMPOSITION[2:]),
+            "--seed before composition: options stand after it",
+        ),
         (("split", "show", "interpolation/arm3"), "no split of this name; did you mean"),
         (("split", "show", "x.yaml"), "x.yaml: no such file"),
     ],

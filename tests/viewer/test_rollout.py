@@ -15,7 +15,7 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
 from morphgen.rl import runs
-from morphgen.rl.play import make_env, play, read_controller
+from morphgen.rl.play import make_env_and_controller, play, read_controller
 from morphgen.rl.training import train
 from morphgen.viewer.address import Address
 from morphgen.viewer.app import start_address
@@ -61,7 +61,7 @@ def episode(files, cache):
 @pytest.mark.slow
 def test_episode_equals_that_of_morphgen_play(episode):
     spec = read_controller("ik", "reach")
-    env, controller = make_env(spec, "planar-cube", 3, sim="mujoco")
+    env, controller = make_env_and_controller(spec, "planar-cube", 3, sim="mujoco")
     results = []
     list(play(env, controller, 1, 3, results.append))
     env.close()
