@@ -164,17 +164,17 @@ def test_repeated_robots_of_a_grammar_are_not_drawn():
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):
-    workshop = holdout_search.ComposeDraft.__call__
+    compose = holdout_search.ComposeDraft.__call__
 
     def with_equal_hashes(self, draft):
-        robot = workshop(self, draft)
+        robot = compose(self, draft)
         return replace(robot, hash="0" * 32) if "cube" in robot.name else robot
 
     monkeypatch.setattr(holdout_search.ComposeDraft, "__call__", with_equal_hashes)
     with pytest.raises(BenchmarkError) as caught:
         made(["arm=lwr"], 9, patterns=("arm={arm3,arm5,arm_ed,lwr} ee={cube,plane,stick}",))
     assert (
-        "--train 9: only 7 different robots without arm=lwr exist (2 rejected: 2 with the bo"
+        "--train 9: only 7 different robots without arm=lwr exist (2 rejected: 2 with the sa"
         in (str(caught.value))
     )
 
