@@ -1,4 +1,4 @@
-"""What the parts of the agent ``me-graph`` are worth: each is left out in turn.
+"""Measure the scores of the agent ``me-graph`` without each of its parts.
 
     python benchmarks/graph_ablation.py interpolation/arm3/reach --seeds 0..1 --steps 7e5
         --sim mujoco --envs 160 --out ablation
@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import runpy
 import sys
+from dataclasses import replace
 
-from morphgen.rl.agents import AGENTS, Agent
+from morphgen.rl.agents import AGENTS, ME_GRAPH, Agent
 
 WITHOUT_TREE, BLIND_CRITIC = "graph-without-tree", "graph-blind-critic"
 AGENT_LABELS = (
@@ -32,7 +33,7 @@ AGENT_LABELS = (
 
 def variant(name: str, module: str) -> Agent:
     """Return an agent with the networks of a module and all else as ``me-graph`` has it."""
-    return Agent(name, f"graph_variants.{module}", preset="fast", any_size=True, channels=("tree",))
+    return replace(ME_GRAPH, name=name, module=f"graph_variants.{module}")
 
 
 if __name__ == "__main__":

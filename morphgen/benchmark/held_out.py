@@ -1,6 +1,7 @@
-"""What a split holds out: parts, manufacturers, ranges of parameters, and combinations of them.
+"""Rules that say which robots a split keeps for its test side.
 
-A rule is written as on the command line: ``arm=kinova*`` holds out parts, ``manufacturer=Kinova``
+A rule holds out parts, a manufacturer, a range of a parameter, or a combination. It is written as
+on the command line: ``arm=kinova*`` holds out parts, ``manufacturer=Kinova``
 the parts of a manufacturer, ``arm3.length=0.3..0.4`` a range of a parameter, and
 ``arm=ur5+ee=plane`` a combination. A robot is held out if one rule holds for it.
 """

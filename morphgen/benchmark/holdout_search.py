@@ -47,7 +47,7 @@ class HoldoutSearch:
 
     request: SplitRequest
     maker: DraftMaker
-    workshop: ComposeDraft
+    compose: ComposeDraft
     pool: dict[int, Draft]
     robots: dict[int, Candidate] = field(default_factory=dict)
     """Composed robots by their number in the pool."""
@@ -84,7 +84,7 @@ class HoldoutSearch:
             progress(num_known + done)
 
         drafts = [self.pool[number] for number in unknown]
-        results = parallel_map(self.workshop, drafts, jobs, report)
+        results = parallel_map(self.compose, drafts, jobs, report)
         for number, result in zip(unknown, results, strict=True):
             if isinstance(result, _Unfit):
                 self.rejected[number] = result.reason

@@ -14,7 +14,6 @@ from morphgen.fitting.replace_collision import with_fits, with_primitives
 from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.formats.fits import read_stored_fits, shapes_to_fit
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,6 @@ def fit_robot(
     *,
     visual: bool = False,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> FittedRobot:
     """Fit primitives to a robot's links, and replace its collision shapes by them.
 
@@ -58,7 +56,6 @@ def fit_robot(
         folders: Folders of parts, for their stored fits.
         visual: Whether to replace the visual shapes, too.
         jobs: Number of processes; the result does not depend on it.
-        progress: Receives the number of links that are fitted, and of all.
 
     Raises:
         FitError: If no link has a shape.
@@ -66,7 +63,7 @@ def fit_robot(
         MorphgenError: If a process died.
     """
     require_shapes(robot, robot.name)
-    report = fit_links(robot, options, jobs=jobs, progress=progress)
+    report = fit_links(robot, options, jobs=jobs)
     return FittedRobot(robot, apply_fit(robot, report, folders, visual=visual), report)
 
 
