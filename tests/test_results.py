@@ -5,6 +5,7 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -48,3 +49,11 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
     assert means
     for agent, numbers in means.items():
         assert any(numbers <= {cell.split(" ")[0] for cell in line} for line in DOCS), agent
+
+
+def test_the_docs_have_the_table_of_the_number_of_robots():
+    command = [sys.executable, "benchmarks/robot_curve.py", "--report"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    rows = [re.split(r"\s*\|\s*", line) for line in printed.splitlines()[2:]]
+    assert len(rows) == 5
+    assert all(row in DOCS for row in rows)
