@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from typing import Literal
 
 from morphgen.benchmark.robot_hash import digest, robot_hash
@@ -77,6 +78,9 @@ class Split:
     """Source of the split, such as a table of a paper."""
     statistics: Mapping[str, object] = field(default_factory=dict)
     """Statistics of the robots, for readers; nothing depends on them."""
+    version: str = field(default_factory=lambda: version("morphgen"), compare=False)
+    """Version of morphgen that made the split, which its files and runs keep; ``morphgen`` in
+    files."""
 
     @property
     def max_links(self) -> int:
@@ -99,7 +103,8 @@ class Split:
 
     def as_dict(self) -> dict[str, object]:
         """Return the split under the keys of the file, for JSON."""
-        data = {"made" if key == "provenance" else key: value for key, value in vars(self).items()}
+        names = {"provenance": "made", "version": "morphgen"}
+        data = {names.get(key, key): value for key, value in vars(self).items()}
         return data | {side: [member.as_dict() for member in self.side(side)] for side in SIDES}
 
 

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, cast
@@ -61,8 +60,6 @@ class SplitFile:
 
     path: Path
     split: Split
-    version: str
-    """Version of morphgen that wrote the file."""
     id: str
     """Id of the split when it was written."""
     id_line: int
@@ -130,9 +127,10 @@ class _Reader:
             self._reasons(fields.get("accepted")),
             self._text(fields["reference"], "reference") if "reference" in fields else "",
             self._free(fields.get("statistics"), "statistics"),
+            names["morphgen"],
         )
         line = fields["id"].start_mark.line + 1
-        return SplitFile(self._path, split, names["morphgen"], names["id"], line)
+        return SplitFile(self._path, split, names["id"], line)
 
     def _fail(self, node: Node, what: str) -> BenchmarkError:
         return BenchmarkError(f"{self._path}:{node.start_mark.line + 1}: {what}")
@@ -327,7 +325,7 @@ def split_text(split: Split) -> str:
     require_split_name(split.name)
     head: dict[str, object] = {
         "format": FORMAT,
-        "morphgen": version("morphgen"),
+        "morphgen": split.version,
         "name": split.name,
         "id": split_id(split),
         "regime": split.regime,

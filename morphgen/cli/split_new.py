@@ -92,16 +92,33 @@ def _paths(out: Path, splits: Sequence[Split]) -> list[Path]:
 
 
 def _write(splits: Sequence[Split], paths: Sequence[Path]) -> None:
-    """Write all files, or none if one of them exists with another content."""
-    from morphgen.benchmark.split_file import split_text, write_split
+    """Write all files, or none if one of them exists with another content.
 
+    A file with the same content that another version of morphgen made is kept.
+    """
+    from morphgen.benchmark.split_file import write_split
+
+    missing = []
     for split, path in zip(splits, paths, strict=True):
-        if path.is_file() and path.read_bytes() != split_text(split).encode():
+        if not path.is_file():
+            missing.append((split, path))
+        elif not _holds(path, split):
             raise BenchmarkError(
                 f"{path} exists with another content; choose another --name or --out"
             )
-    for split, path in zip(splits, paths, strict=True):
+    for split, path in missing:
         write_split(split, path)
+
+
+def _holds(path: Path, split: Split) -> bool:
+    """Test if a file is a split's, apart from the version of morphgen that made it."""
+    from morphgen.benchmark.split_file import read_split_file, split_text
+
+    try:
+        version = read_split_file(path).split.version
+    except BenchmarkError:
+        return False
+    return path.read_bytes() == split_text(replace(split, version=version)).encode()
 
 
 def _summary(split: Split, path: Path) -> list[str]:

@@ -3,6 +3,7 @@
 import string
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -59,7 +60,16 @@ def test_split_files_round_trip(written):
     assert read_split(str(written)) == SPLIT
     read = read_split_file(written)
     assert (read.id, read.is_whole, read.path) == (split_id(SPLIT), True, written)
-    assert read.version == "0.1.0"
+    assert read.split.version == version("morphgen")
+
+
+def test_a_split_keeps_the_version_that_made_it(written):
+    """Runs and built splits contain this text, and compare it, also after an update of morphgen."""
+    text = written.read_text().replace(f'morphgen: "{version("morphgen")}"', 'morphgen: "0.0.1"')
+    written.write_text(text)
+    assert split_text(read_split(written)) == text
+    assert read_split(written).as_dict()["morphgen"] == "0.0.1"
+    assert (read_split(written), split_id(read_split(written))) == (SPLIT, split_id(SPLIT))
 
 
 def test_the_same_split_gives_the_same_bytes(written):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -216,7 +217,7 @@ def test_without_a_command_usage_is_printed_and_exit_code_is_2(run):
 
 
 def test_version(run):
-    assert run("--version") == (0, "morphgen 0.1.0\n", "")
+    assert run("--version") == (0, f"morphgen {version('morphgen')}\n", "")
 
 
 def test_user_library_is_used(run, tmp_path, monkeypatch):

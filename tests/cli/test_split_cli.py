@@ -1,6 +1,7 @@
 """``morphgen split list``, ``show`` and ``new``: output, written files and rejected input."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -213,6 +214,15 @@ def test_existing_split_file_is_never_replaced(run, refused):
     assert "a.yaml exists with another content; choose another --name or --out" in message
     Path("b-train2.yaml").write_text("thesis")
     assert "b-train2.yaml exists" in refused(*INTERPOLATION[:-1], "1,2", "--out", "b.yaml")
+
+
+def test_split_file_of_another_version_is_kept(run):
+    assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
+    path = Path("a.yaml")
+    text = re.sub(r"(?m)^morphgen: .*$", 'morphgen: "0.0.1"', path.read_text())
+    path.write_text(text)
+    assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
+    assert path.read_text() == text
 
 
 def test_interrupted_run_leaves_no_files(run, tmp_path, monkeypatch):
