@@ -9,10 +9,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
 .PHONY: demo test test-all check docs view format clean
 
 demo: $(STAMP)
-	$(BIN)/morphgen compose arm=ur5 ee=plane --out robots
-	$(BIN)/morphgen check robots/ur5-plane --strict
-	$(BIN)/morphgen conform robots/ur5-plane
-	@echo "The robot is in robots/ur5-plane; its picture is robots/ur5-plane/preview.png"
+	$(BIN)/morphgen demo
 
 test: $(STAMP)
 	$(PYTEST) -m "not slow"

@@ -207,7 +207,7 @@ CORE_COMMANDS = (
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(("compose", "ur5-plane"), id="compose"),
+        pytest.param(("demo",), id="demo"),
         *(
             pytest.param(words, id=" ".join(words), marks=pytest.mark.slow)
             for words in CORE_COMMANDS

@@ -2,6 +2,7 @@
 
 from morphgen.cli import (
     check,
+    demo,
     evaluate,
     finetune,
     fit,
@@ -21,6 +22,7 @@ from morphgen.cli import (
 from morphgen.cli.command import Command
 
 COMMANDS: tuple[Command, ...] = (
+    demo.demo,
     robots.compose,
     sample.sample,
     robots.list_parts,
