@@ -142,8 +142,9 @@ def test_pages_work_from_top_to_bottom(name, tmp_path, monkeypatch):
             assert main([*words, *short]) == 0, words
 
 
-def test_part_manifest_page_is_current():
-    script = runpy.run_path(str(ROOT / "docs" / "part_manifest.py"))
+@pytest.mark.parametrize("name", ["part_manifest", "parts"])
+def test_generated_page_is_current(name):
+    script = runpy.run_path(str(ROOT / "docs" / f"{name}.py"))
     assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
 
 
