@@ -12,7 +12,13 @@ import pytest
 import morphgen
 from morphgen.extras import EXTRAS
 
+ROOT = Path(__file__).parent.parent
 PACKAGE = Path(morphgen.__file__).parent
+FOLDERS = [
+    *(PACKAGE / name for name in ("", "viewer", "tasks", "rl")),
+    *(ROOT / name for name in ("benchmarks", "docs")),
+]
+"""Folders of modules; a source distribution has ``tasks`` only as ``morphgen/tasks``."""
 PACKAGES = (
     "errors",
     "extras",
@@ -39,7 +45,7 @@ MODULES = sorted(
 )
 COMMAND_LINE_USERS = (
     PACKAGE / "__main__.py",
-    PACKAGE.parent / "docs" / "site" / "hooks.py",  # writes the reference of the commands
+    ROOT / "docs" / "site" / "hooks.py",  # writes the reference of the commands
 )
 SIMULATORS_AND_MESHES = (
     "coacd",
@@ -101,9 +107,9 @@ def test_imports_have_no_cycles():
         pytest.fail(" -> ".join(error.args[1]))
 
 
-@pytest.mark.parametrize("folder", ["morphgen", "viewer", "tasks", "rl", "benchmarks", "docs"])
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_no_module_imports_the_top_level_package(folder):
-    modules = (PACKAGE.parent / folder).rglob("*.py")
+    modules = folder.rglob("*.py")
     outside = [
         path
         for path in modules
@@ -118,9 +124,9 @@ def test_every_package_has_a_layer():
     assert {package_of(name) for name in NAMES} - {""} == set(PACKAGES) | others
 
 
-@pytest.mark.parametrize("folder", ["morphgen", "viewer", "tasks", "rl", "benchmarks", "docs"])
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_modules_are_short(folder):
-    modules = (PACKAGE.parent / folder).rglob("*.py")
+    modules = folder.rglob("*.py")
     lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in modules}
     assert lengths
     assert {str(path): n for path, n in lengths.items() if n > 400} == {}

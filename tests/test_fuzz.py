@@ -13,7 +13,7 @@ import morphgen
 from helpers.fuzzing import MEMORY_MIB, Runner
 from morphgen.grammar.grammar_file import grammar_names
 
-TEMPLATES = Path(morphgen.__file__).parents[1] / "templates"
+TEMPLATES = Path(morphgen.__file__).parent / "templates"
 
 ROBOT = """<?xml version="1.0"?>
 <robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">
