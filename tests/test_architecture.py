@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import morphgen
+from helpers.simulators import needs_pybullet
 from morphgen.extras import EXTRAS
 
 ROOT = Path(__file__).parent.parent
@@ -155,6 +156,7 @@ def test_importing_the_checks_loads_no_simulator():
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "fcl", "igl", "lxml", "scipy"})
 
 
+@needs_pybullet
 def test_pybullet_processes_load_few_packages():
     loaded = modules_after("import morphgen.tasks.sim.bullet_workers")
     assert "pybullet" in loaded

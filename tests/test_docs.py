@@ -82,7 +82,10 @@ def commands(block):
 def test_links_between_pages_are_valid(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         if not target.startswith("https://"):
-            assert (page.parent / target).exists(), target
+            path = (page.parent / target).resolve()
+            # A source distribution has tasks, rl and viewer only inside of morphgen.
+            packaged = ROOT / "morphgen" / path.relative_to(ROOT)
+            assert path.exists() or packaged.exists(), target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

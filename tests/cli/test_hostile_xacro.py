@@ -7,6 +7,7 @@ import sys
 from xml.sax.saxutils import quoteattr
 
 import pytest
+import yaml
 
 from morphgen.formats import xacro_process
 
@@ -198,6 +199,9 @@ def test_device_files_and_pipes_are_not_read(refused_at, hostile):
         assert "the folder of the description" in refused_at(f'<xacro:include filename="{name}"/>')
 
 
+MERGES_ONCE = tuple(map(int, yaml.__version__.split(".")[:3])) >= (6, 0, 4)
+
+
 def aliases(depth):
     lines = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, depth)]
     return "\n".join(["a0: &a0 [x]", *lines])
@@ -208,12 +212,15 @@ def aliases(depth):
     [
         (aliases(12), "a value has more than 200000 characters and entries"),
         ("a: &a [*a]", "a value has more than 200000 characters and entries"),
-        (
+        pytest.param(
             "a0: &a0 {k: 1}\n"
             + "".join(
                 f"a{i}: &a{i} {{<<: [{','.join([f'*a{i - 1}'] * 9)}]}}\n" for i in range(1, 9)
             ),
             "a mapping has more than 200000 entries",
+            marks=pytest.mark.skipif(
+                MERGES_ONCE, reason="this PyYAML merges a repeated mapping only once"
+            ),
         ),
         ("[" * 1500, "invalid YAML"),
         ("a: !!set {b, c}", "invalid YAML"),

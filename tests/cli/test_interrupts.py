@@ -11,6 +11,7 @@ import pytest
 
 from helpers.commands import heed_ctrl_c
 from helpers.runs import small_split
+from helpers.simulators import needs_pybullet
 from morphgen.benchmark.split_file import split_text
 
 COMMANDS = {
@@ -32,7 +33,10 @@ PATIENCE = 120.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize("later", [0.0, 0.3])
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=needs_pybullet if n == "eval" else []) for n in COMMANDS],
+)
 def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
     check(tmp_path, name, later)
 

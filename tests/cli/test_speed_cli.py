@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from helpers.simulators import PYBULLET
 from morphgen.cli import main
 
 
@@ -13,7 +14,7 @@ def own_cache(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco", "kinematic"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco", "kinematic"])
 def test_speed_prints_rates_and_shares(sim, capsys):
     words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
     assert main([*words, "--json"]) == 0

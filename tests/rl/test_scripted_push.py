@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from helpers.scenes import robot
+from helpers.simulators import PYBULLET
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines.push_planner import PushPlanner
 from morphgen.rl.baselines.scripted_push import MAX_PLANS, RISE, ScriptedPush
@@ -37,7 +38,7 @@ def successes(task, controller, steps=PUSH.max_episode_steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 def test_the_block_crosses_the_line(sim, tmp_path):
     across = successes(batch([PLANE, UR5], 6, tmp_path, sim=sim), ScriptedPush(0))
     assert across[::2].sum() >= 2
@@ -45,7 +46,7 @@ def test_the_block_crosses_the_line(sim, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
 def test_four_of_five_blocks_cross_the_line(words, sim, tmp_path):
     across = successes(batch([words], 20, tmp_path, sim=sim), ScriptedPush(0))

@@ -13,6 +13,7 @@ from gymnasium.wrappers import FlattenObservation
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 import morphgen
+from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
@@ -67,7 +68,7 @@ def run(env, steps):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("morphgen/Reach-v0", {"sim": "pybullet"}),
+        pytest.param("morphgen/Reach-v0", {"sim": "pybullet"}, marks=needs_pybullet),
         ("morphgen/Reach-v0", {"kind": "discrete", "obstacles": True}),
         ("morphgen/Push-v0", {"robot": "prims"}),
         (
@@ -168,7 +169,7 @@ def test_action_moves_its_own_joint(make):
         assert seen["previous_action"].tolist() == action.tolist()
 
 
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 def test_seed_determines_the_episodes(make, sim):
     env, other = make("morphgen/Reach-v0", sim=sim), make("morphgen/Reach-v0", sim=sim)
     env.reset(seed=5)
@@ -344,6 +345,6 @@ def test_mujoco_is_the_default_where_pybullet_is_missing(cache):
     assert [line for line in done.stderr.splitlines() if "PyBullet" in line] == [warning]
 
 
+@needs_pybullet
 def test_pybullet_is_the_default_where_it_is_installed():
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
     assert default_simulator() == "pybullet"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym_env import TaskEnv
@@ -121,16 +122,14 @@ def run_both(env, batch, episodes, seed=3):
 @pytest.mark.parametrize(
     ("sim", "obstacles"),
     [
-        ("pybullet", False),
-        ("pybullet", True),
+        pytest.param("pybullet", False, marks=needs_pybullet),
+        pytest.param("pybullet", True, marks=needs_pybullet),
         ("mujoco", False),
         ("mujoco", True),
         ("kinematic", False),
     ],
 )
 def test_reach_equals_the_batch(make, sim, kind, obstacles):
-    if sim == "pybullet":
-        pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
     env, batch = make("reach", sim=sim, kind=kind, obstacles=obstacles)
     assert env._stepper is not None
     ends, successes = run_both(env, batch, 4)
@@ -138,12 +137,10 @@ def test_reach_equals_the_batch(make, sim, kind, obstacles):
     assert 0 < successes < 4 * STEPS
 
 
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 @pytest.mark.parametrize("obstacles", [False, True])
 def test_push_equals_the_batch(make, sim, kind, obstacles):
-    if sim == "pybullet":
-        pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
     env, batch = make("push", sim=sim, kind=kind, obstacles=obstacles)
     assert env._stepper is not None
     run_both(env, batch, 4)

@@ -12,6 +12,7 @@ import torch
 
 import morphgen
 from helpers.goal_sets import draw_spec
+from helpers.simulators import PYBULLET
 from morphgen.model.dynamics import actuation
 from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.free_space import FreeSpace
@@ -20,7 +21,7 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Contacts
 
-SIMS = ("pybullet", "mujoco")
+SIMS = (PYBULLET, "mujoco")
 FEW = replace(ReachConfig(), num_goals=12, max_episode_steps=40)
 
 

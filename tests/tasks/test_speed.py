@@ -8,6 +8,7 @@ from itertools import count
 import pytest
 
 import morphgen
+from helpers.simulators import PYBULLET
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
@@ -21,7 +22,7 @@ def robot():
     return morphgen.compose("arm=arm3 ee=claw")
 
 
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 def test_shares_sum_to_one_and_separate_the_native_step(robot, sim, tmp_path):
     ticks, (module, step) = count(), SIMULATORS[sim].native_step
     with closing(
