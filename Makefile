@@ -1,4 +1,4 @@
-# make demo | test | test-all | check | docs | view
+# make demo | test | test-all | check | docs | dist | view
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A process a core, and in each one thread: torch's own would only get in each other's way.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
 
-.PHONY: demo test test-all check docs view format clean
+.PHONY: demo test test-all check docs dist view format clean
 
 demo: $(STAMP)
 	$(BIN)/morphgen demo
@@ -26,6 +26,13 @@ check: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+# The wheel and the source distribution, in dist/.
+dist: $(BIN)/twine
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+
 view: demo
 	$(BIN)/morphgen view robots/ur5-plane
 
@@ -38,5 +45,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,dev]"
 	@touch $@
 
+# Three tools are enough for `make dist`; the packages of the other targets take gigabytes.
+$(BIN)/twine:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt build check-wheel-contents twine
+
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build dist *.egg-info
