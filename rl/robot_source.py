@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, Side, Split, compose_member
+from morphgen.benchmark.split import Member, Side, Split, compose_member, split_id
 from morphgen.benchmark.split_file import parse_split, read_split, split_text
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
@@ -116,6 +117,18 @@ def members(source: RobotSource) -> tuple[Member, ...]:
             f"{nearest(source.member, names)}"
         )
     return tuple(member for member in side if member.name == source.member)
+
+
+def identity(source: RobotSource) -> dict[str, Any]:
+    """Return the entries of a source that results depend on: of a split its id, not its text.
+
+    The text also has the version of morphgen that wrote it.
+
+    Raises:
+        BenchmarkError: If the text of the split is malformed.
+    """
+    text = source.split and split_id(parse_split(source.split, Path(source.name)).split)
+    return asdict(source) | {"split": text}
 
 
 def tasks_of(source: RobotSource) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from morphgen.rl.aliases import current_learner, current_run
 from morphgen.rl.checkpoint_content import require_learner
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
-from morphgen.rl.robot_source import RobotSource, most_obstacles, tasks_of
+from morphgen.rl.robot_source import RobotSource, identity, most_obstacles, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig, observation_config
@@ -293,7 +293,7 @@ def require_same_run(folder: Path, config: RunConfig) -> None:
 def _flat(config: RunConfig) -> dict[str, Any]:
     """Return the entries of a config by dotted name; a run may continue on another GPU."""
     flat: dict[str, Any] = {}
-    for name, value in config.as_data().items():
+    for name, value in (config.as_data() | {"source": identity(config.source)}).items():
         nested = value if isinstance(value, dict) else {"": value}
         flat.update({f"{name}.{key}".rstrip("."): entry for key, entry in nested.items()})
     return flat | {"device": config.device.partition(":")[0]}

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from morphgen.rl.evaluation import (
     no_progress,
 )
 from morphgen.rl.inference import MODES, Mode
-from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
+from morphgen.rl.robot_source import RobotSource, identity, members, other_side, tasks_of
 from morphgen.rl.runs import RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
 from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
@@ -134,10 +135,10 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
             for mode, records in data["scores"].items()
         }
         source = RobotSource(**renamed("source", data["source"]))
-        stored = _plain([_with_defaults(data["eval"]), asdict(source)])
+        stored = _plain([_with_defaults(data["eval"]), identity(source)])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, TaskError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    expected = _plain([cell.eval_config.as_data(), asdict(cell.source)])
+    expected = _plain([cell.eval_config.as_data(), identity(cell.source)])
     for what, theirs, ours in zip(("evaluation", "set of robots"), stored, expected, strict=True):
         if theirs != ours:
             raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
@@ -202,6 +203,7 @@ def do_cell(
             mode: _policy_scores(cell, cell.config, eval_config, mode, progress) for mode in MODES
         }
     data = {
+        "morphgen": version("morphgen"),
         "eval": cell.eval_config.as_data(),
         "source": asdict(cell.source),
         "scores": {mode: scores_to_json(records) for mode, records in scores.items()},

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 import threading
 from dataclasses import replace
@@ -12,6 +13,7 @@ import pytest
 from filelock import FileLock
 from PIL import Image
 
+import morphgen
 from helpers.commands import tree
 from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.errors import TaskError
@@ -154,6 +156,14 @@ def test_scores_of_another_evaluation_are_rejected(whole):
     for cell in (whole[0], whole[-1]):
         with pytest.raises(TaskError, match="of another set of robots"):
             read_scores(replace(cell, source=replace(cell.source, goal_seed=1)))
+
+
+def test_scores_of_another_version_of_morphgen_are_read(whole):
+    cell = whole[0]
+    assert json.loads((cell.folder / SCORES).read_text())["morphgen"] == morphgen.__version__
+    newer = re.sub("(?m)^morphgen: .*$", 'morphgen: "0.2.99"', cell.source.split)
+    assert newer != cell.source.split
+    assert read_scores(replace(cell, source=replace(cell.source, split=newer))) is not None
 
 
 def test_scores_of_another_run_are_rejected_without_its_checkpoint(whole, tmp_path):
