@@ -35,6 +35,7 @@ PACKAGES = (
     "tasks",
     "rl",
     "viewer",
+    "doctor",
     "cli",
 )
 """Packages and modules of morphgen, the lowest first; each may import itself and those below."""
@@ -208,6 +209,7 @@ CORE_COMMANDS = (
     ("tokens", "ur5-plane"),
     ("similarity", "prims", "stick"),
     ("conform", "prims"),
+    ("doctor",),
     ("split", "show", "interpolation/panda/reach"),
 )
 

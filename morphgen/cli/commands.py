@@ -3,6 +3,7 @@
 from morphgen.cli import (
     check,
     demo,
+    doctor,
     evaluate,
     finetune,
     fit,
@@ -46,4 +47,5 @@ COMMANDS: tuple[Command, ...] = (
     play.play,
     play.speed,
     view.view,
+    doctor.doctor,
 )

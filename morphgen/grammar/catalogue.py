@@ -34,7 +34,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
         Rows with name, kind, dof, reach (from the mount to the farthest port or tool, the largest
         over all configurations) [m], mass [kg], source, licence, manufacturer and summary.
     """
-    stored: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
+    stored = stored_facts()
     rows: list[dict[str, object]] = []
     for manifest in library.manifests(cast(PartKind, kind)):
         facts = stored.get(manifest.name, {})
@@ -53,6 +53,12 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
             }
         )
     return rows
+
+
+def stored_facts() -> dict[str, dict[str, Any]]:
+    """Return the stored facts by part, with the digest of the files that they are of."""
+    facts: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
+    return facts
 
 
 def compute_facts(manifest: Manifest) -> dict[str, Any]:

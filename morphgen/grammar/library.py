@@ -80,8 +80,12 @@ def default_library(extra: Iterable[Path] = ()) -> Library:
     """
     entries = os.environ.get(LIBRARY_VARIABLE, "").split(os.pathsep)
     users = (path.absolute() for path in (*(Path(entry) for entry in entries if entry), *extra))
-    shipped = (Path(str(files(f"morphgen.{name}"))) for name in ("templates", "robots_real"))
-    return Library(dict.fromkeys((*shipped, *users)))
+    return Library(dict.fromkeys((*shipped_folders(), *users)))
+
+
+def shipped_folders() -> tuple[Path, ...]:
+    """Return the folders of the parts that come with morphgen."""
+    return tuple(Path(str(files(f"morphgen.{name}"))) for name in ("templates", "robots_real"))
 
 
 def _manifest(path: Path) -> Manifest:

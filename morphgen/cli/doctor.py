@@ -1,0 +1,52 @@
+"""``morphgen doctor``: diagnosis of the installation."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command
+
+if TYPE_CHECKING:
+    from morphgen.doctor.entry import Entry
+
+STATUS_WIDTH = 8
+"""Width of the first column [characters]."""
+
+
+@command(
+    "doctor",
+    "print versions, simulators, GPU and caches, and test the installation",
+    opt.JSON,
+    details="A line per result: ok, absent (an optional package), warning, or error. The self-test "
+    "composes, checks, loads, steps and draws a robot, and compares its hash, its files and a "
+    "score with recorded ones. The exit code is 1 if there is an error.",
+    examples=("doctor", "doctor --json"),
+)
+def doctor(args: argparse.Namespace) -> int:
+    """Print the results as they become known; return 1 if there is an error."""
+    from morphgen.doctor.diagnosis import diagnose
+
+    start, last = time.monotonic(), ""
+    results: list[tuple[str, Entry]] = []
+    for section, entry in diagnose():
+        results.append((section, entry))
+        if not args.json:
+            if section != last:
+                print(section)
+            print(f"  {entry.status:<{STATUS_WIDTH}}{entry.name}: {entry.text}", flush=True)
+        last = section
+    counts = Counter(entry.status for _, entry in results)
+    passed = not counts["error"]
+    seconds = time.monotonic() - start
+    if args.json:
+        data = [{"section": section, **entry.as_dict()} for section, entry in results]
+        print(json.dumps({"passed": passed, "seconds": round(seconds, 1), "results": data}))
+    else:
+        listed = ", ".join(f"{n} {status}" for status, n in counts.items())
+        print(f"{'sound' if passed else 'NOT SOUND'}: {listed}, in {seconds:.1f} s")
+    return int(not passed)

@@ -1,0 +1,56 @@
+"""Results of a diagnosis, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from morphgen.errors import MissingDependencyError, MorphgenError, one_line
+from morphgen.extras import missing_extra
+
+Status = Literal["ok", "absent", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One result."""
+
+    name: str
+    """Name of what was examined, such as ``simulator mujoco``."""
+    status: Status
+    """``absent`` for an optional package, ``error`` if morphgen does not work as documented."""
+    text: str
+    """Result, and what to do about it if it is not ``ok``; one line."""
+    data: Mapping[str, object] = field(default_factory=dict)
+    """Values of the text, for programs."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as JSON values."""
+        return asdict(self)
+
+
+def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
+    """Return the result of a function; if it raises, the result says why.
+
+    A broken package may raise anything, and every reason is of interest here.
+    """
+    try:
+        return examine()
+    except Exception as error:
+        return failure(name, error)
+
+
+def failure(name: str, error: Exception) -> Entry:
+    """Return the result of an examination that raised an error."""
+    text = missing_extra(error)
+    if text is not None:
+        return Entry(name, "absent", text)
+    if isinstance(error, ModuleNotFoundError):
+        text = f"the package {error.name} is not installed; install morphgen again"
+    elif isinstance(error, MorphgenError):
+        text = str(error)
+    else:
+        text = f"{type(error).__name__}: {error}"
+    status: Status = "absent" if isinstance(error, MissingDependencyError) else "error"
+    return Entry(name, status, one_line(text))

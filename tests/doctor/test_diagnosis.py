@@ -1,0 +1,245 @@
+"""The diagnosis of sound and of broken installations."""
+
+import importlib.metadata
+import json
+import os
+import shutil
+import sys
+from types import SimpleNamespace
+
+import pytest
+from packaging.requirements import Requirement
+
+from morphgen.cli import main
+from morphgen.doctor import diagnosis, files, packages, reference, self_test, system
+from morphgen.doctor.diagnosis import SECTIONS, diagnose
+from morphgen.doctor.entry import Entry, attempt
+from morphgen.errors import MissingDependencyError, PartError
+from morphgen.grammar import catalogue
+from morphgen.grammar.library import LIBRARY_VARIABLE, default_library
+from morphgen.tasks import packaged_sets
+from morphgen.tasks.registry import SIMULATORS
+
+
+def by_name(entries):
+    return {entry.name: entry for entry in entries}
+
+
+def only(entries, monkeypatch):
+    """Make a section with these results the whole diagnosis."""
+    module = SimpleNamespace(entries=entries)
+    monkeypatch.setitem(sys.modules, "section_of_a_test", module)
+    monkeypatch.setattr(diagnosis, "SECTIONS", {"part": "section_of_a_test"})
+
+
+def broken():
+    raise OSError("libGL.so.1: cannot open shared object file")
+
+
+@pytest.fixture
+def ur5_plane():
+    return reference.reference_robot(default_library())
+
+
+def test_this_installation_is_sound(capsys):
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if not line.startswith(" ")][:-1] == list(SECTIONS)
+    names = {line.split(": ")[0].split(maxsplit=1)[1] for line in lines if line.startswith(" ")}
+    assert {f"simulator {name}" for name in SIMULATORS} < names
+    assert {"core", "extra fit", "cache", "gpu", "loader pinocchio", "score", "film"} < names
+    assert lines[-1].startswith("sound: ")
+
+
+def test_json_has_every_result(monkeypatch, capsys):
+    only(lambda: iter([Entry("a", "ok", "b", {"c": 1}), Entry("d", "error", "e")]), monkeypatch)
+    assert main(["doctor", "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    assert data["passed"] is False
+    assert [each["status"] for each in data["results"]] == ["ok", "error"]
+    assert data["results"][0] == {
+        "section": "part", "name": "a", "status": "ok", "text": "b", "data": {"c": 1}
+    }  # fmt: skip
+
+
+def test_an_error_makes_the_exit_code_1(monkeypatch, capsys):
+    only(lambda: iter([Entry("a", "warning", "b"), Entry("c", "absent", "d")]), monkeypatch)
+    assert main(["doctor"]) == 0
+    only(lambda: iter([Entry("a", "error", "b")]), monkeypatch)
+    assert main(["doctor"]) == 1
+    assert capsys.readouterr().out.splitlines()[-1].startswith("NOT SOUND: 1 error, in ")
+
+
+def test_a_section_that_cannot_be_imported_is_an_error(monkeypatch):
+    monkeypatch.setattr(diagnosis, "SECTIONS", {"a": "no_such_module", "b": SECTIONS["packages"]})
+    (section, entry), *others = diagnose()
+    assert (section, entry.status) == ("a", "error")
+    assert entry.text == "the package no_such_module is not installed; install morphgen again"
+    assert others
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (ModuleNotFoundError(name="torch"), "absent", "pip install 'morphgen[rl]'"),
+        (MissingDependencyError("no PyBullet"), "absent", "no PyBullet"),
+        (ModuleNotFoundError(name="lxml"), "error", "lxml is not installed; install morphgen"),
+        (PartError("unknown part"), "error", "unknown part"),
+        (ValueError("two\nlines"), "error", "ValueError: two lines"),
+    ],
+)
+def test_what_a_broken_package_raises_is_a_result(error, status, text):
+    def examine():
+        raise error
+
+    entry = attempt("it", examine)
+    assert (entry.name, entry.status) == ("it", status)
+    assert text in entry.text
+    assert "\n" not in entry.text
+
+
+def declared(*lines):
+    return [Requirement(line) for line in lines]
+
+
+DECLARED = declared(
+    "numpy>=1.26",
+    'torch>=2.4; extra == "fit"',
+    'gymnasium>=1.4; extra == "rl"',
+    'morphgen[fit]; extra == "rl"',
+    'pybullet; python_version < "3" and extra == "pybullet"',
+)
+
+
+def test_an_extra_has_the_packages_of_the_extras_that_it_includes():
+    names = {
+        extra: [each.name for each in packages.requirements_of(extra, DECLARED)]
+        for extra in ("", "fit", "rl", "pybullet")
+    }
+    assert names == {"": ["numpy"], "fit": ["torch"], "rl": ["gymnasium", "torch"], "pybullet": []}
+
+
+def test_packages_outside_their_ranges_and_missing_ones_are_named():
+    missing = "no-such-distribution"
+    old, absent = packages.group_entries("extra rl", declared("pytest<1", missing))
+    assert (old.name, old.status) == ("package pytest", "warning")
+    assert "is outside of the range <1" in old.text
+    assert (absent.status, absent.data[missing]) == ("absent", None)
+    assert absent.text == f"not installed: {missing}; pip install 'morphgen[rl]'"
+    (core,) = packages.group_entries("core", declared(missing))
+    assert (core.status, core.text) == (
+        "error",
+        f"not installed: {missing}; install morphgen again",
+    )
+    (other,) = packages.group_entries("extra pybullet", ())
+    assert (other.status, other.text) == ("absent", "not available for this version of Python")
+
+
+def test_every_extra_for_users_is_listed():
+    extras = set(importlib.metadata.distribution("morphgen").metadata.get_all("Provides-Extra"))
+    names = by_name(packages.entries())
+    assert {f"extra {each}" for each in extras - packages.NOT_FOR_USERS} == names.keys() - {"core"}
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
+    (tmp_path / "goals-5").mkdir()
+    (tmp_path / "goals-5" / "a.npz").write_bytes(bytes(250_000))
+    monkeypatch.setattr(system, "user_cache_path", lambda _: tmp_path)
+    cache = by_name(system.entries())["cache"]
+    assert (cache.status, cache.data["bytes"]) == ("ok", {"goals-5": 250_000})
+    assert cache.text == f"{tmp_path}: goals-5 0.2 MB; delete it to clear it"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    cache = by_name(system.entries())["cache"]
+    assert (cache.status, "cannot be written" in cache.text) == ("warning", True)
+
+
+def test_folders_of_the_user_are_named(tmp_path, monkeypatch):
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("ROS_PACKAGE_PATH", "/opt/ros")
+    entries = by_name(files.entries())
+    assert f"0 of them in {tmp_path} ({LIBRARY_VARIABLE})" in entries["library"].text
+    assert entries["ROS_PACKAGE_PATH"].text.startswith("/opt/ros; ")
+    assert {entry.status for entry in entries.values()} == {"ok"}
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none"))
+    library = by_name(files.entries())["library"]
+    assert library.status == "error"
+    assert f"does not exist; change {LIBRARY_VARIABLE}=" in library.text
+
+
+def test_data_packages_of_another_version_and_missing_files_are_found(monkeypatch):
+    monkeypatch.setattr(catalogue, "_version", lambda package: "9.9")
+    entry = by_name(files.entries())["robots of rtb-data"]
+    assert (entry.status, len(entry.data["changed"])) == ("warning", entry.data["parts"])
+
+    def missing(package, file):
+        raise PartError(f"{package} has no file {file}")
+
+    monkeypatch.setattr(files, "distribution_file", missing)
+    entry = by_name(files.entries())["robots of rtb-data"]
+    assert (entry.status, "parts lack their file: rtb-data has no" in entry.text) == ("error", True)
+
+
+def test_damaged_goal_sets_and_other_hashes_are_errors(tmp_path, monkeypatch):
+    folder = shutil.copytree(packaged_sets.FOLDER, tmp_path / "sets")
+    for module in (files, reference):
+        monkeypatch.setattr(module, "FOLDER", folder)
+    damaged = next(folder.glob("*.xz"))
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    sets = by_name(files.entries())["goal sets"]
+    assert (sets.status, sets.data["damaged"]) == ("error", [damaged.name])
+    recorded = {**reference.recorded(), "splits": {}, "goal_sets": "0", "checkpoints": {}}
+    monkeypatch.setattr(reference, "recorded", lambda: recorded)
+    monkeypatch.setattr(files, "FOLDER", packaged_sets.FOLDER)
+    entries = by_name(files.entries())
+    for name in ("splits", "goal sets", "policies"):
+        assert entries[name].status == "error"
+        assert entries[name].text.startswith("not the recorded: ")
+
+
+def test_another_robot_is_an_error_and_other_bytes_are_a_warning(ur5_plane, monkeypatch):
+    robots = {
+        "ur5-plane": "0" * 32,
+        "files of ur5-plane": {"robot.urdf": "0"},
+    }
+    monkeypatch.setattr(reference, "recorded", lambda: {"robots": robots, "score": 0.0})
+    monkeypatch.setattr(reference, "score", lambda: 171.49)
+    composed = self_test._compose(ur5_plane)
+    assert (composed.status, "splits refuse such robots" in composed.text) == ("error", True)
+    changed = self_test._files(ur5_plane)
+    assert (changed.status, "robot.urdf" in changed.data["changed"]) == ("warning", True)
+    score = self_test._score()
+    assert (score.status, score.text) == (
+        "error",
+        "jacobian on interpolation/arm3/reach: 171.49, not 0.00 as recorded; scores do not compare",
+    )
+
+
+def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
+    kinematic = SIMULATORS["kinematic"]
+
+    def load(*args):
+        simulation = kinematic.load(*args)
+        simulation.step = lambda targets: None
+        return simulation
+
+    monkeypatch.setitem(SIMULATORS._loaded, "kinematic", SimpleNamespace(load=load))
+    entry = self_test._simulator("it", "kinematic", ur5_plane)
+    assert (entry.status, entry.data) == ("error", {"moved": 0.0})
+
+
+def test_without_drawing_there_are_warnings_only(monkeypatch):
+    monkeypatch.setattr(self_test, "render", lambda *_, **__: broken())
+    monkeypatch.setattr(self_test, "gl_context", lambda *_: broken())
+    monkeypatch.setattr(self_test, "_score", lambda: Entry("score", "ok", ""))
+    entries = by_name(self_test.entries())
+    assert {name for name, entry in entries.items() if entry.status == "warning"} == {
+        "picture",
+        "film",
+    }
+    assert "libGL.so.1" in entries["film"].text
+
+
+def test_without_its_robot_the_self_test_stops(monkeypatch):
+    monkeypatch.setattr(reference, "reference_robot", lambda library: broken())
+    (entry,) = self_test.entries()
+    assert (entry.name, entry.status) == ("compose", "error")

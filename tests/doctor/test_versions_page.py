@@ -1,0 +1,32 @@
+"""The page about versions has the formats of the code."""
+
+import re
+from pathlib import Path
+
+from morphgen.benchmark import split, split_folder
+from morphgen.formats import card
+from morphgen.grammar.robot_set import SetConfig
+from morphgen.rl import drawn_robots, runs
+from morphgen.tasks import split_goals
+from morphgen.viewer import episode
+
+PAGE = (Path(__file__).parents[2] / "docs" / "versions.md").read_text(encoding="utf-8")
+READABLE = f"{runs.FORMAT}; {runs.READABLE[0]} is read"
+FORMATS = {
+    "NAME.yaml": split.FORMAT,
+    "build.json": split_folder.FORMAT,
+    "goals/index.json": split_goals.FORMAT,
+    "card.json": card.CARD_FORMAT,
+    "set.json": SetConfig(Path(), "", "", 0, (), False, False, ()).settings()["format"],
+    runs.CONFIG: READABLE,
+    runs.CHECKPOINT: READABLE,
+    drawn_robots.FILE: drawn_robots.FORMAT,
+    "scores.json": "",
+    ".npz": f"{episode.FORMAT}; 1 is read",
+}
+
+
+def test_formats_of_files_are_those_of_the_code():
+    _, _, section = PAGE.partition("## What the files record")
+    rows = re.findall(r"(?m)^\| [^`|]*`([^`]+)`[^|]*\| ?([^|]*?) ?\|", section.split("\n## ")[0])
+    assert dict(rows) == {file: str(number) for file, number in FORMATS.items()}
