@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.benchmark.extrapolation import parse_bound
-from morphgen.benchmark.holdout_audit import has_hold_out_rules, hold_out_findings
+from morphgen.benchmark.hold_out_audit import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import SIDES, Member, Side, Split

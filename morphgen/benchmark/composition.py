@@ -84,7 +84,7 @@ def composition(
 
 def _candidates(
     patterns: Sequence[str], tasks: Sequence[str], library: Library
-) -> Iterator[HoldoutCandidate]:
+) -> Iterator[HoldOutCandidate]:
     """Yield every robot of the patterns once for each task."""
     name_by_derivation: dict[str, str] = {}
     for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
@@ -97,11 +97,11 @@ def _candidates(
         *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
         properties = (str(derivation), combination(derivation), parts(derivation), last)
         for task in tasks:
-            yield HoldoutCandidate(name, robot.words, *properties, task)
+            yield HoldOutCandidate(name, robot.words, *properties, task)
 
 
 @dataclass(frozen=True)
-class HoldoutCandidate:
+class HoldOutCandidate:
     """A robot with a task, which may become a train or a test member."""
 
     name: str
@@ -123,8 +123,8 @@ class HoldoutCandidate:
 
 
 def hold_out(
-    candidates: Sequence[HoldoutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
-) -> tuple[list[HoldoutCandidate], list[HoldoutCandidate]]:
+    candidates: Sequence[HoldOutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
+) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
     """Choose test candidates, of as many different combinations as possible.
 
     Candidates with the combination of a test candidate are excluded from training, for all tasks.
@@ -161,7 +161,7 @@ def hold_out(
     raise BenchmarkError(_why_not(candidates, n, min_train, max_held))
 
 
-def num_covering(candidates: Sequence[HoldoutCandidate], test: Sequence[HoldoutCandidate]) -> int:
+def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutCandidate]) -> int:
     """Return how many of the first candidates cover each part and task of the test ones."""
     needed = {item for candidate in test for item in candidate.covers}
     n = 0
@@ -174,7 +174,7 @@ def num_covering(candidates: Sequence[HoldoutCandidate], test: Sequence[HoldoutC
 class _TrainPool:
     """The candidates that remain for training while others are held out, by their index."""
 
-    def __init__(self, candidates: Sequence[HoldoutCandidate]) -> None:
+    def __init__(self, candidates: Sequence[HoldOutCandidate]) -> None:
         self._candidates = candidates
         self._mixed = len({candidate.task for candidate in candidates}) > 1
         self._same_combination: dict[str, list[int]] = defaultdict(list)
@@ -214,10 +214,10 @@ class _TrainPool:
 
 
 def _covering_first(
-    candidates: Sequence[HoldoutCandidate], needed: set[str]
-) -> list[HoldoutCandidate]:
+    candidates: Sequence[HoldOutCandidate], needed: set[str]
+) -> list[HoldOutCandidate]:
     """Move candidates that cover all that is needed to the front (greedy set cover)."""
-    first: list[HoldoutCandidate] = []
+    first: list[HoldOutCandidate] = []
     rest = list(candidates)
     missing = set(needed)
     while missing:
@@ -228,7 +228,7 @@ def _covering_first(
     return first + rest
 
 
-def _why_not(candidates: Sequence[HoldoutCandidate], n: int, min_train: int, max_held: int) -> str:
+def _why_not(candidates: Sequence[HoldOutCandidate], n: int, min_train: int, max_held: int) -> str:
     combinations = {candidate.combination: candidate.parts for candidate in candidates}
     counts = Counter(part for parts in combinations.values() for part in parts)
     alone = sorted(part for part, times in counts.items() if times == 1)

@@ -120,7 +120,7 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     - Composition: all parts of a test robot are in train robots, but no train robot has its
       combination. In a split of several tasks, one of its parts is in no train robot of its task.
     - Extrapolation: no train robot has its grammar or its structure.
-    - Hold-out: see ``morphgen.benchmark.holdout_audit``, which tests all robots of a split.
+    - Hold-out: see ``morphgen.benchmark.hold_out_audit``, which tests all robots of a split.
     - All regimes: a train robot has its task.
 
     Raises:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from morphgen.benchmark.holdout_pool import Draft
+from morphgen.benchmark.hold_out_pool import Draft
 
 STRATA = ("arm", "ee", "body", "base")
 """Kinds of parts whose use is balanced, the most important first. Segments are repeated at will."""

@@ -134,7 +134,7 @@ def _summary(split: Split, path: Path) -> list[str]:
 
 def _hold_out_notes(split: Split, library: Library) -> list[str]:
     """Return what a user of ``--hold-out`` may not expect."""
-    from morphgen.benchmark.holdout_audit import related_parts
+    from morphgen.benchmark.hold_out_audit import related_parts
     from morphgen.benchmark.split import HOLD_OUT
 
     if split.regime != HOLD_OUT:

@@ -120,7 +120,7 @@ def _extrapolation_word(args: argparse.Namespace) -> str:
 def _hold_out(
     args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
 ) -> tuple[Split, ...]:
-    from morphgen.benchmark.holdout import hold_out
+    from morphgen.benchmark.hold_out import hold_out
 
     names = args.grammar.split(",") if args.grammar else []
     grammars = [opt.load_grammar_named(name.strip(), library, sound=True) for name in names]

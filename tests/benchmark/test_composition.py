@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morphgen.benchmark.composition import HoldoutCandidate, hold_out, num_covering
+from morphgen.benchmark.composition import HoldOutCandidate, hold_out, num_covering
 from morphgen.errors import BenchmarkError
 
 
 def cell(arm, ee, task="reach"):
-    return HoldoutCandidate(
+    return HoldOutCandidate(
         f"{arm}-{ee}", (), f"{arm}({ee})", f"{arm}[{ee}]", frozenset((arm, ee)), ee, task
     )
 
@@ -69,7 +69,7 @@ def test_the_held_out_robots_depend_on_the_seed():
 
 def test_each_combination_is_held_out_once_before_any_is_repeated():
     cells = [
-        HoldoutCandidate(
+        HoldOutCandidate(
             f"{arm}{ee}{k}", (), f"{arm}{ee}{k}", arm + ee, frozenset((arm, ee)), ee, "reach"
         )
         for arm in "abc"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from morphgen.benchmark.held_out import HoldOutRule, held_out_parts, parse_rules
+from morphgen.benchmark.hold_out_rules import HoldOutRule, held_out_parts, parse_rules
 from morphgen.benchmark.regimes import parts
 from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 from morphgen.errors import BenchmarkError

@@ -9,7 +9,7 @@ from itertools import product
 
 from morphgen.benchmark.audit import NEAR_THRESHOLDS
 from morphgen.benchmark.generate import MAX_COMPOSED, SplitRequest
-from morphgen.benchmark.holdout_pool import Draft, DraftMaker
+from morphgen.benchmark.hold_out_pool import Draft, DraftMaker
 from morphgen.benchmark.robot_factory import Candidate, Progress, RobotFactory, UnfitRobotError
 from morphgen.benchmark.similarity import cosine, tree_distance
 from morphgen.benchmark.stratified import TestBalance, TrainBalance, stratified
@@ -42,7 +42,7 @@ class ComposeDraft:
 
 
 @dataclass
-class HoldoutSearch:
+class HoldOutSearch:
     """Choose robots, compose them, reject those that do not do, and choose again."""
 
     request: SplitRequest

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.benchmark.generate import MAX_DRAWS, RobotStream, SplitRequest
-from morphgen.benchmark.held_out import HoldOutRule, RangeCondition, held_out_parts
+from morphgen.benchmark.hold_out_rules import HoldOutRule, RangeCondition, held_out_parts
 from morphgen.benchmark.part_patterns import PatternRobot, pattern_robots
 from morphgen.benchmark.regimes import parts
 from morphgen.benchmark.robot_factory import (

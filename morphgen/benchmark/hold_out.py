@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from morphgen.benchmark.generate import RobotStream, SplitRequest, assemble_drawn, require_size
-from morphgen.benchmark.held_out import parse_rules
-from morphgen.benchmark.holdout_pool import DraftMaker, make_pool
-from morphgen.benchmark.holdout_search import ComposeDraft, HoldoutSearch
+from morphgen.benchmark.hold_out_pool import DraftMaker, make_pool
+from morphgen.benchmark.hold_out_rules import parse_rules
+from morphgen.benchmark.hold_out_search import ComposeDraft, HoldOutSearch
 from morphgen.benchmark.member_names import unique_names
 from morphgen.benchmark.robot_factory import Progress, RobotFactory
 from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Split
@@ -39,7 +39,7 @@ def hold_out(
 
     Args:
         request: Sizes, tasks and seed.
-        hold_out: Rules, see ``held_out.parse_rules``.
+        hold_out: Rules, see ``hold_out_rules.parse_rules``.
         library: The library of parts.
         patterns: Patterns of the robots to draw from, see ``pattern_robots``. Parameters with
             held-out ranges are drawn, others have the pattern's values.
@@ -68,7 +68,7 @@ def hold_out(
     maker = DraftMaker(rules, library, request.seed)
     factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
     pool = dict(enumerate(make_pool(request, maker, patterns, grammars)))
-    search = HoldoutSearch(request, maker, ComposeDraft(factory), pool)
+    search = HoldOutSearch(request, maker, ComposeDraft(factory), pool)
     test, train = search.run(jobs, progress)
     robots = [*train, *test]
     names = unique_names(robot.derivation for robot in robots)

@@ -7,12 +7,12 @@ import pytest
 
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
-from morphgen.benchmark import holdout_search
+from morphgen.benchmark import hold_out_search
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest
-from morphgen.benchmark.held_out import parse_rules
-from morphgen.benchmark.holdout import hold_out
-from morphgen.benchmark.holdout_audit import hold_out_findings, related_parts
+from morphgen.benchmark.hold_out import hold_out
+from morphgen.benchmark.hold_out_audit import hold_out_findings, related_parts
+from morphgen.benchmark.hold_out_rules import parse_rules
 from morphgen.benchmark.regimes import parameters
 from morphgen.benchmark.split import Member, compose_member
 from morphgen.benchmark.split_file import parse_split, split_text
@@ -164,13 +164,13 @@ def test_repeated_robots_of_a_grammar_are_not_drawn():
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):
-    compose = holdout_search.ComposeDraft.__call__
+    compose = hold_out_search.ComposeDraft.__call__
 
     def with_equal_hashes(self, draft):
         robot = compose(self, draft)
         return replace(robot, hash="0" * 32) if "cube" in robot.name else robot
 
-    monkeypatch.setattr(holdout_search.ComposeDraft, "__call__", with_equal_hashes)
+    monkeypatch.setattr(hold_out_search.ComposeDraft, "__call__", with_equal_hashes)
     with pytest.raises(BenchmarkError) as caught:
         made(["arm=lwr"], 9, patterns=("arm={arm3,arm5,arm_ed,lwr} ee={cube,plane,stick}",))
     assert (

@@ -2,7 +2,7 @@
 
 import pytest
 
-from morphgen.benchmark.held_out import held_out_parts, parse_rules
+from morphgen.benchmark.hold_out_rules import held_out_parts, parse_rules
 from morphgen.benchmark.member_names import parts_name, unique_names
 from morphgen.benchmark.part_patterns import pattern_robots
 from morphgen.errors import BenchmarkError, CompositionError, PartError
