@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from morphgen.rl.agents import AGENTS, ME_GRAPH, Agent
 
-WITHOUT_TREE, BLIND_CRITIC = "graph-without-tree", "graph-blind-critic"
+WITHOUT_TREE, CRITIC_WITHOUT_LINKS = "graph-without-tree", "graph-critic-without-links"
 AGENT_LABELS = (
     "me-graph",
     *(f"me-graph-{channel}" for channel in ("lag", "joint", "jacobian", "dls")),
@@ -27,7 +27,7 @@ AGENT_LABELS = (
     "me-graph+robot-advantages",
     "me-graph+joint-entropy",
     WITHOUT_TREE,
-    BLIND_CRITIC,
+    CRITIC_WITHOUT_LINKS,
 )
 
 
@@ -38,7 +38,7 @@ def variant(name: str, module: str) -> Agent:
 
 if __name__ == "__main__":
     AGENTS.register(variant(WITHOUT_TREE, "no_tree"))
-    AGENTS.register(variant(BLIND_CRITIC, "blind_critic"))
+    AGENTS.register(variant(CRITIC_WITHOUT_LINKS, "critic_without_links"))
     agents = [] if "--agents" in sys.argv else ["--agents", ",".join(AGENT_LABELS)]
     sys.argv = ["morphgen", "study", *sys.argv[1:], *agents]
     runpy.run_module("morphgen", run_name="__main__", alter_sys=True)
