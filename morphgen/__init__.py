@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from morphgen import tasks as tasks
-    from morphgen.api.benchmark import similarity, split, tokens
+    from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
+    from morphgen.api.environments import make_env
     from morphgen.api.fitting import fit
     from morphgen.api.robots import compose, read, sample, write
+    from morphgen.api.splits import split
     from morphgen.errors import MorphgenError
     from morphgen.model.robot import Robot
-    from morphgen.tasks.make_env import make_env
 
     __version__: str
 
@@ -49,11 +50,11 @@ _MODULES = {
     "conform": "morphgen.api.checks",
     "fit": "morphgen.api.fitting",
     "fix": "morphgen.api.checks",
-    "make_env": "morphgen.tasks.make_env",
+    "make_env": "morphgen.api.environments",
     "read": "morphgen.api.robots",
     "sample": "morphgen.api.robots",
     "similarity": "morphgen.api.benchmark",
-    "split": "morphgen.api.benchmark",
+    "split": "morphgen.api.splits",
     "tokens": "morphgen.api.benchmark",
     "write": "morphgen.api.robots",
 }

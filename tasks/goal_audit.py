@@ -13,7 +13,7 @@ with the start configuration if the robots are the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,7 +30,13 @@ from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, no_progress, parallel_map
 from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.goal_sets import arrays_of
-from morphgen.tasks.split_goals import GoalResult, SplitGoals, certify_goal_set
+from morphgen.tasks.split_goals import (
+    GoalResult,
+    SplitGoals,
+    certify_goal_set,
+    has_goals,
+    read_split_goals,
+)
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
 
@@ -61,6 +67,30 @@ NEAR_JOINT = 1e-3
 """Difference of every joint below which configurations are the same [rad or m]."""
 MAX_SHARED = 0.5
 """Fraction of a set that two different robots may have in common."""
+
+
+def goals_to_audit(
+    folder: Path | None,
+    seed: int | None,
+    sample: Callable[[GoalConfig], Sequence[GoalResult]] | None,
+) -> SplitGoals | None:
+    """Return the goal sets that an audit of a split tests; None if it tests none.
+
+    Args:
+        folder: Folder where the split is built, or None; goal sets that it ships come first.
+        seed: Seed that the sets must have; by default the one that they are shipped with, else 0.
+        sample: Samples the sets of a split that ships none; None to test shipped sets only.
+
+    Raises:
+        BenchmarkError: If a shipped file is broken.
+    """
+    if folder is not None and has_goals(folder):
+        goals = read_split_goals(folder)
+        return goals if seed is None else replace(goals, config=replace(goals.config, seed=seed))
+    if sample is None:
+        return None
+    config = GoalConfig(seed or 0)
+    return SplitGoals.from_results(sample(config), config)
 
 
 def audit_goals(

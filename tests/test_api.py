@@ -12,6 +12,8 @@ import pytest
 import trimesh
 
 import morphgen
+from morphgen.api.loaded_split import LoadedSplit
+from morphgen.cli import main
 from morphgen.errors import MorphgenError
 
 FUNCTIONS = (
@@ -95,6 +97,15 @@ def test_documentation_examples_work(name, tmp_path, monkeypatch):
     assert doctest.DocTestRunner().run(example).failed == 0
 
 
+@pytest.mark.parametrize("name", ["write", "build", "verify"])
+def test_documentation_examples_of_a_split_work(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (example,) = doctest.DocTestFinder().find(getattr(LoadedSplit, name), name, globs={})
+    assert example.examples
+    example.globs["morphgen"] = morphgen
+    assert doctest.DocTestRunner().run(example).failed == 0
+
+
 def test_robots_may_be_named(tmp_path):
     robot = morphgen.compose("arm3-stick")
     folder = morphgen.write(robot, tmp_path, picture=False)
@@ -133,6 +144,56 @@ def test_split_has_robots_statistics_and_audit():
     assert scenario.audit().split == scenario.name
 
 
+def test_a_split_is_chosen_written_built_audited_and_verified(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rules = {"hold_out": ["ee=cube"], "robots": "arm={lwr,z1} ee={cube,stick}", "statistics": True}
+    split = morphgen.split("my/cubes", train=2, test=2, task=["reach"], **rules)
+    assert isinstance(split.definition.statistics["cosine"], dict)
+    assert [len(side) for side in (split.train, split.test)] == [2, 2]
+    file = split.write()
+    assert (str(file), split.write(), split.write("own.yaml").name) == (
+        "my/cubes.yaml",
+        file,
+        "own.yaml",
+    )
+    with pytest.raises(MorphgenError, match=r"own\.yaml exists with another content; choose"):
+        morphgen.split("interpolation/arm3/reach").write("own.yaml")
+    assert morphgen.split(file).definition == split.definition
+    folder = split.build("data", light=True, goals=True, goal_seed=1)
+    built = morphgen.split(folder)
+    assert (built.verify(), split.verify()) == ((), ())
+    codes = {finding.code for finding in built.audit().findings}
+    assert "goals-seed" not in codes
+    assert "goals-seed" in {finding.code for finding in built.audit(goal_seed=2).findings}
+    with pytest.raises(MorphgenError, match="was built with goals: ask for goals"):
+        split.build("data", light=True)
+    (folder / "robots" / split.test[0].name / "robot.urdf").write_text("<robot/>")
+    assert [each.where for each in built.verify()] == [split.test[0].name]
+
+
+@pytest.mark.slow
+def test_splits_of_every_regime_are_those_of_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pattern = "arm={lwr,z1,ur5} ee={stick,plane}"
+    for words, arguments in (
+        (["--hold-out", "ee=plane", "--from", pattern, "--train", "2"],
+         {"hold_out": "ee=plane", "robots": pattern, "train": 2}),
+        (["interpolation", "--grammar", "arm3", "--hull", "inside", "--seed", "3"],
+         {"regime": "interpolation", "grammar": "arm3", "hull": "inside", "seed": 3}),
+        (["composition", "--from", pattern, "--task", "push", "--obstacles"],
+         {"regime": "composition", "robots": pattern, "task": "push", "obstacles": True}),
+        (["extrapolation", "--train-category", "stick,nlink", "--test-category", "chain",
+          "--train", "2,4", "--max-links", "25", "--similarity", "<0.9"],
+         {"regime": "extrapolation", "train_category": ["stick", "nlink"], "train": [2, 4],
+          "test_category": "chain", "max_links": 25, "similarity": "<0.9"}),
+    ):  # fmt: skip
+        assert main(["split", "new", *words, "--out", "cli"]) == 0
+        splits = morphgen.split(**arguments)
+        for split in splits if isinstance(splits, tuple) else [splits]:
+            file = split.write("api")
+            assert file.read_bytes() == (Path("cli") / file.relative_to("api")).read_bytes()
+
+
 def test_vector_environments_of_one_keep_their_axis():
     env = morphgen.make_env("reach", "arm3-stick", sim="kinematic")
     (vector,) = (morphgen.make_env("reach", "arm3-stick", num_envs=1, sim="kinematic"),)
@@ -157,6 +218,16 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.similarity("arm3-stick"), "1 robots to compare; expected a list"),
         (lambda: morphgen.similarity(["prims", "z1"], ["tee"]), "did you mean 'tree'"),
         (lambda: morphgen.split("interpolation/arm3"), "did you mean 'interpolation/arm3/"),
+        (lambda: morphgen.split(), "no split is named; expected a name, or hold_out or regime"),
+        (lambda: morphgen.split("a", test=2), "hold-out: hold_out is missing; valid: hold_out, ro"),
+        (lambda: morphgen.split(hold_out="arm=lwrr"), "no arm matches 'lwrr'; did you mean 'lwr'"),
+        (lambda: morphgen.split(hold_out="arm=lwr", hull="any"), "hold-out: no effect of hull; va"),
+        (lambda: morphgen.split(regime="composed"), "unknown regime 'composed'; did you mean 'com"),
+        (lambda: morphgen.split(regime="interpolation", grammar=["arm3", "arm5"]), "2 grammars"),
+        (lambda: morphgen.split(hold_out="arm=lwr", task="reech"), "unknown task 'reech'; did yo"),
+        (lambda: morphgen.split(hold_out="arm=lwr", task=[]), "expected one or more, all differe"),
+        (lambda: morphgen.split("../a", hold_out="arm=lwr"), "name '../a': use letters, digits"),
+        (lambda: morphgen.split(holdout="arm=lwr"), "argument 'holdout'; did you mean 'hold_out'"),
         (lambda: morphgen.make_env("reech"), "did you mean 'reach'"),
         (lambda: morphgen.make_env("reach", workers=2), "unknown option 'workers'"),
         (lambda: morphgen.make_env("reach", ["prims"]), "name several with num_envs"),

@@ -1,4 +1,4 @@
-"""Encode and compare robots, and load splits of train and test robots."""
+"""Encode and compare robots."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 
 from morphgen.api.library import LibraryFolders, open_library
 from morphgen.benchmark import tokens as encoding
-from morphgen.benchmark.loaded_split import LoadedSplit
 from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
-from morphgen.benchmark.split_source import read_split_or_folder
 from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.extras import explain_missing_extras
@@ -106,29 +104,3 @@ def similarity(
         features(each, token_shapes(each, parts.folders), max_links=size) for each in loaded
     ]
     return {name: similarity_matrix(compared, name) for name in names}
-
-
-def split(name: str | PathLike[str], *, library: LibraryFolders = ()) -> LoadedSplit:
-    """Load a split of train and test robots.
-
-    Examples:
-        >>> scenario = morphgen.split("interpolation/arm3/reach")
-        >>> len(scenario.train), len(scenario.test)
-        (10, 1)
-        >>> scenario.audit().passed()
-        True
-
-    Args:
-        name: Name of a split that comes with morphgen, such as ``interpolation/arm3/reach``; a
-            split's file; or the folder where a split was built.
-        library: Folders of your own parts.
-
-    Returns:
-        The split. Its ``train`` and ``test`` robots are composed when first used; ``statistics()``
-        and ``audit()`` measure and compare all of them, which takes seconds.
-
-    Raises:
-        BenchmarkError: If the split does not exist or is malformed.
-    """
-    definition, _ = read_split_or_folder(name)
-    return LoadedSplit(definition, open_library(library))

@@ -81,6 +81,15 @@ class BuildSettings:
     picture: bool = False
     """Add ``preview.png`` to the bundles."""
 
+    def __post_init__(self) -> None:
+        """Check that both can be done.
+
+        Raises:
+            BenchmarkError: If a light build is to have pictures.
+        """
+        if self.light and self.picture:
+            raise BenchmarkError("a light build has no pictures; choose one of light and picture")
+
 
 BUNDLED = BuildSettings()
 

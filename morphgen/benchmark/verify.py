@@ -95,10 +95,16 @@ def verify(
     if is_built:
         differences += _folder_differences(folder, split_file.split, library, jobs, progress)
     else:
-        inspector = _Inspector(library.folders, split_file.split.max_links)
-        inspected = _inspect(split_file.split, inspector, jobs, progress)
-        differences += _robot_differences(split_file.split, inspected)
+        differences += compare_robots(split_file.split, library, jobs=jobs, progress=progress)
     return Verification(split_file.split, computed_id, tuple(differences))
+
+
+def compare_robots(
+    split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
+) -> tuple[Difference, ...]:
+    """Compose every robot of a split and compare its hash; see ``verify``."""
+    inspector = _Inspector(library.folders, split.max_links)
+    return tuple(_robot_differences(split, _inspect(split, inspector, jobs, progress)))
 
 
 @dataclass(frozen=True, eq=False)

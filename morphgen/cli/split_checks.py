@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Split
     from morphgen.benchmark.verify import Difference
     from morphgen.model.findings import Finding
-    from morphgen.tasks.split_goals import GoalResult, SplitGoals
+    from morphgen.tasks.split_goals import SplitGoals
 
 MAX_LISTED = 10
 """Largest number of findings of one code, or of differences, that are printed."""
@@ -88,24 +88,15 @@ def _audit_goals(
     args: argparse.Namespace, result: Audit, split: Split, folder: Path | None
 ) -> tuple[Audit, SplitGoals | None]:
     """Add the findings about goal sets to an audit; return the goal sets, too."""
-    accepts_some = any(code.startswith("goals-") for code in split.accepted)
-    if folder is None and not args.goals and not accepts_some:
-        return result, None
-    from morphgen.tasks.env_specs import GoalConfig
-    from morphgen.tasks.goal_audit import audit_goals, with_goal_findings
-    from morphgen.tasks.split_goals import SplitGoals, has_goals, read_split_goals
+    from morphgen.tasks.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 
-    if folder is not None and has_goals(folder):
-        goals = read_split_goals(folder)
-        if args.goal_seed is not None:
-            goals = replace(goals, config=replace(goals.config, seed=args.goal_seed))
-    elif args.goals:
-        config = GoalConfig(args.goal_seed or 0)
-        goals = SplitGoals.from_results(make_goals(args, split, config), config)
-    else:
-        return with_goal_findings(result, split, None), None
-    with bar(args, "auditing goals") as update:
-        findings = audit_goals(split, goals, opt.library_of(args), jobs=args.jobs, progress=update)
+    sample = partial(make_goals, args, split) if args.goals else None
+    goals = goals_to_audit(folder, args.goal_seed, sample)
+    findings = None
+    if goals is not None:
+        with bar(args, "auditing goals") as update:
+            library = opt.library_of(args)
+            findings = audit_goals(split, goals, library, jobs=args.jobs, progress=update)
     return with_goal_findings(result, split, findings), goals
 
 
@@ -170,45 +161,31 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 )
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
-    from morphgen.benchmark.split_build import build_split, split_folder_path
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder_files import BuildSettings
+    from morphgen.tasks.env_specs import GoalConfig
+    from morphgen.tasks.split_building import build_with_goals
 
-    if args.light and args.picture:
-        raise BenchmarkError("--light writes no pictures; say --light or --picture")
+    settings = BuildSettings(light=args.light, picture=args.picture)
     if not args.goals:
         opt.reject_idle({"--goal-seed": args.goal_seed is not None}, "only with --goals")
-    split = read_split(args.split)
-    goals: list[GoalResult] = []
-    if args.goals:
-        from morphgen.tasks.env_specs import GoalConfig
-        from morphgen.tasks.split_goals import require_goal_sets, write_goals
-
-        config = GoalConfig(args.goal_seed or 0)
-        goals = make_goals(args, split, config)
-        require_goal_sets(goals)
-    elif (built_folder := split_folder_path(split, args.out)).is_dir():
-        from morphgen.tasks.split_goals import GOALS, has_goals
-
-        if has_goals(built_folder):
-            raise BenchmarkError(
-                f"{built_folder} was built with goals: say --goals, delete "
-                f"{built_folder / GOALS}, or name another folder"
-            )
+    split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
+    goals = make_goals(args, split, config) if args.goals else []
     with bar(args, "building") as update:
-        report = build_split(
+        report = build_with_goals(
             split,
             args.out,
             opt.library_of(args),
+            settings,
+            goals,
+            config,
             jobs=args.jobs,
-            settings=BuildSettings(light=args.light, picture=args.picture),
             progress=update,
         )
     written, kept = report.num_written, report.num_kept
     data = {"folder": str(report.folder), "made": written, "kept": kept}
     lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
     if args.goals:
-        write_goals(report.folder, goals, config)
         data["goals"] = len(goals)
         lines.append(f"{len(goals)} goal sets, seed {config.seed}")
     lines.append(f"verify it anywhere: morphgen split verify {report.folder}")

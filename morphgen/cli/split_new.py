@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -15,16 +15,17 @@ from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import SplitRequest
+    from morphgen.benchmark.new_split import RobotChoice
     from morphgen.benchmark.split import Split
     from morphgen.grammar.library import Library
-
-Progress = Callable[[int], None]
 
 
 def new_split(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
+    from morphgen.benchmark.new_split import choose_robots
     from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import require_split_name
+    from morphgen.benchmark.split_writing import split_paths, write_new_splits
     from morphgen.benchmark.statistics import statistics
 
     request = _request(args)
@@ -32,14 +33,14 @@ def new_split(args: argparse.Namespace) -> None:
     library = opt.library_of(args)
     total = request.train[-1] + request.test if request.train else None
     with bar(args, "sampling", total=total) as update:
-        splits: tuple[Split, ...] = args.generate(args, request, library, update)
+        splits = choose_robots(_choice(args), request, library, jobs=args.jobs, progress=update)
     if args.statistics:
         splits = tuple(
             replace(split, statistics=statistics(split, library, jobs=args.jobs))
             for split in splits
         )
-    paths = _paths(args.out, splits)
-    _write(splits, paths)
+    paths = split_paths(args.out, splits)
+    write_new_splits(splits, paths)
     data = [
         {
             "file": str(path),
@@ -58,6 +59,7 @@ def new_split(args: argparse.Namespace) -> None:
 
 def _request(args: argparse.Namespace) -> SplitRequest:
     from morphgen.benchmark.generate import SplitRequest
+    from morphgen.benchmark.new_split import default_name
     from morphgen.benchmark.token_layout import MAX_LINKS
 
     tasks = [text.strip() for text in args.task.split(",")]
@@ -72,53 +74,30 @@ def _request(args: argparse.Namespace) -> SplitRequest:
         raise BenchmarkError(
             f"--train {args.train}: expected a whole number, or several such as 10,30,100"
         ) from error
-    words = [
-        args.regime,
-        args.robots_word(args),
-        *tasks,
-        *(["obstacles"] if args.obstacles else []),
-    ]
-    name = args.name or "-".join([*words, f"seed{args.seed}"])
+    name = args.name or default_name(_choice(args), tasks, args.obstacles, args.seed)
     links = MAX_LINKS if args.max_links is None else args.max_links
     return SplitRequest(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
 
 
-def _paths(out: Path, splits: Sequence[Split]) -> list[Path]:
-    if out.suffix != ".yaml":
-        return [out / f"{split.name}.yaml" for split in splits]
-    if len(splits) == 1:
-        return [out]
-    return [out.with_stem(f"{out.stem}-train{split.provenance['train']}") for split in splits]
+def _choice(args: argparse.Namespace) -> RobotChoice:
+    """Return the rules that the options of a regime name."""
+    from morphgen.benchmark.new_split import RobotChoice
+
+    grammar = getattr(args, "grammar", "")
+    return RobotChoice(
+        args.regime,
+        hold_out=tuple(getattr(args, "hold_out", ())),
+        robots=tuple(getattr(args, "patterns", ())),
+        grammar=(grammar,) if args.regime == "interpolation" else _names(grammar),
+        train_category=_names(getattr(args, "train_category", "")),
+        test_category=_names(getattr(args, "test_category", "")),
+        hull=getattr(args, "hull", ""),
+        similarity=getattr(args, "similarity", ""),
+    )
 
 
-def _write(splits: Sequence[Split], paths: Sequence[Path]) -> None:
-    """Write all files, or none if one of them exists with another content.
-
-    A file with the same content that another version of morphgen made is kept.
-    """
-    from morphgen.benchmark.split_file import write_split
-
-    missing = []
-    for split, path in zip(splits, paths, strict=True):
-        if not path.is_file():
-            missing.append((split, path))
-        elif not _holds(path, split):
-            raise BenchmarkError(
-                f"{path} exists with another content; choose another --name or --out"
-            )
-    for split, path in missing:
-        write_split(split, path)
-
-
-def _holds(path: Path, split: Split) -> bool:
-    """Test if a file is a split's, apart from the version of morphgen that made it."""
-    from morphgen.benchmark.split_file import read_split_file, split_text
-
-    try:
-        version = read_split_file(path).split.version
-    except BenchmarkError:
-        return False
-    return path.read_bytes() == split_text(replace(split, version=version)).encode()
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 def _summary(split: Split, path: Path) -> list[str]:

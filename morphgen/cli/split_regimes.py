@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import (
@@ -17,15 +15,7 @@ from morphgen.cli.command import (
     path_option,
     repeated,
 )
-from morphgen.cli.split_new import Progress, new_split
-
-if TYPE_CHECKING:
-    from morphgen.benchmark.generate import SplitRequest
-    from morphgen.benchmark.split import Split
-    from morphgen.grammar.library import Library
-
-MAX_WORD = 60
-"""Largest number of characters of what is held out in the name of a split."""
+from morphgen.cli.split_new import new_split
 
 
 def new_hold_out(args: argparse.Namespace) -> None:
@@ -69,76 +59,6 @@ def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
     )
 
 
-def _interpolation(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.interpolation import interpolation
-
-    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
-    return interpolation(
-        request, grammar, library, hull=args.hull, jobs=args.jobs, progress=progress
-    )
-
-
-def _interpolation_word(args: argparse.Namespace) -> str:
-    return Path(args.grammar).stem + ("" if args.hull == "any" else f"-{args.hull}")
-
-
-def _composition(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.composition import composition
-
-    return composition(request, args.patterns, library, jobs=args.jobs, progress=progress)
-
-
-def _composition_word(args: argparse.Namespace) -> str:
-    words = " ".join(args.patterns).split()
-    keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
-    return "-".join(keys) or "robots"
-
-
-def _extrapolation(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.extrapolation import extrapolation, parse_bound
-
-    bound = parse_bound(args.similarity) if args.similarity else None
-    train, test = (
-        [opt.load_grammar_named(name.strip(), library, sound=True) for name in names.split(",")]
-        for names in (args.train_category, args.test_category)
-    )
-    return extrapolation(
-        request, train, test, library, similarity=bound, jobs=args.jobs, progress=progress
-    )
-
-
-def _extrapolation_word(args: argparse.Namespace) -> str:
-    return "-".join(Path(name).stem for name in args.test_category.split(","))
-
-
-def _hold_out(
-    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
-) -> tuple[Split, ...]:
-    from morphgen.benchmark.hold_out import hold_out
-
-    names = args.grammar.split(",") if args.grammar else []
-    grammars = [opt.load_grammar_named(name.strip(), library, sound=True) for name in names]
-    return hold_out(
-        request,
-        args.hold_out,
-        library,
-        patterns=args.patterns,
-        grammars=grammars,
-        jobs=args.jobs,
-        progress=progress,
-    )
-
-
-def _hold_out_word(args: argparse.Namespace) -> str:
-    return "-".join(re.findall(r"[A-Za-z0-9_.]+", ",".join(args.hold_out)))[:MAX_WORD].strip("-.")
-
-
 REGIMES = (
     Command(
         "interpolation",
@@ -160,11 +80,7 @@ REGIMES = (
         ),
         new_split,
         examples=("split new interpolation --grammar arm3 --train 10 --test 1 --hull inside",),
-        defaults={
-            "generate": _interpolation,
-            "regime": "interpolation",
-            "robots_word": _interpolation_word,
-        },
+        defaults={"regime": "interpolation"},
     ),
     Command(
         "composition",
@@ -188,11 +104,7 @@ REGIMES = (
             'split new composition --from "arm={ur5,panda} ee={plane,stick,cylinder,sake_ez}" '
             "--train 7 --test 1 --task push",
         ),
-        defaults={
-            "generate": _composition,
-            "regime": "composition",
-            "robots_word": _composition_word,
-        },
+        defaults={"regime": "composition"},
     ),
     Command(
         "extrapolation",
@@ -222,11 +134,7 @@ REGIMES = (
             "split new extrapolation --train-category stick,nlink,prims --test-category chain "
             '--similarity "<0.6"',
         ),
-        defaults={
-            "generate": _extrapolation,
-            "regime": "extrapolation",
-            "robots_word": _extrapolation_word,
-        },
+        defaults={"regime": "extrapolation"},
     ),
 )
 new = Command(
@@ -267,5 +175,5 @@ new = Command(
         "split new --hold-out arm3.length=0.3..0.4 --grammar arm3 --test 4",
         'split new composition --from "arm={ur5,panda} ee={plane,stick}" --train 3',
     ),
-    defaults={"generate": _hold_out, "regime": "hold-out", "robots_word": _hold_out_word},
+    defaults={"regime": "hold-out"},
 )

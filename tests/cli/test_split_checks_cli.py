@@ -202,7 +202,7 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
         ("audit some.yaml --near 2,0.5", "--near 2,0.5: a tree distance is from 0 to 1"),
         ("audit some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("audit broken.yaml", "broken.yaml:"),
-        ("build some.yaml --light --picture", "say --light or --picture"),
+        ("build some.yaml --light --picture", "choose one of light and picture"),
         ("build some.yaml --out file", "cannot write file/mine/some: Not a directory"),
         ("build wrong.yaml --out out", "unknown part 'cubw'; did you mean 'cube'?"),
         ("verify folder", "folder is no built split: it has no build.json; morphgen split build"),
@@ -333,7 +333,10 @@ def test_build_without_goals_does_not_reuse_a_folder_with_goals(run, write):
     before = tree(Path("data"))
     code, out, err = run("split", "build", path, "--light")
     assert (code, out) == (2, "")
-    assert "data/mine/some was built with goals: say --goals, delete data/mine/some/goals" in err
+    assert (
+        "data/mine/some was built with goals: ask for goals (--goals), delete data/mine/some/goals"
+        in err
+    )
     assert tree(Path("data")) == before
 
 

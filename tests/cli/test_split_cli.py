@@ -211,7 +211,7 @@ def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch):
 def test_existing_split_file_is_never_replaced(run, refused):
     assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
     message = refused(*INTERPOLATION, "--out", "a.yaml", "--seed", 1)
-    assert "a.yaml exists with another content; choose another --name or --out" in message
+    assert "a.yaml exists with another content; choose another name or path" in message
     Path("b-train2.yaml").write_text("thesis")
     assert "b-train2.yaml exists" in refused(*INTERPOLATION[:-1], "1,2", "--out", "b.yaml")
 
