@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 
@@ -13,8 +12,7 @@ from morphgen.benchmark.split import Side, Split
 from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import TaskError, nearest
 from morphgen.grammar.library import default_library
-from morphgen.grammar.robot_source import RobotLike
-from morphgen.model.robot import Robot
+from morphgen.grammar.robot_source import RobotLike, is_one_robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
@@ -85,7 +83,7 @@ def make_batch(
         MissingDependencyError: If the simulator is not installed.
         MorphgenError: If a robot cannot be composed or read.
     """
-    if isinstance(robots, Robot | str | PathLike):
+    if is_one_robot(robots):
         raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
     _require_env_for_each(num_envs, len(robots))
     folders = tuple(library)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from os import PathLike
 
 from numpy.typing import ArrayLike
 
@@ -14,8 +13,7 @@ from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.grammar.robot_source import RobotLike, resolve_robot
-from morphgen.model.robot import Robot
+from morphgen.grammar.robot_source import RobotLike, resolve_robot, robot_list
 from morphgen.typing import Array
 
 
@@ -94,9 +92,8 @@ def similarity(
     names = [measures] if isinstance(measures, str) else measures
     for name in names:
         get_measure(name)
-    several = [robots] if isinstance(robots, Robot | str | PathLike) else robots
     parts = open_library(library)
-    loaded = [resolve_robot(robot, parts) for robot in several]
+    loaded = [resolve_robot(robot, parts) for robot in robot_list(robots)]
     if len(loaded) < 2:
         raise BenchmarkError(f"{len(loaded)} robots to compare; expected a list of two or more")
     size = default_max_links(len(each.links) for each in loaded) if max_links is None else max_links

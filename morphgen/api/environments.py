@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.api.library import LibraryFolders, library_folders
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
-from morphgen.model.robot import Robot
+from morphgen.grammar.robot_source import is_one_robot, robot_list
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -121,12 +120,12 @@ def make_env(
     if num_envs is None:
         from morphgen.tasks.gym_env import TaskEnv
 
-        if not isinstance(robot, Robot | str | PathLike):
+        if not is_one_robot(robot):
             raise TaskError(f"robot {robot!r}: expected one robot; name several with num_envs")
         return TaskEnv(task, robot, **options)
     from morphgen.tasks.vector import task_vector
 
-    several = [robot] if isinstance(robot, Robot | str | PathLike) else robot
+    several = robot_list(robot)
     if not several:
         raise TaskError("robot []: expected at least one robot")
     return task_vector(num_envs, task=task, robots=several, **options)

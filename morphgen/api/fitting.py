@@ -49,8 +49,9 @@ def fit(
         library: Folders of your own parts.
 
     Returns:
-        The robot with primitives as ``robot``, and the quality of each link's fit as ``report``;
-        ``agreement()`` compares their self-collisions with those of the meshes.
+        The quality of each link's fit as ``report``, and the robot with primitives as ``robot``,
+        which is made at the first access; ``agreement()`` compares its self-collisions with those
+        of the meshes.
 
     Raises:
         FitError: If an argument is out of its range, or no link has a shape.

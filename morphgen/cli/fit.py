@@ -185,20 +185,22 @@ def _fit_robot(
 ) -> dict[str, object]:
     """Fit one robot, write its bundle if a folder is given, and return the data of ``--json``."""
     from morphgen.checks import check
-    from morphgen.fitting.fitted_robot import FittedRobot, apply_fit
+    from morphgen.fitting.fitted_robot import fit_robot
     from morphgen.formats.bundle import write_bundle
 
-    robot = target.robot
-    report = _fit_links(target, options, args)
+    folders = opt.library_of(args).folders
+    with bar(args, f"fitting {target.label}", "link") as shown:
+        fit = fit_robot(
+            target.robot, options, folders, visual=args.visual, jobs=args.jobs, progress=shown
+        )
+    report = fit.report
     if not args.json:
         print(_report_text(report))
     if folder is None:
         return report.as_dict()
-    folders = opt.library_of(args).folders
-    fitted = replace(apply_fit(robot, report, folders, visual=args.visual), name=folder.name)
-    fit = FittedRobot(robot, fitted, report)
     with status(args, f"comparing collisions in {args.configurations} configurations"):
         of_primitives, of_hulls = fit.agreement(args.configurations, args.seed)
+    fitted = replace(fit.robot, name=folder.name)
     findings = check(fitted, tool_required=not target.is_part)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:
@@ -208,15 +210,6 @@ def _fit_robot(
         "agreement": of_primitives.as_dict(),
         "agreement_of_hulls": of_hulls.as_dict(),
     }
-
-
-def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
-    from morphgen.fitting.fitted_robot import require_shapes
-    from morphgen.fitting.robot_fit import fit_links
-
-    require_shapes(target.robot, target.label)
-    with bar(args, f"fitting {target.label}", "link") as shown:
-        return fit_links(target.robot, options, jobs=args.jobs, progress=shown)
 
 
 def _fit_all_parts(args: argparse.Namespace) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from morphgen.errors import FitError
@@ -14,6 +14,7 @@ from morphgen.fitting.replace_collision import with_fits, with_primitives
 from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.formats.fits import read_stored_fits, shapes_to_fit
 from morphgen.model.robot import Robot
+from morphgen.processes import Progress, no_progress
 
 
 @dataclass(frozen=True)
@@ -22,10 +23,28 @@ class FittedRobot:
 
     source: Robot
     """The robot whose shapes were fitted."""
-    robot: Robot
-    """The same robot with the primitives as its collision shapes."""
     report: FitReport
     """The primitives of each link, and their measured quality."""
+    folders: tuple[Path, ...] = ()
+    """Folders of parts, for their stored fits."""
+    visual: bool = False
+    """Whether ``robot`` has the primitives as its visual shapes, too."""
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The same robot with the primitives as its collision shapes, made at the first access.
+
+        Its provenance has the report without durations.
+
+        Raises:
+            MeshError: If a mesh cannot be read.
+            RobotError: If a joint axis is zero.
+        """
+        primitives = {row.link: row.fit.primitives for row in self.report.links}
+        fits = fits_of(self.source, self.report, read_stored_fits(self.folders))
+        fitted = with_fits(with_primitives(self.source, primitives, visual=self.visual), fits)
+        provenance = {**self.source.provenance, "primitives": self.report.without_times()}
+        return replace(fitted, provenance=provenance)
 
     def agreement(self, configurations: int = 1000, seed: int = 0) -> tuple[Agreement, Agreement]:
         """Compare self-collisions with those of the meshes over random configurations.
@@ -43,12 +62,13 @@ class FittedRobot:
 def fit_robot(
     robot: Robot,
     options: FitOptions,
-    folders: Sequence[Path] = (),
+    folders: tuple[Path, ...] = (),
     *,
     visual: bool = False,
     jobs: int = 1,
+    progress: Progress = no_progress,
 ) -> FittedRobot:
-    """Fit primitives to a robot's links, and replace its collision shapes by them.
+    """Fit primitives to a robot's links.
 
     Args:
         robot: The robot.
@@ -56,46 +76,14 @@ def fit_robot(
         folders: Folders of parts, for their stored fits.
         visual: Whether to replace the visual shapes, too.
         jobs: Number of processes; the result does not depend on it.
+        progress: Receives the number of links that are fitted, and of all.
 
     Raises:
         FitError: If no link has a shape.
         MeshError: If a mesh cannot be read.
         MorphgenError: If a process died.
     """
-    require_shapes(robot, robot.name)
-    report = fit_links(robot, options, jobs=jobs)
-    return FittedRobot(robot, apply_fit(robot, report, folders, visual=visual), report)
-
-
-def require_shapes(robot: Robot, name: str) -> None:
-    """Require a shape to fit.
-
-    Raises:
-        FitError: If no link has one; ``name`` is the robot's name in the message.
-    """
     if not any(map(shapes_to_fit, robot.links)):
-        raise FitError(f"{name}: no link has a shape")
-
-
-def apply_fit(
-    robot: Robot, report: FitReport, folders: Sequence[Path] = (), *, visual: bool = False
-) -> Robot:
-    """Return a robot with the primitives of a report as its collision shapes.
-
-    Its provenance has the report without durations.
-
-    Args:
-        robot: The robot that was fitted.
-        report: Its fits.
-        folders: Folders of parts, for their stored fits.
-        visual: Whether to replace the visual shapes, too.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-        RobotError: If a joint axis is zero.
-    """
-    primitives = {row.link: row.fit.primitives for row in report.links}
-    fits = fits_of(robot, report, read_stored_fits(folders))
-    fitted = with_fits(with_primitives(robot, primitives, visual=visual), fits)
-    provenance = {**robot.provenance, "primitives": report.without_times()}
-    return replace(fitted, provenance=provenance)
+        raise FitError(f"robot {robot.name!r}: no link has a shape")
+    report = fit_links(robot, options, jobs=jobs, progress=progress)
+    return FittedRobot(robot, report, folders, visual)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeGuard, cast
 
 from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
@@ -131,6 +131,16 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
     if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
         return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
     return robot
+
+
+def is_one_robot(robots: RobotLike | Iterable[RobotLike]) -> TypeGuard[RobotLike]:
+    """Return whether an argument is one robot, itself or by its name, and not several."""
+    return isinstance(robots, Robot | str | PathLike)
+
+
+def robot_list(robots: RobotLike | Iterable[RobotLike]) -> list[RobotLike]:
+    """Return an argument that may be one robot or several as a list."""
+    return [robots] if is_one_robot(robots) else list(cast("Iterable[RobotLike]", robots))
 
 
 def resolve_robot(robot: RobotLike, library: Library, root: Path | None = None) -> Robot:

@@ -423,7 +423,7 @@ def test_bundle_is_not_overwritten_by_its_own_fit(refused, meshed, named):
 
 def test_robot_without_shapes_is_rejected(refused, tmp_path):
     (tmp_path / "bare.urdf").write_text('<robot name="r"><link name="a"/></robot>')
-    assert "bare.urdf: no link has a shape" in refused("fit", "bare.urdf")
+    assert "robot 'r': no link has a shape" in refused("fit", "bare.urdf")
 
 
 def test_robot_with_an_invalid_mesh_is_rejected_with_the_file_name(refused, tmp_path):
