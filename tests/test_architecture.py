@@ -126,7 +126,7 @@ def test_every_package_has_a_layer():
     assert {package_of(name) for name in NAMES} - {""} == set(PACKAGES) | others
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", [*FOLDERS, ROOT / "tests"], ids=lambda folder: folder.name)
 def test_modules_are_short(folder):
     modules = folder.rglob("*.py")
     lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in modules}

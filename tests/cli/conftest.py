@@ -1,10 +1,13 @@
 """Each command-line test runs in its own temporary folder."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import trimesh
 
 from helpers.commands import tree
+from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import LIBRARY_VARIABLE
@@ -67,3 +70,43 @@ def urdf(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def own_cache(cache, monkeypatch):
+    """Keep goal sets in a cache of the module."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+@pytest.fixture
+def split_yaml(tmp_path):
+    """Write a small split as ``split.yaml``."""
+    from helpers.runs import small_split  # loads torch, which few of the tests need
+
+    write_split(small_split(), tmp_path / "split.yaml")
+    return "split.yaml"
+
+
+@pytest.fixture
+def nothing_is_stored(monkeypatch):
+    """Forbid storing fits, which would write into the library's folder."""
+
+    def forbidden(*_, **__):
+        raise AssertionError("a test was about to store the fits of the library's parts")
+
+    monkeypatch.setattr("morphgen.fitting.part_fits.parts_with_meshes", forbidden)
+    monkeypatch.setattr("morphgen.fitting.part_fits.store_parts", forbidden)
+
+
+@pytest.fixture
+def box(tmp_path):
+    """``link.stl``, a box centred at (1, 2, 3)."""
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.apply_translation((1.0, 2.0, 3.0))
+    mesh.export(tmp_path / "link.stl")
+    return Path("link.stl")

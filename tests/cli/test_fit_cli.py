@@ -1,8 +1,7 @@
-"""``morphgen fit``: output, written files and rejected input."""
+"""``morphgen fit`` of parts and robots: output, written files and rejected input."""
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +11,6 @@ import trimesh
 from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
-from morphgen.fitting import part_fits
 from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.grammar.library import default_library
@@ -21,46 +19,7 @@ from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import Link
 
-FIGURES = {
-    "iou",
-    "coverage",
-    "volume_ratio",
-    "protrusion_mean",
-    "protrusion_p95",
-    "gap_mean",
-    "gap_p95",
-    "hausdorff",
-}
-
-
-@pytest.fixture(autouse=True)
-def _nothing_is_stored(monkeypatch):
-    """Forbid storing fits, which would write into the library's folder."""
-
-    def forbidden(*_, **__):
-        raise AssertionError("a test was about to store the fits of the library's parts")
-
-    monkeypatch.setattr(part_fits, "parts_with_meshes", forbidden)
-    monkeypatch.setattr(part_fits, "store_parts", forbidden)
-
-
-@pytest.fixture
-def box(tmp_path):
-    """``link.stl``, a box centred at (1, 2, 3)."""
-    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
-    mesh.apply_translation((1.0, 2.0, 3.0))
-    mesh.export(tmp_path / "link.stl")
-    return Path("link.stl")
-
-
-@pytest.fixture
-def angle(tmp_path):
-    """``angle.stl``, an L of two boxes that touch."""
-    tall, wide = trimesh.creation.box((0.1, 0.1, 0.4)), trimesh.creation.box((0.2, 0.1, 0.1))
-    tall.apply_translation((0.05, 0.05, 0.2))
-    wide.apply_translation((0.2, 0.05, 0.05))
-    trimesh.boolean.union([tall, wide]).export(tmp_path / "angle.stl")
-    return Path("angle.stl")
+pytestmark = pytest.mark.usefixtures("nothing_is_stored")
 
 
 @pytest.fixture
@@ -102,68 +61,6 @@ def assert_same_inertials(fitted, source):
         np.testing.assert_allclose(
             link.inertial.inertia, before.inertial.inertia, rtol=1e-6, atol=1e-12
         )
-
-
-def test_mesh_fit_prints_a_table_and_the_primitive(run, box, tmp_path):
-    before = tree(tmp_path)
-    code, out, err = run("fit", box)
-    assert (code, err) == (0, "")
-    header, rule, row, shape = out.splitlines()
-    for word in ("link", "primitives", "solid", "IoU", "Hausdorff mm"):
-        assert word in header
-    assert set(rule) == {"-", " "}
-    assert row.split()[:3] == ["link.stl", "box", "watertight"]
-    assert float(row.split()[3]) > 0.97
-    assert shape.startswith("Box(size=(")
-    assert tree(tmp_path) == before
-
-
-@pytest.mark.slow
-def test_mesh_fit_as_json_is_in_metres(run, box):
-    code, out, err = run("fit", box, "--json", "--seed", "3")
-    assert (code, err) == (0, "")
-    data = json.loads(out)
-    assert out.count("\n") == 1
-    assert (data["mesh"], data["solid"], data["decimated_from"]) == ("link.stl", "watertight", None)
-    (primitive,) = data["primitives"]
-    np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), rtol=0.02)
-    np.testing.assert_allclose(primitive["xyz"], (1.0, 2.0, 3.0), atol=2e-3)
-    assert np.linalg.norm(primitive["quaternion"]) == pytest.approx(1.0)
-    assert set(data["quality"]) == FIGURES
-    assert data["quality"]["iou"] > 0.97
-    again = json.loads(run("fit", box, "--json", "--seed", "3")[1])
-    assert {**again, "seconds": 0} == {**data, "seconds": 0}
-
-
-@pytest.mark.slow
-def test_more_primitives_are_fitted_until_the_iou_is_reached(run, angle):
-    code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
-    assert (code, err) == (0, "")
-    data = json.loads(out)
-    assert [set(each) & {"box", "cylinder", "sphere"} for each in data["primitives"]] == [
-        {"box"}
-    ] * 2
-    assert data["quality"]["iou"] > 0.95
-    code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.3", "--json")
-    assert len(json.loads(out)["primitives"]) == 1
-
-
-def test_enclosing_primitives_cover_the_whole_mesh(run, angle):
-    code, out, err = run("fit", angle, "--enclose", "--json")
-    assert (code, err) == (0, "")
-    data = json.loads(out)
-    assert data["quality"]["coverage"] == 1.0
-    assert data["quality"]["gap_p95"] < 1e-8
-    assert data["quality"]["iou"] < 0.8
-
-
-@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "STL"])
-def test_every_mesh_format_is_read(run, tmp_path, suffix):
-    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / f"link.{suffix}")
-    code, out, err = run("fit", f"link.{suffix}", "--json", "--enclose")
-    assert (code, err) == (0, "")
-    (primitive,) = json.loads(out)["primitives"]
-    np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), atol=1e-5)
 
 
 def test_part_made_of_primitives_keeps_them(run):
@@ -333,32 +230,6 @@ def test_flat_link_is_reported_and_the_others_are_fitted(run, box, tmp_path, out
         assert finding.startswith("warning no-primitive at link leaf: ")
 
 
-MESHES = {
-    "empty.stl": b"",
-    "text.stl": b"Dear diary,\nthis is no mesh.\n",
-    "noise.stl": b"\x00\xff" * 300,
-    "none.obj": b"v 0 0 0\n",
-    "nan.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-    "inf.obj": b"v 1e999 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-    "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n",
-    "point.obj": b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n",
-}
-
-
-@pytest.mark.parametrize("name", list(MESHES))
-def test_invalid_mesh_is_rejected_with_its_file_name(refused, tmp_path, name):
-    (tmp_path / name).write_bytes(MESHES[name])
-    assert name in refused("fit", name)
-
-
-def test_binary_stl_with_nan_is_rejected_with_its_file_name(refused, tmp_path):
-    mesh = trimesh.creation.box((1, 1, 1))
-    data = bytearray(mesh.export(file_type="stl"))
-    data[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()
-    (tmp_path / "nan.stl").write_bytes(data)
-    assert "nan.stl" in refused("fit", "nan.stl")
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -399,12 +270,6 @@ def test_folder_named_like_a_part_does_not_hide_the_part(run, tmp_path):
     assert (code, [link["link"] for link in json.loads(out)["links"]]) == (0, ["plate"])
 
 
-def test_mesh_fit_does_not_accept_out(refused, box):
-    message = refused("fit", box, "--out", "made")
-    assert "link.stl is a mesh" in message
-    assert "--out" in message
-
-
 @pytest.mark.parametrize("source", ["plane", "robot"])
 def test_folder_that_is_not_a_bundle_is_rejected_before_fitting(
     refused, robot_urdf, tmp_path, source
@@ -431,14 +296,6 @@ def test_robot_with_an_invalid_mesh_is_rejected_with_the_file_name(refused, tmp_
     shape = '<visual><geometry><mesh filename="empty.stl"/></geometry></visual>'
     (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
     assert "empty.stl" in refused("fit", "r.urdf", "--out", "made")
-
-
-def test_errors_are_printed_as_json_with_the_json_option(run, tmp_path):
-    (tmp_path / "flat.obj").write_bytes(MESHES["flat.obj"])
-    code, out, err = run("fit", "flat.obj", "--json")
-    assert code == 2
-    assert "flat" in json.loads(out)["message"]
-    assert err == f"morphgen: {json.loads(out)['message']}\n"
 
 
 @pytest.mark.parametrize("step", ["urdf_text", "card_text"])

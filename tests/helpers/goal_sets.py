@@ -2,7 +2,13 @@
 
 from morphgen.tasks.env_specs import GoalConfig, env_spec
 from morphgen.tasks.goal_sets import goal_set
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
+
+CONFIG = ReachConfig(num_goals=12, train_layouts=3, eval_layouts=2)
+"""Constants of a small goal set."""
+LIFTED = -0.4
+"""Height of the ground below a robot that is lifted [m]."""
 
 
 def draw_goals(robot, config, *, obstacles=False, seed=0, **options):
@@ -14,3 +20,8 @@ def draw_spec(robot, config, *, obstacles=False, seed=0, cache=None):
     """Return the environment specification of a robot for a task config."""
     goal_config = GoalConfig(seed, (config,))
     return env_spec(robot, config.task, goal_config, obstacles=obstacles, cache=cache)
+
+
+def sample_goals(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
+    """Return the goal set of a lifted robot, by default a small one."""
+    return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)

@@ -48,3 +48,10 @@ def _integrated(body, actions):
         target = np.clip(moved, *joint_limits(body).T)
         path.append(target)
     return np.array(path)
+
+
+def held(sim, steps):
+    q = sim.q.clone()
+    for _ in range(steps):
+        sim.step(q)
+    return sim

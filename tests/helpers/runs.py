@@ -15,6 +15,11 @@ EVAL = EvalConfig(episodes=2, sim="mujoco")
 POLICY = PolicyConfig("me-mlp", network=mlp.Config(4, 8, 1))
 PPO = PPOConfig(total_timesteps=6 * 4 * 8, num_steps=8, epochs=1, minibatches=2)
 """Six updates of four environments."""
+NETWORK = ("--set", "mlp_width=8")
+ROLLOUT = ("--set", "num_steps=8", "--set", "minibatches=2", "--set", "epochs=1")
+SMALL = ("--sim", "mujoco", "--envs", "4", *ROLLOUT, *NETWORK)
+RUN = ("train", "planar-cube", "task=reach", "--agent", "me-mlp", *SMALL)
+"""Words of the command line for such a run."""
 
 
 def small_split(name="mine/small", task="reach"):

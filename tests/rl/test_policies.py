@@ -1,223 +1,29 @@
-"""Masked entries change no actions, values or gradients; other entries do."""
+"""Networks of the agents: sizes, masks, order of entities, precision and stored weights."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
+from helpers.observations import (
+    LINKS,
+    OBSTACLES,
+    N,
+    agents,
+    filled,
+    kinds,
+    mask_of,
+    networks,
+    observed,
+    outputs,
+)
 from morphgen.benchmark.token_layout import POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS, transformer
 from morphgen.rl.agents.encoder import Entities
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.observation_layout import layout_of, pad_links, require_layout, truncate_links
-from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.tasks.observation import tree_entries
-
-N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
-COUNT = torch.tensor([6, 4, 1, 3])
-MASKS = {
-    "tokens": "links",
-    "velocity": "links",
-    "previous_action": "links",
-    "lag": "links",
-    "jacobian": "links",
-    "goal": "goal_mask",
-    "object": "object_mask",
-    "line": "object_mask",
-    "obstacles": "obstacle_mask",
-    "points": "point_mask",
-}
-"""Mask of the rows of each observation entry."""
-
-
-def observed(seed=0, *, extras=True):
-    """A mixed batch: rows 0 and 1 reach, 2 and 3 push; 3 has no obstacle, and 2 no point."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=generator)
-
-    links = torch.arange(LINKS) < COUNT[:, None]
-    actions = links & (torch.arange(LINKS) > 0)
-    actions[2, 0] = True
-    pushes = torch.tensor([False, False, True, True])
-    found = {
-        "tokens": normal(N, LINKS, 48),
-        "links": links,
-        "actions": actions,
-        "goal": normal(N, 7),
-        "goal_mask": ~pushes,
-        "object": normal(N, 13),
-        "object_mask": pushes,
-        "line": normal(N, 1),
-        "obstacles": normal(N, OBSTACLES, 13),
-        "obstacle_mask": torch.tensor([[1, 0, 1], [1, 1, 1], [0, 1, 0], [0, 0, 0]]).bool(),
-        **chain_entries(actions),
-    }
-    if extras:
-        found["velocity"], found["previous_action"] = normal(N, LINKS), normal(N, LINKS)
-        found["points"], found["tool"] = normal(N, POINTS, 3), normal(N, 3)
-        found["point_mask"] = torch.tensor([True, True, False, True])[:, None].repeat(1, POINTS)
-        found["point_mask"][0, 5:] = False
-        found["lag"], found["jacobian"] = normal(N, LINKS, 1), normal(N, LINKS, 20)
-    return found
-
-
-def chain_entries(actions):
-    """Return the tree of robots whose links follow each other, for movable links (n, L)."""
-    chain = torch.ones(LINKS, LINKS).tril().bool().expand(len(actions), -1, -1)
-    return tree_entries(SimpleNamespace(ancestors=chain), torch.arange(len(actions)), actions)
-
-
-def mask_of(seen, name):
-    """Return the mask of an observation entry, in the entry's shape."""
-    mask = seen[MASKS[name]] if name in MASKS else torch.ones(N).bool()
-    return mask.reshape(mask.shape + (1,) * (seen[name].dim() - mask.dim())).expand_as(seen[name])
-
-
-def filled(seen, value):
-    """Return the observation with its masked entries filled with a value."""
-    values = {k: seen[k].masked_fill(~mask_of(seen, k), value) for k in MASKS if k in seen}
-    return {**seen, **values}
-
-
-def networks(agent="me-tf", seen=None, *, discrete=True, proprioceptive_only=False, lively=True):
-    """Return an actor and a critic; ``lively`` ones have noise on the initial weights."""
-    layout = layout_of(seen or observed())
-    config = PolicyConfig(
-        agent=agent,
-        discrete=discrete,
-        proprioceptive_only=proprioceptive_only,
-        tool_position=layout.tool,
-        network=transformer.Config(logit_scale=1.0) if agent == "me-tf" else None,
-    )
-    actor, critic = make_networks(config, layout, seed=0)
-    if lively:
-        generator = torch.Generator().manual_seed(1)
-        for each in (*actor.parameters(), *critic.parameters()):
-            each.data += 0.1 * torch.randn(each.shape, generator=generator)
-    return actor, critic
-
-
-def outputs(actor, critic, seen):
-    """Return the modes, the log-probabilities of sampled actions, and the values."""
-    head = actor.distribution(seen)
-    return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
-
-
-agents = pytest.mark.parametrize("agent", list(AGENTS))
-kinds = pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
-
-
-@agents
-@kinds
-@pytest.mark.parametrize("garbage", [-7.5, 1e30, -3e38, math.inf, math.nan])
-def test_invalid_numbers_in_the_padding_change_nothing(agent, discrete, garbage):
-    seen = observed()
-    pair = networks(agent, seen, discrete=discrete)
-    clean, dirty = outputs(*pair, filled(seen, 0.0)), outputs(*pair, filled(seen, garbage))
-    for one, other in zip(clean, dirty, strict=True):
-        assert one.isfinite().all()
-        assert one.equal(other)
-
-
-@agents
-@kinds
-@pytest.mark.parametrize("garbage", [1e30, math.nan])
-def test_invalid_numbers_in_the_padding_change_no_gradient(agent, discrete, garbage):
-    seen = observed()
-
-    def gradients(fill):
-        actor, critic = networks(agent, seen, discrete=discrete)
-        _, log_prob, value = outputs(actor, critic, filled(seen, fill))
-        (log_prob.sum() + value.square().sum()).backward()
-        return [each.grad for each in (*actor.parameters(), *critic.parameters())]
-
-    for clean, dirty in zip(gradients(0.0), gradients(garbage), strict=True):
-        assert clean.isfinite().all()
-        assert clean.equal(dirty)
-
-
-@agents
-@kinds
-def test_gradients_are_zero_in_the_padding_and_only_there(agent, discrete):
-    seen = observed()
-    for name in MASKS:
-        seen[name].requires_grad_()
-    _, log_prob, value = outputs(*networks(agent, seen, discrete=discrete), seen)
-    (log_prob + value).sum().backward()
-    read = seen["actions"] if agent == "me-graph" else seen["links"]
-    for name in MASKS:
-        assert not seen[name].grad[~mask_of(seen, name)].any(), name
-        if MASKS[name] == "links" and name != "tokens":
-            assert seen[name].grad[read].all(), name
-        elif name not in ("tokens", "points"):
-            assert seen[name].grad[mask_of(seen, name)].all(), name
-    of_links = seen["tokens"].grad.abs().sum(dim=-1)
-    assert of_links[read].all()
-    assert seen["points"].grad[0].any()
-
-
-@agents
-def test_permuting_padding_changes_nothing(agent):
-    seen = observed()
-    pair = networks(agent, seen)
-    turned = filled(seen, 3.0)
-    turned["tokens"] = turned["tokens"].clone()
-    turned["tokens"][1, 4:] = torch.randn(2, 48, generator=torch.Generator().manual_seed(5))
-    swapped = {**turned, "tokens": turned["tokens"].clone()}
-    swapped["tokens"][1, [4, 5]] = turned["tokens"][1, [5, 4]]
-    for one, other in zip(outputs(*pair, turned), outputs(*pair, swapped), strict=True):
-        assert one.equal(other)
-
-
-def test_the_amount_of_padding_does_not_change_the_transformer():
-    seen = observed()
-    pair = networks("me-tf", seen)
-    more = torch.full((N, 5, 13), 9.0)
-    wider = {
-        **seen,
-        "obstacles": torch.cat([seen["obstacles"], more], dim=1),
-        "obstacle_mask": torch.cat([seen["obstacle_mask"], more[..., 0] < 0], dim=1),
-    }
-    for one, other in zip(outputs(*pair, seen), outputs(*pair, wider), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
-
-
-@kinds
-def test_the_transformer_acts_and_learns_the_same_without_unused_rows(discrete):
-    seen = {name: each[1:] for name, each in observed().items()}
-    rows = rows_needed(PolicyConfig("me-tf"), seen)
-    assert rows == COUNT[1:].max() == LINKS - 2
-    found = []
-    for needed in (seen, truncate_links(seen, rows)):
-        actor, critic = networks("me-tf", seen, discrete=discrete)
-        head = actor.distribution(needed)
-        actions = pad_links(head.mode(), LINKS)
-        probable = head.log_prob(actions[:, : needed["links"].shape[1]])
-        value = critic(needed)
-        (probable + head.entropy() + value).sum().backward()
-        gradients = [each.grad for each in (*actor.parameters(), *critic.parameters())]
-        found.append([actions, probable, head.entropy(), value, *gradients])
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("agent", ["se", "me-mlp"])
-def test_an_mlp_takes_all_rows_of_its_layout(agent):
-    assert rows_needed(PolicyConfig(agent), observed()) == LINKS
-
-
-def test_position_embeddings_of_absent_links_get_no_gradient():
-    seen = {name: each[1:2] for name, each in observed().items()}
-    actor, critic = networks("me-tf", seen)
-    _, log_prob, value = outputs(actor, critic, seen)
-    (log_prob + value).sum().backward()
-    for network in (actor.network, critic.network):
-        assert network.index.grad[:4].any(dim=1).all()
-        assert not network.index.grad[4:].any()
+from morphgen.rl.observation_layout import layout_of, require_layout
+from morphgen.rl.policies import make_networks
 
 
 def test_the_order_of_obstacles_does_not_change_the_transformer():

@@ -1,6 +1,11 @@
 """Fixtures shared by the task tests."""
 
+from dataclasses import replace
+
 import pytest
+
+from helpers.robots import arm
+from morphgen.checks.self_collision import survey_collisions
 
 
 @pytest.fixture
@@ -18,3 +23,15 @@ def simulate():
     yield make
     for simulation in simulations:
         simulation.close()
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """Folder of stored goal sets, which does not exist yet."""
+    return tmp_path / "goals"
+
+
+@pytest.fixture(scope="module")
+def body():
+    """The arm, with the pairs of its links that always touch."""
+    return replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs)

@@ -10,32 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.goal_sets import draw_goals
-from helpers.robots import arm
+from helpers.goal_sets import CONFIG, LIFTED, sample_goals
 from helpers.scenes import robot
 from morphgen.benchmark.workspace import shoulder, workspace
-from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Link
-from morphgen.tasks import free_space, goal_sets, obstacles
+from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import (
     KEPT,
     draw_boxes,
-    draw_layouts,
     fewest_goals,
-    layouts_of,
     place_boxes,
 )
 from morphgen.tasks.reach import goals as module
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 
-CONFIG = ReachConfig(num_goals=12, train_layouts=3, eval_layouts=2)
-LIFTED = -0.4
 WORDS = (
     "arm=ur5 ee=plane",
     "arm=panda ee=panda_hand",
@@ -43,20 +36,6 @@ WORDS = (
     "prims",
     "arm=arm3 ee=claw",
 )
-
-
-@pytest.fixture
-def cache(tmp_path):
-    return tmp_path / "goals"
-
-
-@pytest.fixture(scope="module")
-def body():
-    return replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs)
-
-
-def sample_goals(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
-    return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
 
 
 def scene_of(body, goal_set, ground=LIFTED, layout=0):
@@ -130,54 +109,6 @@ def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground
             assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-6
             assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
         assert space.free(q).mean() > KEPT - 0.15
-
-
-def layouts_in(body, count=8, size=(0.5, 0.7), usable=lambda space: np.ones(1, bool)):
-    boxes = draw_boxes(body, count, size, np.random.default_rng(0))
-    space = FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED))
-    return draw_layouts(space, (1, 1), np.random.SeedSequence(0), usable)
-
-
-def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
-    boxes = draw_boxes(body, 8, (0.5, 0.7), np.random.default_rng(0))
-
-    def left(share):
-        monkeypatch.setattr(obstacles, "KEPT", share)
-        layouts, _ = layouts_in(body)
-        q, _ = FreeSpace(Scene(body, ground=LIFTED)).sample(200, np.random.default_rng(1))
-        placed = place_boxes(boxes, layouts[0])
-        return FreeSpace(Scene(body, obstacles=placed, ground=LIFTED)).free(q).mean()
-
-    assert left(0.0) < 0.6
-    assert left(0.7) > 0.6
-
-
-def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, cache):
-    config = replace(CONFIG, num_goals=30)
-    more = replace(config, num_goals=60, train_layouts=5, eval_layouts=4)
-    small, large = (sample_goals(body, cache, obstacles=True, config=one) for one in (config, more))
-    assert small.obstacles == large.obstacles
-    for side in ("train", "eval"):
-        few, many = layouts_of(config, side), layouts_of(more, side)
-        np.testing.assert_array_equal(
-            small.layouts[few], large.layouts[many][: len(few)], err_msg=side
-        )
-        np.testing.assert_array_equal(small.usable[few], large.usable[many][: len(few), :30])
-    assert len(np.unique(large.layouts[:, 0], axis=0)) == 9
-    assert (large.layouts == large.layouts.astype(np.float32)).all()
-
-
-def test_unknown_layouts_are_rejected():
-    with pytest.raises(TaskError, match="unknown layouts 'test'; valid: train, eval"):
-        layouts_of(CONFIG, "test")
-
-
-def test_a_layout_without_goals_is_an_error(body):
-    def usable(space):
-        return np.arange(40) >= 16  # 4 of the first 20, of which 5 are needed
-
-    with pytest.raises(BenchmarkError, match=r"of its first 20 goals only 4 or fewer"):
-        layouts_in(body, 1, (0.05, 0.1), usable=usable)
 
 
 def test_missing_room_for_obstacles_is_an_error(body, cache):
