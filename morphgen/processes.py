@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import itertools
 import os
 import signal
@@ -11,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from ctypes import c_byte
@@ -76,7 +75,7 @@ def parallel_map(
 def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
     context = get_context("spawn")
     stopped = context.RawValue("b", 0)
-    pool = ProcessPoolExecutor(jobs, context, _init_pool_worker, (work, stopped))
+    pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (work, stopped))
     waiting = iter(chunks)
     try:
         running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
@@ -127,19 +126,40 @@ def sigint_blocked() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def init_worker() -> None:
-    """Initialise a worker process: ignore Ctrl-C, and exit when the parent process ends."""
+def init_worker(stopped: c_byte) -> None:
+    """Initialise a worker process.
+
+    It ignores Ctrl-C, exits when the parent process ends, and interrupts its work when the parent
+    sets ``stopped``, which is in memory that all processes share.
+    """
+    global _stopped
+    _stopped = stopped
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _init_pool_worker(work: Callable[[Any], object], stopped: c_byte) -> None:
-    """Initialise a worker of ``parallel_map``, whose work ends when the parent stops."""
-    global _work, _stopped
-    init_worker()
-    _work, _stopped = work, stopped
     signal.signal(signal.SIGTERM, _interrupt)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     threading.Thread(target=_interrupt_when_stopped, daemon=True).start()
+
+
+def call_in_worker(work: Callable[..., R], *arguments: object) -> R:
+    """Call a function in a worker process.
+
+    Raises:
+        CancelledError: If the parent has stopped, or stops before the call has ended.
+    """
+    try:
+        with _working() as is_needed:
+            if is_needed():
+                return work(*arguments)
+    except KeyboardInterrupt:
+        pass
+    raise CancelledError
+
+
+def _init_map_worker(work: Callable[[Any], object], stopped: c_byte) -> None:
+    """Initialise a worker of ``parallel_map``."""
+    global _work
+    _work = work
+    init_worker(stopped)
 
 
 def _interrupt(*_: object) -> None:
@@ -152,7 +172,9 @@ def _interrupt_when_stopped() -> None:
     """Interrupt the work once the parent has stopped; a fit may still take minutes by then."""
     while _stopped is not None and not _stopped.value:
         time.sleep(POLL_INTERVAL)
-    _thread.interrupt_main(signal.SIGTERM)
+    main = threading.main_thread().ident
+    if main is not None:
+        signal.pthread_kill(main, signal.SIGTERM)  # which also interrupts a system call
 
 
 def _end_with_parent() -> None:
@@ -164,13 +186,25 @@ def _end_with_parent() -> None:
 
 
 def _process_chunk(items: Sequence[Any]) -> list[Any]:
+    if _work is None:
+        raise RuntimeError("the worker was not initialised")
+    with _working() as is_needed:
+        return [_work(item) for item in items if is_needed()]
+
+
+@contextmanager
+def _working() -> Iterator[Callable[[], bool]]:
+    """Let the work in this block be interrupted; yield a function that says if it is needed.
+
+    Once the parent has stopped, nobody needs the results.
+    """
     global _is_working
-    if _work is None or _stopped is None:
+    stopped = _stopped
+    if stopped is None:
         raise RuntimeError("the worker was not initialised")
     _is_working = True
     try:
-        # Once the parent has stopped, nobody needs the results.
-        return [_work(item) for item in items if not _stopped.value]
+        yield lambda: not stopped.value
     finally:
         _is_working = False
 

@@ -6,11 +6,12 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from ctypes import c_byte
 from multiprocessing import get_context
 from typing import TypeVar
 
 from morphgen.errors import MorphgenError
-from morphgen.processes import init_worker, sigint_blocked
+from morphgen.processes import call_in_worker, init_worker, sigint_blocked
 
 T = TypeVar("T")
 
@@ -26,25 +27,27 @@ class Workers:
         """Prepare a pool of ``n`` processes; they start with the first work."""
         self._n = n
         self._lock = threading.Lock()
+        self._context = get_context("spawn")  # threads and OpenGL do not survive a fork
+        self._stopped: c_byte = self._context.RawValue("b", 0)
         self._pool = self._new_pool()
-        self._closed = False
 
     def submit(self, work: Callable[..., T], *arguments: object) -> Future[T]:
         """Queue a function call for a process."""
         with self._lock, sigint_blocked():
             try:
-                return self._pool.submit(work, *arguments)
+                return self._pool.submit(call_in_worker, work, *arguments)
             except BrokenProcessPool:
-                if not self._closed:
+                if not self._stopped.value:
                     self._pool.shutdown(wait=False, cancel_futures=True)
                     self._pool = self._new_pool()
-                return self._pool.submit(work, *arguments)
+                return self._pool.submit(call_in_worker, work, *arguments)
 
     def result(self, future: Future[T]) -> T:
         """Wait for the result of a call.
 
         Raises:
             WorkerDied: If a process of the pool died before the call was done.
+            CancelledError: If the pool was closed before the call was done.
             MorphgenError: If the call raises it.
         """
         try:
@@ -55,11 +58,10 @@ class Workers:
             ) from error
 
     def close(self) -> None:
-        """End the processes; waiting calls are dropped."""
+        """End the processes; calls that run or wait are dropped."""
         with self._lock:
-            self._closed = True
+            self._stopped.value = 1
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        # Spawned, because threads and OpenGL do not survive a fork.
-        return ProcessPoolExecutor(self._n, get_context("spawn"), init_worker)
+        return ProcessPoolExecutor(self._n, self._context, init_worker, (self._stopped,))

@@ -23,3 +23,9 @@ def die(number):
 def die_later(seconds):
     time.sleep(seconds)
     os._exit(0)
+
+
+def sleep_from(started):
+    """Create a file, then sleep for an hour."""
+    started.touch()
+    time.sleep(3600)

@@ -2,10 +2,11 @@
 
 import os
 import time
+from concurrent.futures import CancelledError
 
 import pytest
 
-from helpers.worker_functions import die_later, power
+from helpers.worker_functions import die_later, power, sleep_from
 from morphgen.viewer.workers import WorkerDied, Workers
 
 
@@ -36,6 +37,18 @@ def test_closing_workers_ends_their_processes():
     while alive(process) and time.monotonic() < until:
         time.sleep(0.05)
     assert not alive(process)
+
+
+def test_closing_workers_interrupts_their_work(tmp_path):
+    workers = Workers(1)
+    started = tmp_path / "started"
+    running, waiting = workers.submit(sleep_from, started), workers.submit(power, 2, 3)
+    while not started.exists():
+        time.sleep(0.01)
+    workers.close()
+    for future in (running, waiting):
+        with pytest.raises(CancelledError):
+            future.result(timeout=60)
 
 
 def alive(process):
