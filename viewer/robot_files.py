@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import tempfile
-import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, MJCF, PICTURE, URDF, write_bundle
 from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import render
+from morphgen.formats.zip_files import write_entries
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.model.robot import Robot
 from morphgen.viewer.robot_tables import has_tool
@@ -31,8 +31,6 @@ _JPEG_QUALITY = 82
 """JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card."""
 _CACHE_FORMAT = 1
 """Version of the cache; increase it when a thumbnail or its facts change for the same robot."""
-_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""Time of every file in a zip, so that the same robot gives the same bytes."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +95,7 @@ def new_bundle_files(robot: Robot) -> dict[str, bytes]:
 def zip_files(folder: str, files: dict[str, bytes]) -> bytes:
     """Return a zip with the files in a folder; the same files give the same bytes."""
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path, data in sorted(files.items()):
-            entry = zipfile.ZipInfo(f"{folder}/{path}", _ZIP_TIME)
-            entry.external_attr = 0o644 << 16  # a file that everybody may read
-            archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
+    write_entries(content, {f"{folder}/{path}": data for path, data in files.items()})
     return content.getvalue()
 
 

@@ -19,10 +19,7 @@ import json
 import re
 import secrets
 import shutil
-import stat
-import struct
 import zipfile
-import zlib
 from pathlib import Path, PurePosixPath
 
 from lxml import etree
@@ -31,26 +28,23 @@ from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import CARD, PICTURE, URDF
 from morphgen.formats.resolve import PackageFinder, resolve_uri
 from morphgen.formats.xml import parse_xml
+from morphgen.formats.zip_files import (
+    ENTRY_SIGNATURE,
+    UNREADABLE,
+    ZipLimits,
+    safe_entries,
+    stays_inside,
+)
 from morphgen.model.geometry import MESH_SUFFIXES
 from morphgen.viewer.messages import MAX_UPLOAD
 from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shorten
 
 MAX_UPLOADS = 50
 """Uploads that a viewer keeps."""
-MAX_UNPACKED = 100 * 2**20
-"""Largest total size of the files in a zip [bytes]."""
-MAX_FILES = 2000
-"""Files in a zip."""
-MAX_NAME = 100
-"""Longest name of a file or folder in a zip [bytes]."""
-MAX_DEPTH = 20
-"""Longest path in a zip [names]."""
+LIMITS = ZipLimits(max_bytes=100 * 2**20, max_files=2000, max_name=100, max_depth=20)
+"""Bounds on a zip."""
 PACKAGE = "package.xml"
 """Marks a ROS package, which ``package://`` needs."""
-_ZIP_ENTRY = b"PK\x01\x02"
-"""Signature of every entry in a zip's table of contents."""
-_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Accepted methods; others (LZMA) can allocate gigabytes before they return a byte."""
 _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
 _MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
 """Suffixes of files that meshes refer to."""
@@ -109,76 +103,17 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
 def _unzip(name: str, content: bytes) -> dict[str, bytes]:
     """Return the files of a zip by their paths, after checking its table of contents."""
     # Counted in the raw bytes, because zipfile would read a table of millions of entries.
-    if content.count(_ZIP_ENTRY) > MAX_FILES:
-        raise UploadError(f"{name}: holds more than {MAX_FILES} files; nothing was kept")
+    if content.count(ENTRY_SIGNATURE) > LIMITS.max_files:
+        raise UploadError(f"{name}: holds more than {LIMITS.max_files} files; nothing was kept")
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-            if sum(entry.file_size for entry in entries) > MAX_UNPACKED:
-                raise UploadError(
-                    f"{name}: unpacks to more than {MAX_UNPACKED // 2**20} MB; nothing was kept"
-                )
-            paths = [_zip_path(name, entry) for entry in entries]
-            _require_distinct(name, paths)
-            return {path: archive.read(entry) for path, entry in zip(paths, entries, strict=True)}
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        struct.error,
-        EOFError,
-        OSError,
-        RuntimeError,  # an encrypted file
-        ValueError,
-    ) as error:
+            return {path: archive.read(entry) for entry, path in safe_entries(archive, LIMITS)}
+    except FormatError as error:
+        raise UploadError(f"{name}: {error}; nothing was kept") from error
+    except UNREADABLE as error:
         raise UploadError(
             f"{name}: not a readable zip: {shorten(str(error))}; nothing was kept"
         ) from error
-
-
-def _zip_path(name: str, entry: zipfile.ZipInfo) -> str:
-    """Return the path of a zip's entry, if every file system can store it safely."""
-    path = PurePosixPath(entry.orig_filename.replace("\\", "/"))
-    fault = ""
-    if not _stays_inside(entry.orig_filename) or ".." in path.parts or ":" in str(path):
-        fault = "leads out of its folder"
-    elif stat.S_ISLNK(entry.external_attr >> 16):
-        fault = "is a link"
-    elif entry.compress_type not in _COMPRESSION:
-        fault = "is compressed by a method other than deflate"
-    elif not path.parts or len(path.parts) > MAX_DEPTH or not str(path).isprintable():
-        fault = f"is not a valid file name, or lies in more than {MAX_DEPTH} folders"
-    elif any(len(part.encode()) > MAX_NAME for part in path.parts):
-        fault = f"is longer than {MAX_NAME} characters"
-    if fault:
-        raise UploadError(f"{name}: {shorten(entry.orig_filename)!r} {fault}; nothing was kept")
-    return str(path)
-
-
-def _require_distinct(name: str, paths: list[str]) -> None:
-    """Require that no two files have the same path, and no file the path of a folder.
-
-    Case is ignored, because some file systems ignore it.
-    """
-    known_paths: set[str] = set()
-    for path in paths:
-        if path.casefold() in known_paths:
-            raise UploadError(f"{name}: {shorten(path)!r} is there twice; nothing was kept")
-        known_paths.add(path.casefold())
-    for path in paths:
-        if not known_paths.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
-            raise UploadError(
-                f"{name}: {shorten(path)!r} is in a folder that is a file; nothing was kept"
-            )
-
-
-def _stays_inside(path: str) -> bool:
-    """Return whether a path with slashes or backslashes stays in the folder that it starts in."""
-    depth = 0
-    for part in path.replace("\\", "/").split("/"):
-        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
-        if depth < 0:
-            return False
-    return not path.startswith(("/", "\\"))
 
 
 def _is_kept(path: str, data: bytes) -> bool:
@@ -265,7 +200,7 @@ def _require_inner_uri(path: str, uri: str) -> None:
             f"{path}: {shorten(uri)!r}: only relative paths and package:// are accepted"
         )
     joined = name if name != uri else str(PurePosixPath(path).parent / name)
-    if name.startswith(("/", "\\")) or not _stays_inside(joined):
+    if name.startswith(("/", "\\")) or not stays_inside(joined):
         raise UploadError(f"{path}: {shorten(uri)!r} leads out of its folder; nothing was kept")
 
 

@@ -1,0 +1,191 @@
+"""Zip archives: written with the same bytes for the same files, and read without trust.
+
+Threat: an archive from a stranger may name files outside its folder, hold links or two files of one
+name, or unpack to more than the disk holds. Everything is checked before the first file is written.
+"""
+
+from __future__ import annotations
+
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from morphgen.errors import FormatError
+from morphgen.formats.files import replacing_file
+
+ENTRY_SIGNATURE = b"PK\x01\x02"
+"""First bytes of every entry in a zip's table of contents."""
+_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Accepted methods; others (LZMA) can allocate gigabytes before they return a byte."""
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Time of all written entries: the earliest that a zip can hold."""
+_MODE = 0o100644
+"""Mode of all written entries: a regular file that its owner may write."""
+_UNIX = 3
+"""System that written entries name as their creator."""
+_LEVEL = 9
+_SHOWN = 100
+"""Longest name that an error shows [characters]."""
+_CHUNK = 2**20
+"""Bytes that are unpacked at once."""
+
+UNREADABLE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    RuntimeError,  # an encrypted file
+    ValueError,
+)
+"""Errors that ``zipfile`` raises for malformed archives."""
+
+
+@dataclass(frozen=True)
+class ZipLimits:
+    """Bounds on an archive that is read."""
+
+    max_bytes: int
+    """Largest total size of the unpacked files [bytes]."""
+    max_files: int
+    max_name: int = 250
+    """Longest name of a file or folder [bytes]."""
+    max_depth: int = 20
+    """Longest path [names]."""
+
+
+def write_zip(path: Path, files: Mapping[str, bytes | Path]) -> None:
+    """Write an archive in place of an earlier one; nothing half-written stays.
+
+    Args:
+        path: The archive.
+        files: Contents, or the files that hold them, by path in the archive.
+
+    Raises:
+        FormatError: If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing_file(path) as partial, partial.open("wb") as target:
+            write_entries(target, files)
+            target.close()
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def write_entries(target: IO[bytes], files: Mapping[str, bytes | Path]) -> None:
+    """Write an archive of files to an open file; for the arguments see ``write_zip``.
+
+    Entries are sorted and have no time, so the same files give the same bytes with the same zlib.
+    """
+    with zipfile.ZipFile(target, "w") as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, _EPOCH)
+            entry.external_attr, entry.create_system = _MODE << 16, _UNIX
+            content = files[name]
+            data = content.read_bytes() if isinstance(content, Path) else content
+            archive.writestr(entry, data, zipfile.ZIP_DEFLATED, _LEVEL)
+
+
+def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
+    """Unpack an archive into an empty folder.
+
+    Raises:
+        FormatError: If it cannot be read, exceeds a limit, or names a file that is not safe; then
+            files may have been written to ``folder``, and nowhere else.
+    """
+    try:
+        if path.stat().st_size > limits.max_bytes:
+            raise FormatError(f"{path}: more than {limits.max_bytes // 2**20} MB")
+        with zipfile.ZipFile(path) as archive:
+            for entry, name in safe_entries(archive, limits):
+                target = folder / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _unpack_entry(archive, entry, target)
+    except FormatError as error:
+        raise FormatError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: no such file") from error
+    except UNREADABLE as error:
+        raise FormatError(f"{path}: not a readable zip: {_shortened(str(error))}") from error
+
+
+def safe_entries(archive: zipfile.ZipFile, limits: ZipLimits) -> list[tuple[zipfile.ZipInfo, str]]:
+    """Return the files of an archive with their paths, after checking its table of contents.
+
+    Raises:
+        FormatError: If it exceeds a limit, or a path is not safe; the message does not name the
+            archive.
+    """
+    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    if len(entries) > limits.max_files:
+        raise FormatError(f"holds more than {limits.max_files} files")
+    if sum(entry.file_size for entry in entries) > limits.max_bytes:
+        raise FormatError(f"unpacks to more than {limits.max_bytes // 2**20} MB")
+    paths = [_entry_path(entry, limits) for entry in entries]
+    _require_distinct(paths)
+    return list(zip(entries, paths, strict=True))
+
+
+def stays_inside(path: str) -> bool:
+    """Return whether a path with slashes or backslashes stays in the folder that it starts in."""
+    depth = 0
+    for part in path.replace("\\", "/").split("/"):
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return False
+    return not path.startswith(("/", "\\"))
+
+
+def _unpack_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
+    """Write one file; its size is that of the table of contents at most."""
+    left = entry.file_size
+    with archive.open(entry) as source, target.open("xb") as file:
+        while chunk := source.read(_CHUNK):
+            left -= len(chunk)
+            if left < 0:
+                raise FormatError(f"{_shortened(entry.filename)!r} is larger than its entry says")
+            file.write(chunk)
+
+
+def _entry_path(entry: zipfile.ZipInfo, limits: ZipLimits) -> str:
+    """Return the path of an entry, if every file system can store it safely."""
+    path = PurePosixPath(entry.orig_filename.replace("\\", "/"))
+    fault = ""
+    if not stays_inside(entry.orig_filename) or ".." in path.parts or ":" in str(path):
+        fault = "leads out of its folder"
+    elif stat.S_ISLNK(entry.external_attr >> 16):
+        fault = "is a link"
+    elif entry.compress_type not in _COMPRESSION:
+        fault = "is compressed by a method other than deflate"
+    elif not path.parts or len(path.parts) > limits.max_depth or not str(path).isprintable():
+        fault = f"is not a valid file name, or lies in more than {limits.max_depth} folders"
+    elif any(len(part.encode()) > limits.max_name for part in path.parts):
+        fault = f"is longer than {limits.max_name} characters"
+    if fault:
+        raise FormatError(f"{_shortened(entry.orig_filename)!r} {fault}")
+    return str(path)
+
+
+def _require_distinct(paths: Sequence[str]) -> None:
+    """Require that no two files have the same path, and no file the path of a folder.
+
+    Case is ignored, because some file systems ignore it.
+    """
+    known_paths: set[str] = set()
+    for path in paths:
+        if path.casefold() in known_paths:
+            raise FormatError(f"{_shortened(path)!r} is there twice")
+        known_paths.add(path.casefold())
+    for path in paths:
+        if not known_paths.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
+            raise FormatError(f"{_shortened(path)!r} is in a folder that is a file")
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
