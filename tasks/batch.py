@@ -26,8 +26,9 @@ from morphgen.tasks.random_streams import random_streams
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
+from morphgen.tasks.step_result import TaskState
 from morphgen.tasks.straight_paths import StraightPaths
-from morphgen.tasks.task import OBJECT, EnvSpec, TaskState
+from morphgen.tasks.task import OBJECT, EnvSpec
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
 

@@ -25,7 +25,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.task import NumpyRow, TaskState
+from morphgen.tasks.step_result import NumpyRow, TaskState
 from morphgen.tasks.vector import NumpyObservation
 
 Float32 = NDArray[np.float32]

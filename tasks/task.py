@@ -8,8 +8,9 @@ batch's environments at this task and evaluate every step of them as tensors.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.typing import Array
 
 if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
@@ -160,53 +162,6 @@ class Marker:
     """``frame``: axes inside a translucent ball. ``box``: a box."""
     size: Vec3
     """Edge lengths of the box, or diameters of the ball [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class TaskState:
-    """State after a step for its evaluation: rows of k environments; positions in root frames."""
-
-    tool: torch.Tensor
-    """Position of the tool, shape (k, 3) [m]."""
-    block_pose: torch.Tensor
-    """Pose of the block, shape (k, 7); zeros if there is none."""
-    limit_violation: torch.Tensor
-    """Sum over joints of their distance outside of the limits, shape (k,) [rad and m]."""
-    acceleration: torch.Tensor
-    """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
-    diverged: torch.Tensor
-    """Whether the simulation diverged, shape (k,), bool; such a step is never a success."""
-    tool_rotation: torch.Tensor | None = None
-    """Rotation matrix of the tool, shape (k, 3, 3); None if no task ``needs_tool_rotation``."""
-
-
-@dataclass(frozen=True, eq=False)
-class StepResult:
-    """Result of a step: rows of k environments."""
-
-    success: torch.Tensor
-    """Whether the task is fulfilled, shape (k,), bool."""
-    terminated: torch.Tensor
-    """Whether the task ends the episode, shape (k,), bool."""
-    distance: torch.Tensor
-    """Distance from success, shape (k,) [m]."""
-    score: torch.Tensor
-    """Score of the step, shape (k,); see ``Task.episode_score``."""
-    terms: dict[str, torch.Tensor]
-    """Weighted reward terms by name, each of shape (k,); the reward is their sum."""
-    angle: torch.Tensor | None = None
-    """Angle from success, shape (k,) [rad]; None if the task wants no orientation."""
-
-
-@dataclass(frozen=True, eq=False)
-class NumpyRow:
-    """The formulas of one environment of a task in NumPy."""
-
-    evaluate: Callable[[TaskState], StepResult]
-    """``TaskEnvs.evaluate`` of a state whose values are vectors and bools of NumPy and numbers:
-    those of ``TaskState`` without the axis of rows. The result has numbers, too."""
-    observe: Callable[[NDArray[np.float32]], dict[str, NDArray[np.float32]]]
-    """``TaskEnvs.observe`` of the pose of the block, shape (7,), in arrays that the caller owns."""
 
 
 class TaskEnvs(ABC):
@@ -389,6 +344,26 @@ class Task(ABC, Generic[C, G]):
             steps: Number of steps.
         """
         return total / steps
+
+    def score_range(self, config: C, reach: float) -> tuple[float, float]:
+        """Return the lowest and the highest score that an episode can have.
+
+        Args:
+            config: Constants of the task.
+            reach: Reach of the robot [m].
+        """
+        return -math.inf, math.inf
+
+    def outcome_fault(self, config: C, success: bool, score: float, distance: float) -> str:
+        """Return why an episode cannot have ended so, or nothing; submissions are checked with it.
+
+        Args:
+            config: Constants of the task.
+            success: Whether it ended in success.
+            score: See ``episode_score``.
+            distance: Distance from success at the end [m].
+        """
+        return ""
 
     def markers(self, config: C, goals: G) -> tuple[Marker, ...]:
         """Return the shapes that show a robot's goal."""

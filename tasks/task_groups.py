@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.tasks.registry import TASKS
+from morphgen.tasks.step_result import StepResult, TaskState
 from morphgen.tasks.task import (
     STANDARD_FIELDS,
     EnvSpec,
-    StepResult,
     Task,
     TaskEnvs,
-    TaskState,
 )
 from morphgen.tasks.tool_targets import ToolTargets
 

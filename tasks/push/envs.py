@@ -14,7 +14,8 @@ from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.rows import choose, goal_choices, padded_rows, positive_part, row_norms
-from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
+from morphgen.tasks.task import EnvSpec, TaskEnvs
 
 GAP = 0.05
 """Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""

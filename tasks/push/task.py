@@ -83,6 +83,20 @@ class Push(Task[PushConfig, PushStartSet]):
         """Return 1 for success at the end, else 0."""
         return last
 
+    def score_range(self, config: PushConfig, reach: float) -> tuple[float, float]:
+        """Return the score of a failure and that of a success."""
+        return 0.0, 1.0
+
+    def outcome_fault(
+        self, config: PushConfig, success: bool, score: float, distance: float
+    ) -> str:
+        """Compare success with the score and with the final distance from the line."""
+        if score != float(success):
+            return f"score {score:g} with success {str(success).lower()}; expected {success:d}"
+        if success and distance > 0:
+            return f"success at {distance:g} m from the line; expected 0"
+        return ""
+
     def markers(self, config: PushConfig, goals: PushStartSet) -> tuple[Marker, ...]:
         """Return a strip on the ground, longer than the starts of the block are spread."""
         length = float(np.ptp(goals.blocks[:, 0])) + 4 * max(goals.block.size)

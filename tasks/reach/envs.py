@@ -14,7 +14,8 @@ from morphgen.errors import TaskError
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.rows import choose, goal_choices, padded_rows, row_norms
-from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
+from morphgen.tasks.task import EnvSpec, TaskEnvs
 
 
 class ReachEnvs(TaskEnvs):

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
     from morphgen.tasks.reach.envs import ReachEnvs
 
+MAX_DISTANCE = 3.0
+"""Bound on the distance between tool and goal in reaches: each is within one, and a reach is an
+estimate."""
+_ROUNDING = 1e-6
+"""Rounding of a distance that is computed with single precision [m]."""
+
 
 class Reach(Task[ReachConfig, ReachGoalSet]):
     """Bring the tool to a goal and keep it there, within 6 s."""
@@ -65,6 +71,20 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         from morphgen.tasks.reach.envs import ReachEnvs
 
         return ReachEnvs(specs, env_spec_index, num_joints)
+
+    def score_range(self, config: ReachConfig, reach: float) -> tuple[float, float]:
+        """Return the score at the farthest distance from a goal, and the score near it."""
+        return -config.score_square * (MAX_DISTANCE * reach) ** 2, config.score_near
+
+    def outcome_fault(
+        self, config: ReachConfig, success: bool, score: float, distance: float
+    ) -> str:
+        """Compare success with the final distance."""
+        if success and distance > config.near + _ROUNDING:
+            return f"success at a distance of {distance:g} m; a success is within {config.near:g} m"
+        if not success and config.goal == "position" and distance < config.near - _ROUNDING:
+            return f"no success at a distance of {distance:g} m, which is within {config.near:g} m"
+        return ""
 
     def markers(self, config: ReachConfig, goals: ReachGoalSet) -> tuple[Marker, ...]:
         """Return a ball with the radius of success, and axes of the goal pose."""
