@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.audit import NEAR_THRESHOLDS, Audit, NearThresholds, audit
+from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.split import Split, compose_side
 from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.split_writing import split_paths, write_new_splits
@@ -57,6 +58,19 @@ class LoadedSplit:
             MorphgenError: As ``compose_member``.
         """
         return tuple(compose_side(self.definition, "test", self.library))
+
+    def licences(self) -> tuple[LicencedPart, ...]:
+        """Return the parts of the robots with their licences, and what these restrict.
+
+        Examples:
+            >>> scenario = morphgen.split("extrapolation/arms/reach")
+            >>> [part.part for part in scenario.licences() if part.licence.restrictions]
+            ['sake_ez']
+
+        Raises:
+            MorphgenError: If the library lacks a part, or a derivation is malformed.
+        """
+        return licenced_parts(self.definition, self.library)
 
     @explain_missing_extras()
     def statistics(self, *, jobs: int = 1, progress: Progress = no_progress) -> dict[str, Any]:

@@ -120,7 +120,8 @@ def split(
     Returns:
         The split, or for several sizes a tuple of splits. Its ``train`` and ``test`` robots are
         composed when first used. ``statistics()`` and ``audit()`` measure and compare all of them,
-        ``write()`` writes its file, ``build()`` all robots, and ``verify()`` compares them.
+        ``licences()`` lists their parts with licences and restrictions, ``write()`` writes its
+        file, ``build()`` all robots, and ``verify()`` compares them.
 
     Raises:
         BenchmarkError: If the split does not exist or is malformed; or if an argument is unknown or
