@@ -103,13 +103,8 @@ def extrapolation(
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]
     train = make_robots(recipes, factory, jobs=jobs, progress=progress)
-    names = {structure(robot.derivation, library): robot.name for robot in reversed(train)}
-
-    def reject_trained(derivation: Derivation) -> str:
-        twin = names.get(structure(derivation, library))
-        return f"the structure of train robot {twin}" if twin else ""
-
-    reject_by_similarity = _SimilarityBound(train, request.train[0], similarity)
+    reject_trained = UntrainedStructure(train, library)
+    reject_by_similarity = SimilarityBound(train, request.train[0], similarity)
     search = TestRobotSearch(request, train, factory, progress)
     targets = ", ".join(grammar.name for grammar in test_grammars)
     if not search.find(test_streams, reject_trained, reject_by_similarity):
@@ -130,7 +125,20 @@ def extrapolation(
     )
 
 
-class _SimilarityBound:
+class UntrainedStructure:
+    """Reject derivations that have the structure of a train robot."""
+
+    def __init__(self, train: Sequence[Candidate], library: Library) -> None:
+        self._library = library
+        self._names = {structure(each.derivation, library): each.name for each in reversed(train)}
+
+    def __call__(self, derivation: Derivation) -> str:
+        """Return the reason why a derivation is rejected; empty if it is accepted."""
+        twin = self._names.get(structure(derivation, self._library))
+        return f"the structure of train robot {twin}" if twin else ""
+
+
+class SimilarityBound:
     """Reject robots whose cosine to the nearest train robot violates the bound."""
 
     def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:

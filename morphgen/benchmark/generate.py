@@ -14,6 +14,7 @@ from morphgen.benchmark.robot_factory import (
     Progress,
     RobotFactory,
     SampledRecipe,
+    UnfitRobotError,
     members,
     numbered_name,
     stream_seed,
@@ -120,7 +121,19 @@ class TestRobotSearch:
         train: Sequence[Candidate],
         factory: RobotFactory,
         progress: Progress,
+        *,
+        skip_unfit: bool = False,
     ) -> None:
+        """Begin with no test robots.
+
+        Args:
+            request: Number of test robots.
+            train: Robots that no test robot may equal.
+            factory: Makes the robots.
+            progress: Receives the number of robots that are finished.
+            skip_unfit: Reject robots that cannot be members of a split, instead of raising.
+        """
+        self._skip_unfit = skip_unfit
         self._request, self._factory, self._progress = request, factory, progress
         self._num_train = len(train)
         self._name_by_hash = {robot.hash: robot.name for robot in train}
@@ -159,7 +172,13 @@ class TestRobotSearch:
         reason = reject_derivation(derivation) if derivation else "no end"
         if reason:
             return reason
-        robot = self._factory(stream.recipe(number))
+        try:
+            robot = self._factory(stream.recipe(number))
+        except UnfitRobotError as error:
+            if not self._skip_unfit:
+                raise
+            self._num_composed += 1
+            return error.reason
         # The robot comes from a later draw if the conditions of the grammar reject the first one.
         reason = reject_derivation(robot.derivation) or reject_robot(robot)
         if not reason and robot.hash in self._name_by_hash:

@@ -61,7 +61,7 @@ def interpolation(
     factory = RobotFactory(library.folders, max_links=request.max_links)
     recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
     train = make_robots(recipes, factory, jobs=jobs, progress=progress)
-    criterion = _StructureAndHull(train, request.train[0], hull, library)
+    criterion = StructureAndHull(train, request.train[0], hull, library)
     search = TestRobotSearch(request, train, factory, progress)
     if not search.find([test_stream], criterion):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
@@ -80,7 +80,7 @@ def interpolation(
     )
 
 
-class _StructureAndHull:
+class StructureAndHull:
     """Reject derivations of another structure, or on the wrong side of the convex hull."""
 
     def __init__(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,6 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
+from morphgen.benchmark.licences import licenced_parts
+from morphgen.benchmark.release_file import (
+    LICENCES_FILE,
+    RELEASE_FILE,
+    is_archive,
+    is_release,
+    opened_folder,
+    read_release,
+)
+from morphgen.benchmark.release_texts import licences_json
 from morphgen.benchmark.split import Member, Split, compose_member, sided_members, split_id
 from morphgen.benchmark.split_file import find_split, read_split_file
 from morphgen.benchmark.split_folder import (
@@ -34,6 +45,7 @@ from morphgen.benchmark.split_folder_files import (
 from morphgen.benchmark.split_folder_robots import differences, hashes, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.formats.data_files import read_text
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
@@ -58,6 +70,8 @@ class Verification:
     id: str
     """Id of the split, computed from its robots."""
     differences: tuple[Difference, ...]
+    content: str = ""
+    """For a release: SHA-256 of ``SHA256SUMS``, which lists all files."""
 
 
 def verify(
@@ -70,10 +84,11 @@ def verify(
     """Compare a split with the robots that its derivations give today.
 
     The id of the split and the hash of each robot are tested. In a split folder every file is
-    compared with ``SHA256SUMS`` and with the robot that its derivation gives, too.
+    compared with ``SHA256SUMS`` and with the robot that its derivation gives, too; in a release
+    also its description and its licences.
 
     Args:
-        name_or_path: Name or file of a split, or a split folder.
+        name_or_path: Name or file of a split, a split folder, or the archive of a release.
         library: The library of parts.
         jobs: Number of processes.
         progress: Receives the number of robots that are finished, and of all.
@@ -82,6 +97,9 @@ def verify(
         BenchmarkError: If the split does not exist or cannot be read.
     """
     folder = Path(name_or_path)
+    if is_archive(folder):
+        with opened_folder(folder) as unpacked:
+            return verify(unpacked, library, jobs=jobs, progress=progress)
     is_built = folder.is_dir()
     if is_built:
         require_split_folder(folder)
@@ -94,9 +112,12 @@ def verify(
         differences.append(Difference(str(path), why))
     if is_built:
         differences += _folder_differences(folder, split_file.split, library, jobs, progress)
+        if is_release(folder):
+            differences += _release_differences(folder, split_file.split, library)
     else:
         differences += compare_robots(split_file.split, library, jobs=jobs, progress=progress)
-    return Verification(split_file.split, computed_id, tuple(differences))
+    content = _sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
+    return Verification(split_file.split, computed_id, tuple(differences), content)
 
 
 def compare_robots(
@@ -210,6 +231,22 @@ def _file_differences(folder: Path) -> Iterator[Difference]:
         yield Difference(where, f"file {path} {why}")
 
 
+def _release_differences(folder: Path, split: Split, library: Library) -> Iterator[Difference]:
+    """Yield what the description and the licences of a release state otherwise than the split."""
+    try:
+        release = read_release(folder)
+        if (release.name, release.id) != (split.name, split_id(split)):
+            why = f"it is of split {release.name}, id {release.id}, not of {SPLIT_FILE}"
+            yield Difference(RELEASE_FILE, why)
+        expected = licences_json(licenced_parts(split, library))
+        if read_text(folder / LICENCES_FILE) != expected:
+            yield Difference(LICENCES_FILE, "its licences are not those of the parts")
+    except MorphgenError as error:
+        yield Difference(RELEASE_FILE, str(error))
+    except OSError as error:
+        yield Difference(LICENCES_FILE, f"cannot be read: {error.strerror}")
+
+
 def _record_differences(
     path: Path, split: Split, known: Mapping[str, RobotData]
 ) -> Iterator[Difference]:
@@ -258,3 +295,7 @@ def _token_differences(
             yield Difference(
                 name, f"{path.name}: {token_field.name} of link {link} is not the robot's"
             )
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

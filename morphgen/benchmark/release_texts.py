@@ -1,0 +1,232 @@
+"""The files of a release for readers: the dataset card ``README.md`` and ``LICENCES.md``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+
+import yaml
+from tabulate import tabulate
+
+from morphgen.benchmark.croissant import citation
+from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids, restricted
+from morphgen.benchmark.release_file import (
+    CROISSANT_FILE,
+    LICENCES_FILE,
+    LICENCES_TEXT,
+    RELEASE_FILE,
+    SCORES_FILE,
+    SUBMISSIONS_DIR,
+    Release,
+)
+from morphgen.benchmark.split import SIDES, Split
+from morphgen.benchmark.split_folder import (
+    ROBOTS_DIR,
+    ROBOTS_FILE,
+    SPLIT_FILE,
+    SUMS_FILE,
+    TOKENS_FILE,
+)
+
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
+"""Size categories of Hugging Face by their upper bound."""
+
+_CARD = """\
+# {name} {version}
+
+{summary}
+
+A split of robots for cross-embodiment learning ({regime}): train a policy on {train} robots, and
+test it on {test} that it has not seen. Made with morphgen {morphgen}; the split's id is `{id}`.
+
+| file | content |
+|---|---|
+{files}
+
+## Use it
+
+```
+morphgen split verify {folder}
+morphgen train {folder}
+morphgen eval runs/{name}/me-graph/seed0 --split {folder} --submission mine.json
+morphgen split score mine.json --split {folder}
+```
+
+Without morphgen: `datasets.load_dataset("json", data_files="{robots}")`,
+`mlcroissant.Dataset("{croissant}").records("robots")`, `numpy.load("{tokens}")`, and
+`sha256sum -c {sums}`.
+
+## Evaluation
+
+{evaluation}
+
+## Difficulty
+
+{difficulty}
+{private}
+## Licences
+
+{licences}
+
+## Citation
+
+{citation}
+"""
+
+
+def card_text(
+    split: Split, release: Release, parts: Sequence[LicencedPart], names: Iterable[str]
+) -> str:
+    """Return the dataset card: Markdown with the front matter that Hugging Face reads.
+
+    Args:
+        split: The split.
+        release: The release.
+        parts: The parts of its robots.
+        names: Paths of the release's files.
+    """
+    text = _CARD.format(
+        name=release.name,
+        version=release.version,
+        summary=split.summary or "(no summary)",
+        regime=split.regime,
+        train=len(split.train),
+        test=len(split.test),
+        morphgen=release.morphgen,
+        id=release.id,
+        files=_file_table(names),
+        folder=release.stem,
+        robots=ROBOTS_FILE,
+        croissant=CROISSANT_FILE,
+        tokens=TOKENS_FILE,
+        sums=SUMS_FILE,
+        evaluation=_evaluation(release),
+        difficulty=_difficulty(release),
+        private=_private(release),
+        licences=_licence_summary(parts),
+        citation=citation(split, release),
+    )
+    return f"---\n{_front_matter(split, release, parts)}---\n\n{text}"
+
+
+def licences_json(parts: Iterable[LicencedPart]) -> str:
+    """Return the text of ``licences.json``."""
+    return json.dumps([part.as_dict() for part in parts], indent=2, ensure_ascii=False) + "\n"
+
+
+def licences_text(parts: Sequence[LicencedPart]) -> str:
+    """Return the text of ``LICENCES.md``."""
+    lines = ["# Licences", "", _licence_summary(parts), ""]
+    for identifier in licence_ids(parts):
+        licence = find_licence(identifier)
+        limits = f" ({', '.join(licence.restrictions)})" if licence.restrictions else ""
+        heading = f"[{identifier}]({licence.url})" if licence.url else identifier
+        lines += [f"## {heading}{limits}", ""]
+        for part in parts:
+            if part.licence.id == identifier:
+                lines += _part_lines(part)
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _part_lines(part: LicencedPart) -> list[str]:
+    robots = [
+        f"{side}: {', '.join(names)}"
+        for side in SIDES
+        if (names := [name for each, name in part.robots if each == side])
+    ]
+    source = [f"  - source: {' '.join(part.citation.split())}"] if part.citation else []
+    return [f"- **{part.part}**", *source, f"  - robots: {'; '.join(robots)}"]
+
+
+def _front_matter(split: Split, release: Release, parts: Sequence[LicencedPart]) -> str:
+    ids = [find_licence(each).hub_id for each in licence_ids(parts)]
+    robots = len(split.train) + len(split.test)
+    tasks = sorted({member.task for side in SIDES for member in split.side(side)})
+    data = {
+        "pretty_name": f"{release.name} {release.version}",
+        "license": ids[0] if len(ids) == 1 else ids,
+        "task_categories": ["robotics", "reinforcement-learning"],
+        "tags": ["morphgen", "cross-embodiment", "croissant", split.regime, *tasks],
+        "size_categories": [next((name for n, name in _SIZES if robots < n), "n>100K")],
+        "configs": [
+            {"config_name": "robots", "data_files": [{"split": "robots", "path": ROBOTS_FILE}]}
+        ],
+    }
+    text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=10_000)
+    return text
+
+
+def _file_table(names: Iterable[str]) -> str:
+    known = {name.partition("/")[0] for name in names}
+    table = {
+        SPLIT_FILE: "the split: derivation, task and hash of every robot",
+        ROBOTS_FILE: "a line per robot: side, task, numbers of links and joints, reach, mass, path",
+        TOKENS_FILE: "tokens (n, max_links, 48) of the robots at home, with a mask",
+        ROBOTS_DIR: "a folder per robot with its URDF",
+        "goals": "goals and starts of every robot",
+        RELEASE_FILE: "version, evaluation and difficulty",
+        SCORES_FILE: "reference scores",
+        SUBMISSIONS_DIR: "submissions that reference scores were computed from",
+        f"{LICENCES_TEXT}, {LICENCES_FILE}": "every part with its licence, source and robots",
+        CROISSANT_FILE: "this dataset in Croissant 1.0",
+        SUMS_FILE: "SHA-256 of every file",
+    }
+    optional = ("goals", SCORES_FILE, SUBMISSIONS_DIR)
+    return "\n".join(
+        f"| `{name}` | {content} |"
+        for name, content in table.items()
+        if name not in optional or name in known
+    )
+
+
+def _evaluation(release: Release) -> str:
+    rules = release.evaluation
+    return (
+        f"Simulator `{rules['simulator']}`, {rules['episodes']} episodes per robot or more, seed "
+        f"{rules['seed']}, goals of seed {rules['goal_seed']}; the constants of the tasks are in "
+        f"`{RELEASE_FILE}`. A submission holds the outcome of every episode, and `morphgen split "
+        "score` computes scores and intervals from them."
+    )
+
+
+def _difficulty(release: Release) -> str:
+    cosine = release.difficulty.get("cosine")
+    if not cosine:
+        return "Not measured."
+    rows = [
+        (test, *(f"{each['train']} {each['value']:.3f}" for each in measures.values()))
+        for test, measures in release.difficulty["nearest"].items()
+    ]
+    measures = next(iter(release.difficulty["nearest"].values()))
+    headers = ("test robot", *(f"nearest by {name}" for name in measures))
+    low, high = cosine["min"], cosine["max"]
+    return (
+        f"Cosine similarity of test and train robots: {cosine['mean']:.2f} (from {low:.2f} to "
+        f"{high:.2f}).\n\n{tabulate(rows, headers, tablefmt='github')}"
+    )
+
+
+def _private(release: Release) -> str:
+    if release.private_test is None:
+        return ""
+    private = release.private_test
+    return (
+        "\n## Private test side\n\n"
+        f"{private.robots} more test robots were drawn from {', '.join(private.grammars)} with a "
+        f"secret. Its commitment is `{private.commitment}`. Once the secret is published, "
+        "`morphgen split reveal` draws the robots again and verifies them.\n"
+    )
+
+
+def _licence_summary(parts: Sequence[LicencedPart]) -> str:
+    limits = [
+        f"**{part.part} is {part.licence.id} ({', '.join(part.licence.restrictions)})**: robots "
+        f"{', '.join(dict.fromkeys(name for _, name in part.robots))}."
+        for part in restricted(parts)
+    ]
+    text = (
+        f"The parts of the robots are under {', '.join(licence_ids(parts))}. "
+        f"`{LICENCES_TEXT}` lists parts, sources and robots."
+    )
+    return "\n".join([text, *limits])
