@@ -39,6 +39,17 @@ Progress = Callable[[float, int], None]
 """Callback with the number of episodes done, where running ones are fractions, and their total."""
 
 
+Record = Callable[[EnvSpec, Side, Sequence[Episode], Sequence[Episode]], None]
+"""Callback with the specification of a robot, its side, its episodes, and those of the random
+policy, which begin alike."""
+
+
+def no_record(
+    spec: EnvSpec, side: Side, episodes: Sequence[Episode], random_episodes: Sequence[Episode]
+) -> None:
+    """Ignore the episodes."""
+
+
 def no_progress(done: float, total: int) -> None:
     """Ignore the progress."""
 
@@ -100,6 +111,7 @@ def evaluate_run(
     *,
     device: str = "cpu",
     progress: Progress = no_progress,
+    record: Record = no_record,
 ) -> list[Score]:
     """Evaluate a run on the robots of a side of its split, or on its one robot.
 
@@ -110,13 +122,16 @@ def evaluate_run(
         mode: Whether policies act by the mean of their actions, or sample them.
         device: Device of the networks.
         progress: Callback for the progress; for agents of single robots it starts again per robot.
+        record: Callback for the episodes of every robot.
 
     Raises:
         TaskError: If there is no checkpoint, or no such side.
     """
     files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(files, source, config, mode, device=device, progress=progress)
+    return evaluate_checkpoints(
+        files, source, config, mode, device=device, progress=progress, record=record
+    )
 
 
 def evaluate_checkpoints(
@@ -127,6 +142,7 @@ def evaluate_checkpoints(
     *,
     device: str = "cpu",
     progress: Progress = no_progress,
+    record: Record = no_record,
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 
@@ -145,10 +161,10 @@ def evaluate_checkpoints(
         scores: list[Score] = []
         for policy, trained_on in zip(trained, sources, strict=True):
             robot = replace(source, member=trained_on.member)
-            scores += _evaluate_together([policy], robot, config, mode, device, progress)
+            scores += _evaluate_together([policy], robot, config, mode, device, progress, record)
         return scores
     _require_same_interface(paths, [run for run, _ in trained])
-    return _evaluate_together(trained, source, config, mode, device, progress)
+    return _evaluate_together(trained, source, config, mode, device, progress, record)
 
 
 def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:
@@ -184,6 +200,7 @@ def _evaluate_together(
     mode: Mode,
     device: str,
     progress: Progress,
+    record: Record,
 ) -> list[Score]:
     """Evaluate policies on the same robots; scores are means over the episodes of all policies."""
 
@@ -192,11 +209,16 @@ def _evaluate_together(
 
     controllers = [partial(make, learner) for _, learner in trained]
     interface = trained[0][0].interface
-    return evaluate(controllers, source, config, interface, progress=progress)
+    return evaluate(controllers, source, config, interface, progress=progress, record=record)
 
 
 def evaluate_baseline(
-    name: str, source: RobotSource, config: EvalConfig, *, progress: Progress = no_progress
+    name: str,
+    source: RobotSource,
+    config: EvalConfig,
+    *,
+    progress: Progress = no_progress,
+    record: Record = no_record,
 ) -> list[Score]:
     """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out.
 
@@ -205,7 +227,15 @@ def evaluate_baseline(
     """
     baseline = BASELINES[name]
     make = partial(baseline.make, config.seed)
-    return evaluate([make], source, config, Interface(), tasks=baseline.tasks, progress=progress)
+    return evaluate(
+        [make],
+        source,
+        config,
+        Interface(),
+        tasks=baseline.tasks,
+        progress=progress,
+        record=record,
+    )
 
 
 def evaluate(
@@ -216,6 +246,7 @@ def evaluate(
     *,
     tasks: Sequence[str] | None = None,
     progress: Progress = no_progress,
+    record: Record = no_record,
 ) -> list[Score]:
     """Return the scores of the robots of a source, in order.
 
@@ -228,6 +259,7 @@ def evaluate(
         interface: Actions and observations of the controllers.
         tasks: Tasks to evaluate; robots with other tasks are left out. None for all tasks.
         progress: Callback for the progress of the controllers, without the random policy.
+        record: Callback for the episodes of every robot.
 
     Raises:
         TaskError: If no robot has one of the tasks.
@@ -252,12 +284,11 @@ def evaluate(
     if key not in _random_cache:
         make_random = partial(Random, config.seed)
         _random_cache[key] = _run_all(make_random, specs, config, Interface(), library)
-    return [
-        _score(spec, source.side, robot_episodes, random_episodes)
-        for spec, robot_episodes, random_episodes in zip(
-            specs, episodes, _random_cache[key], strict=True
-        )
-    ]
+    scores: list[Score] = []
+    for spec, own, of_random in zip(specs, episodes, _random_cache[key], strict=True):
+        record(spec, source.side, own, of_random)
+        scores.append(_score(spec, source.side, own, of_random))
+    return scores
 
 
 _random_cache: dict[object, list[list[Episode]]] = {}

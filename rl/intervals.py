@@ -6,7 +6,7 @@ After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the stati
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ from scipy.stats import binomtest, bootstrap, trim_mean
 LEVEL = 0.95
 """Confidence level of the intervals."""
 RESAMPLES = 2000
+MAX_RESAMPLED = 2**26
+"""Largest number of values that are resampled at once: 512 MB."""
 TRIM = 0.25
 """Fraction that the interquartile mean leaves out at each end."""
 
@@ -45,6 +47,27 @@ def mean_interval(samples: ArrayLike) -> Interval:
     if len(values) < 2:
         return Interval(mean, math.nan, math.nan)
     return _interval(mean, (values,), np.mean, paired=False)
+
+
+def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
+    """Return the mean of the strata's means, with a bootstrap that resamples every stratum.
+
+    Args:
+        strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
+
+    Raises:
+        ValueError: If a stratum has no samples.
+    """
+    tables = tuple(_table(samples, 1) for samples in strata)
+    mean = float(np.mean([table.mean() for table in tables]))
+    if min(len(table) for table in tables) < 2:
+        return Interval(mean, math.nan, math.nan)
+
+    def statistic(*samples: NDArray[Any], axis: int = -1) -> NDArray[Any]:
+        values: NDArray[Any] = np.mean([sample.mean(axis=axis) for sample in samples], axis=0)
+        return values
+
+    return _interval(mean, tables, statistic, paired=False)
 
 
 def wilson_interval(successes: int, trials: int) -> Interval:
@@ -92,12 +115,14 @@ def _interval(
 ) -> Interval:
     if all(np.ptp(sample) == 0 for sample in samples):
         return Interval(value, value, value)
+    num_values = sum(len(sample) for sample in samples)
     interval = bootstrap(
         samples,
         statistic,
         paired=paired,
         vectorized=True,
         n_resamples=RESAMPLES,
+        batch=min(RESAMPLES, max(1, MAX_RESAMPLED // num_values)),
         confidence_level=LEVEL,
         method="percentile",
         random_state=np.random.default_rng(0),

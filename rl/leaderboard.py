@@ -1,0 +1,146 @@
+"""Scores of submissions with their intervals, computed from the episodes, and their ranking."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from tabulate import tabulate
+
+from morphgen.benchmark.split import SIDES, Side
+from morphgen.formats.records import FiniteNumber, Record
+from morphgen.rl.eval_report import SIDES as SIDE_NAMES
+from morphgen.rl.intervals import stratified_mean_interval
+from morphgen.rl.scores import finite_or_none
+from morphgen.rl.submission import RobotOutcomes, Submission
+from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
+
+Source = Literal["submission", "reference", "study"]
+RandomScores = Mapping[tuple[Side, str], Sequence[float]]
+"""Scores of the random policy's episodes, by side and name of the robot."""
+
+
+class SideScore(Record, frozen=True):
+    """Mean result over the robots of a side that do one task."""
+
+    side: Side
+    task: str
+    robots: int
+    score: FiniteNumber
+    """Mean score, relative to the random policy where the task wants it."""
+    success: FiniteNumber
+    """Mean success rate, 0 to 1."""
+    low: FiniteNumber | None = None
+    """Lower end of the 95% bootstrap interval of ``score``; None if it is not known."""
+    high: FiniteNumber | None = None
+    """Upper end of the interval."""
+
+
+class Row(Record, frozen=True):
+    """A method in a ranking."""
+
+    method: str
+    source: Source
+    """``submission``; ``reference``, a submission in a release; or ``study``, its stored scores."""
+    mode: str
+    seeds: tuple[int, ...]
+    """Seeds of the training; empty for a baseline."""
+    episodes: int
+    """Episodes per robot."""
+    sides: tuple[SideScore, ...]
+
+    def group(self, side: Side, task: str) -> SideScore | None:
+        """Return the result of a side at a task."""
+        return next((s for s in self.sides if (s.side, s.task) == (side, task)), None)
+
+
+def score_submission(
+    submission: Submission, random: RandomScores | None = None, source: Source = "submission"
+) -> Row:
+    """Compute the scores of a submission that was checked.
+
+    Args:
+        submission: The submission.
+        random: Scores of the random policy; by default those in the submission.
+        source: Source of the row.
+    """
+    groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
+    for side in SIDES:
+        for outcomes in submission.robots:
+            if outcomes.side == side:
+                groups.setdefault((side, outcomes.task), []).append(outcomes)
+    sides = []
+    for (side, task), robots in groups.items():
+        interval = stratified_mean_interval([_relative(each, random) for each in robots])
+        success = float(np.mean([np.mean(each.success) for each in robots]))
+        ends = finite_or_none((interval.low, interval.high))
+        sides.append(SideScore(side, task, len(robots), interval.value, success, *ends))
+    seed = submission.training_seed
+    return Row(
+        submission.method,
+        source,
+        submission.mode,
+        () if seed is None else (seed,),
+        min(len(each.score) for each in submission.robots),
+        tuple(sides),
+    )
+
+
+def random_scores(submission: Submission) -> RandomScores:
+    """Return the scores of the random policy's episodes in a submission."""
+    return {(each.side, each.robot): each.random_score for each in submission.robots}
+
+
+def _relative(outcomes: RobotOutcomes, random: RandomScores | None) -> Array:
+    scores = np.array(outcomes.score)
+    if not TASKS[outcomes.task].relative_to_random:
+        return scores
+    own = (random or {}).get((outcomes.side, outcomes.robot), outcomes.random_score)
+    relative: Array = scores - np.resize(np.array(own), len(scores))
+    return relative
+
+
+def ranked(rows: Sequence[Row]) -> list[Row]:
+    """Return rows by their result on the test robots, the best first.
+
+    It is the mean score if the test robots have one task; scores of different tasks cannot be
+    added, so with several tasks it is the mean success rate. Rows without test robots come last.
+    """
+
+    def result(row: Row) -> float:
+        test = [side for side in row.sides if side.side == "test"]
+        if not test:
+            return -math.inf
+        if len(test) == 1:
+            return test[0].score
+        robots = sum(side.robots for side in test)
+        return sum(side.success * side.robots for side in test) / robots
+
+    return sorted(rows, key=result, reverse=True)
+
+
+def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
+    """Return the ranking as a table; ``style`` is one of tabulate's."""
+    pairs = {(side.side, side.task): None for row in rows for side in row.sides}
+    groups = sorted(pairs, key=lambda pair: (pair[0] != "test", pair[1]))
+    headers = ["rank", "method", "from", "seeds"]
+    for side, task in groups:
+        headers += [f"{SIDE_NAMES[side]} {task}", "95%", "success"]
+    lines = []
+    for rank, row in enumerate(ranked(rows), 1):
+        name = f"{row.method} ({row.mode})" if row.mode == "stochastic" else row.method
+        cells = [str(rank), name, row.source, ", ".join(map(str, row.seeds)) or "-"]
+        for side, task in groups:
+            cells += _cells(row.group(side, task))
+        lines.append([*cells, str(row.episodes)])
+    return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
+
+
+def _cells(score: SideScore | None) -> list[str]:
+    if score is None:
+        return ["-", "", ""]
+    interval = "" if score.low is None else f"{score.low:.1f} to {score.high:.1f}"
+    return [f"{score.score:.1f}", interval, f"{score.success:.0%}"]

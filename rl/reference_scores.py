@@ -1,0 +1,249 @@
+"""Reference scores of a release: of submissions, which it holds, and of cells of studies."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from morphgen.benchmark.release_file import SCORES_FILE, SUBMISSIONS_DIR
+from morphgen.benchmark.split import SIDES, Split, split_id
+from morphgen.benchmark.split_file import parse_split
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError
+from morphgen.formats.data_files import read_json
+from morphgen.formats.records import Record, read_record
+from morphgen.grammar.library import Library
+from morphgen.rl.aliases import renamed
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.leaderboard import Row, SideScore, random_scores, score_submission
+from morphgen.rl.robot_source import RobotSource
+from morphgen.rl.scores import Score, finite_or_none, score_from_json
+from morphgen.rl.study import SCORES
+from morphgen.rl.submission import (
+    Submission,
+    is_submission,
+    read_submission,
+    submission_text,
+)
+from morphgen.rl.submission_checks import check_submission, require_rules
+from morphgen.tasks.env_specs import GoalConfig, task_configs
+from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
+from morphgen.tasks.registry import TASKS
+
+FORMAT = 1
+RANDOM = "random"
+"""Method whose episodes all scores of a release are relative to."""
+
+
+class _ScoresFile(Record, frozen=True):
+    """The content of ``scores.json``: rows of methods whose episodes the release does not hold."""
+
+    format: int
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """The reference scores of a release."""
+
+    rows: tuple[Row, ...] = ()
+    """Rows of studies."""
+    submissions: tuple[Submission, ...] = ()
+
+    @property
+    def random(self) -> Submission | None:
+        """The submission of the random policy, if the release holds one."""
+        return next((each for each in self.submissions if each.method == RANDOM), None)
+
+    def all_rows(self) -> list[Row]:
+        """Return the scores of the submissions, and the rows of other runs in studies."""
+        random = random_scores(self.random) if self.random else None
+        scored = [score_submission(each, random, "reference") for each in self.submissions]
+        known = {(row.method, row.mode, row.seeds) for row in scored}
+        others = (row for row in self.rows if (row.method, row.mode, row.seeds) not in known)
+        return [*scored, *others]
+
+
+def reference_files(
+    paths: Sequence[Path],
+    split: Split,
+    protocol: EvalProtocol,
+    library: Library,
+    *,
+    jobs: int = 1,
+) -> dict[str, bytes]:
+    """Return the files of a release with reference scores, by path.
+
+    Args:
+        paths: Submissions, files ``scores.json`` of studies, and folders of such files.
+        split: The split.
+        protocol: Rules of the evaluation, which all scores must follow.
+        library: The library of parts.
+        jobs: Number of processes.
+
+    Raises:
+        BenchmarkError: If a file is malformed, breaks a rule, or nothing there is of this split.
+    """
+    submissions: dict[str, Submission] = {}
+    cells: list[_Cell] = []
+    expected = None
+    for path in paths:
+        found = list(_files_below(path))
+        before = len(submissions) + len(cells)
+        for file, data in found:
+            if not is_submission(data):
+                cells += _cells(file, data, split, protocol)
+                continue
+            submission = read_submission(file)
+            if submission.split.id != split_id(split) and file != path:
+                continue
+            expected = expected or expected_robots(split, protocol, library, jobs=jobs)
+            check_submission(submission, str(file), split, protocol, expected, version("morphgen"))
+            name = f"{SUBMISSIONS_DIR}/{_file_name(submission)}"
+            if name in submissions and submissions[name] != submission:
+                raise BenchmarkError(f"{file}: another submission of {submission.method} is there")
+            submissions[name] = submission
+        if len(submissions) + len(cells) == before:
+            raise BenchmarkError(f"{path}: no scores of split {split.name}, id {split_id(split)}")
+    # Sorted, so that the order of the paths does not change the files.
+    submissions = dict(sorted(submissions.items()))
+    files = {name: submission_text(each).encode() for name, each in submissions.items()}
+    rows = sorted(_rows(cells), key=lambda row: (row.method, row.mode))
+    references = References(tuple(rows), tuple(submissions.values()))
+    data = {
+        "format": FORMAT,
+        "rows": msgspec.to_builtins(rows),
+        "of_submissions": msgspec.to_builtins(references.all_rows()[: len(submissions)]),
+    }
+    return files | {SCORES_FILE: (json.dumps(data, indent=2) + "\n").encode()}
+
+
+def read_references(folder: Path) -> References:
+    """Read the reference scores of a release; they were checked when it was made.
+
+    Raises:
+        BenchmarkError: If a file is malformed.
+    """
+    path = folder / SCORES_FILE
+    if not path.is_file():
+        return References()
+    try:
+        data = read_json(path)
+    except (OSError, FormatError) as error:
+        raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+    if isinstance(data, dict):
+        data.pop("of_submissions", None)  # for readers: they are computed again
+    stored = read_record(data, _ScoresFile, str(path), BenchmarkError)
+    files = sorted((folder / SUBMISSIONS_DIR).glob("*.json"))
+    return References(stored.rows, tuple(read_submission(file) for file in files))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """The scores of a cell of a study in one mode."""
+
+    file: Path
+    method: str
+    mode: str
+    seed: int | None
+    scores: tuple[Score, ...]
+
+
+def _files_below(path: Path) -> Iterator[tuple[Path, Any]]:
+    """Yield a JSON file, or the submissions and scores of studies below a folder."""
+    if path.is_dir():
+        files = sorted({*path.rglob(SCORES), *path.glob("*.json")})
+    elif path.is_file():
+        files = [path]
+    else:
+        raise BenchmarkError(f"{path}: no such file or folder")
+    for file in files:
+        try:
+            data = read_json(file)
+        except (OSError, FormatError) as error:
+            raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        if file == path or is_submission(data) or file.name == SCORES:
+            yield file, data
+
+
+def _cells(
+    file: Path,
+    data: Any,  # noqa: ANN401
+    split: Split,
+    protocol: EvalProtocol,
+) -> Iterator[_Cell]:
+    """Yield the scores of a cell by mode; nothing if it is of another split."""
+    try:
+        table = renamed("scores", data)
+        source = RobotSource(**renamed("source", table["source"]))
+        if not source.split or split_id(parse_split(source.split, file).split) != split_id(split):
+            return
+        rules = table["eval"]
+        constants = {name: values for name, values in rules.items() if name in TASKS}
+        goals = GoalConfig(source.goal_seed, task_configs(constants))
+        found = EvalProtocol(rules["sim"], rules["episodes"], rules["seed"], goals)
+        scores = {
+            mode: tuple(score_from_json(record) for record in records)
+            for mode, records in table["scores"].items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, MorphgenError) as error:
+        raise BenchmarkError(
+            f"{file}: neither a submission nor the scores of a study's cell: {error!r}"
+        ) from error
+    require_rules(found.as_data(split), protocol.as_data(split), str(file))
+    parent = file.parent.name
+    is_seed = parent.removeprefix("seed").isdecimal() and parent.startswith("seed")
+    seed = int(parent.removeprefix("seed")) if is_seed else None
+    method = file.parent.parent.name if is_seed else parent
+    for mode, records in scores.items():
+        yield _Cell(file, method, "" if mode in BASELINES else mode, seed, records)
+
+
+def _rows(cells: Sequence[_Cell]) -> list[Row]:
+    """Return a row per method and mode: means over seeds and robots."""
+    groups: dict[tuple[str, str], dict[int | None, _Cell]] = {}
+    for cell in cells:
+        group = groups.setdefault((cell.method, cell.mode), {})
+        other = group.setdefault(cell.seed, cell)
+        if other.scores != cell.scores:
+            raise BenchmarkError(f"{cell.file}: other scores of the same run are in {other.file}")
+    rows = []
+    for (method, mode), group in groups.items():
+        scores = [score for cell in group.values() for score in cell.scores]
+        pairs = {(s.side, s.task): None for side in SIDES for s in scores if s.side == side}
+        sides = []
+        for side, task in pairs:
+            own = [score for score in scores if (score.side, score.task) == (side, task)]
+            # With one robot and one seed, its interval over episodes is that of the side.
+            ends = finite_or_none((own[0].low, own[0].high)) if len(own) == 1 else (None, None)
+            sides.append(
+                SideScore(
+                    side,
+                    task,
+                    len({score.robot for score in own}),
+                    float(np.mean([score.score for score in own])),
+                    float(np.mean([score.success for score in own])),
+                    *ends,
+                )
+            )
+        seeds = tuple(sorted(seed for seed in group if seed is not None))
+        episodes = min(score.episodes for score in scores)
+        rows.append(Row(method, "study", mode, seeds, episodes, tuple(sides)))
+    return rows
+
+
+def _file_name(submission: Submission) -> str:
+    """Return a file name of letters, digits and a few signs."""
+    words = [submission.method]
+    if submission.mode == "stochastic":
+        words.append(submission.mode)
+    if submission.training_seed is not None:
+        words.append(f"seed{submission.training_seed}")
+    return re.sub(r"[^A-Za-z0-9+_-]", "_", "-".join(words)) + ".json"

@@ -1,0 +1,170 @@
+"""Check that a submission holds valid episodes of every robot of a split, under given rules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from morphgen.benchmark.split import Split, split_id
+from morphgen.errors import BenchmarkError
+from morphgen.rl.submission import RobotOutcomes, Submission
+from morphgen.tasks.eval_protocol import EvalProtocol, ExpectedRobot
+from morphgen.tasks.registry import TASKS
+
+LISTS = ("success", "score", "distance", "steps", "diverged")
+"""Lists of a robot with an entry per episode of the policy."""
+MAX_EPISODES = 10_000
+"""Largest number of episodes of a robot."""
+MAX_DISTANCE = 1e3
+"""Largest distance from success [m]."""
+
+
+def check_submission(
+    submission: Submission,
+    where: str,
+    split: Split,
+    protocol: EvalProtocol,
+    expected: Sequence[ExpectedRobot],
+    version: str,
+) -> None:
+    """Check all that a submission claims.
+
+    Args:
+        submission: The submission.
+        where: Its file, for messages.
+        split: The split.
+        protocol: Rules of the evaluation.
+        expected: What it must hold for every member, see ``expected_robots``.
+        version: Version of morphgen that it must come from, up to the last number.
+
+    Raises:
+        BenchmarkError: At the first fault; the message names robot and field.
+    """
+    _check_head(submission, where, split, protocol, version)
+    wanted = {(each.side, each.member.name): each for each in expected}
+    seen: set[tuple[str, str]] = set()
+    for outcomes in submission.robots:
+        key = (outcomes.side, outcomes.robot)
+        at = f"{where}: {outcomes.side} robot {outcomes.robot}"
+        if key not in wanted:
+            raise BenchmarkError(f"{at}: the split has no such robot")
+        if key in seen:
+            raise BenchmarkError(f"{at}: is there twice; expected once")
+        seen.add(key)
+        _check_robot(outcomes, at, wanted[key], protocol)
+    sides = {side for side, _ in seen} | {"test"}
+    for side, name in wanted:
+        if side in sides and (side, name) not in seen:
+            raise BenchmarkError(
+                f"{where}: {side} robot {name}: is missing; expected all robots of the side"
+            )
+
+
+def require_rules(found: Mapping[str, Any], rules: Mapping[str, Any], where: str) -> None:
+    """Require that an evaluation followed the rules of a protocol.
+
+    Args:
+        found: Rules of the evaluation, see ``EvalProtocol.as_data``.
+        rules: Those that it must follow; it may have more episodes.
+        where: The file, for messages.
+
+    Raises:
+        BenchmarkError: If a rule differs.
+    """
+    for key in ("simulator", "seed", "goal_seed"):
+        if found.get(key) != rules[key]:
+            raise BenchmarkError(
+                f"{where}: evaluation.{key}: {found.get(key)!r}; expected {rules[key]!r}"
+            )
+    constants = found.get("constants")
+    for task, values in rules["constants"].items():
+        own = constants.get(task) if isinstance(constants, Mapping) else None
+        for name, value in values.items():
+            given = own.get(name) if isinstance(own, Mapping) else None
+            if given != value:
+                raise BenchmarkError(
+                    f"{where}: evaluation.constants.{task}.{name}: {given!r}; expected {value!r}"
+                )
+    episodes = found.get("episodes")
+    if type(episodes) is not int or episodes < rules["episodes"]:
+        raise BenchmarkError(
+            f"{where}: evaluation.episodes: {episodes!r}; expected {rules['episodes']} or more"
+        )
+
+
+def _check_head(
+    submission: Submission, where: str, split: Split, protocol: EvalProtocol, version: str
+) -> None:
+    expected_id = split_id(split)
+    if submission.split.id != expected_id:
+        raise BenchmarkError(
+            f"{where}: split.id: {submission.split.id} ({submission.split.name}); expected "
+            f"{expected_id} ({split.name})"
+        )
+    if _series(submission.morphgen) != _series(version):
+        raise BenchmarkError(
+            f"{where}: morphgen: {submission.morphgen}; scores are compared with those of version "
+            f"{_series(version)}"
+        )
+    require_rules(submission.evaluation, protocol.as_data(split), where)
+
+
+def _series(version: str) -> str:
+    """Return a version without its last number: episodes are the same within a series."""
+    return ".".join(version.split(".")[:2])
+
+
+def _check_robot(
+    outcomes: RobotOutcomes, at: str, expected: ExpectedRobot, protocol: EvalProtocol
+) -> None:
+    member = expected.member
+    for key, found, wanted in (
+        ("task", outcomes.task, member.task),
+        ("body", outcomes.body, member.robot_hash),
+        ("goal_set", outcomes.goal_set, expected.goal_set),
+    ):
+        if found != wanted:
+            raise BenchmarkError(f"{at}: {key}: {found}; expected {wanted}")
+    count = len(outcomes.score)
+    if not protocol.episodes <= count <= MAX_EPISODES:
+        raise BenchmarkError(
+            f"{at}: score: {count} episodes; expected {protocol.episodes} to {MAX_EPISODES}"
+        )
+    for name in LISTS:
+        if len(getattr(outcomes, name)) != count:
+            raise BenchmarkError(
+                f"{at}: {name}: {len(getattr(outcomes, name))} episodes; expected {count}, as in "
+                "score"
+            )
+    random_count = len(outcomes.random_score)
+    if random_count < protocol.episodes or len(outcomes.random_success) != random_count:
+        raise BenchmarkError(
+            f"{at}: random_score: {random_count} episodes, random_success: "
+            f"{len(outcomes.random_success)}; expected {protocol.episodes} or more, as many of both"
+        )
+    _check_episodes(outcomes, at, expected, protocol)
+
+
+def _check_episodes(
+    outcomes: RobotOutcomes, at: str, expected: ExpectedRobot, protocol: EvalProtocol
+) -> None:
+    task = TASKS[expected.member.task]
+    config = protocol.goals.task_config(expected.member.task)
+    low, high = task.score_range(config, expected.reach)
+    for name in ("score", "random_score"):
+        for i, score in enumerate(getattr(outcomes, name)):
+            if not low <= score <= high:
+                raise BenchmarkError(f"{at}: {name}[{i}]: {score:g}; expected {low:g} to {high:g}")
+    rows = zip(*(getattr(outcomes, name) for name in LISTS), strict=True)
+    for i, (success, score, distance, steps, diverged) in enumerate(rows):
+        fault = ""
+        if not 1 <= steps <= config.max_episode_steps:
+            fault = f"steps[{i}]: {steps}; expected 1 to {config.max_episode_steps}"
+        elif not 0 <= distance <= MAX_DISTANCE:
+            fault = f"distance[{i}]: {distance:g}; expected 0 to {MAX_DISTANCE:g}"
+        elif diverged and success:
+            fault = f"success[{i}]: true in an episode that diverged; expected false"
+        elif not diverged and (why := task.outcome_fault(config, success, score, distance)):
+            fault = f"episode {i}: {why}"
+        if fault:
+            raise BenchmarkError(f"{at}: {fault}")

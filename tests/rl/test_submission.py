@@ -1,0 +1,307 @@
+"""Submissions: their file, every check, scores, ranking and references."""
+
+import copy
+import json
+import math
+
+import numpy as np
+import pytest
+
+from helpers.runs import small_source, small_split
+from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, VERSION, data
+from morphgen.benchmark.split import split_id
+from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.formats.records import read_record
+from morphgen.grammar.library import default_library
+from morphgen.rl import reference_scores
+from morphgen.rl.intervals import mean_interval, stratified_mean_interval
+from morphgen.rl.leaderboard import (
+    Row,
+    SideScore,
+    random_scores,
+    ranked,
+    ranking_table,
+    score_submission,
+)
+from morphgen.rl.reference_scores import read_references, reference_files
+from morphgen.rl.submission import Submission, read_submission, submission_text
+from morphgen.rl.submission_checks import check_submission
+from morphgen.tasks.eval_protocol import EvalProtocol, protocol_from
+
+LIBRARY = default_library()
+TEST = -1
+"""Index of the test robot."""
+
+
+def submission(values=None, **more):
+    return read_record(values or data(**more), Submission, "s.json", BenchmarkError)
+
+
+def check(values):
+    check_submission(submission(values), "s.json", SPLIT, PROTOCOL, EXPECTED, VERSION)
+
+
+def test_a_valid_submission_passes():
+    check(data())
+    only_test = data()
+    only_test["robots"] = only_test["robots"][TEST:]
+    check(only_test)
+    check(data(episodes=9))
+    check({**data(), "morphgen": "0.7.9"})
+
+
+def test_a_submission_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / "s.json"
+    path.write_text(submission_text(submission()))
+    assert read_submission(path) == submission()
+    assert json.loads(path.read_text()) == data()
+
+
+def changed(*keys, value):
+    """Return the data of a submission with another value at a path of keys."""
+    values = copy.deepcopy(data())
+    entry = values
+    for key in keys[:-1]:
+        entry = entry[key]
+    entry[keys[-1]] = value
+    return values
+
+
+FAULTS = {
+    "split": (("split", "id"), "0" * 32, f"split.id: {'0' * 32} (mine/small); expected"),
+    "version": (("morphgen",), "0.6.9", "morphgen: 0.6.9; scores are compared with those of"),
+    "simulator": (("evaluation", "simulator"), "pybullet", "evaluation.simulator: 'pybullet'"),
+    "seed": (("evaluation", "seed"), 3, "evaluation.seed: 3; expected 0"),
+    "episodes": (("evaluation", "episodes"), 3, "evaluation.episodes: 3; expected 4 or more"),
+    "constant": (
+        ("evaluation", "constants", "reach", "near"),
+        0.3,
+        "evaluation.constants.reach.near: 0.3; expected 0.03",
+    ),
+    "constants": (("evaluation", "constants"), [], "evaluation.constants.reach.steps: None"),
+    "robot": (("robots", TEST, "robot"), "other", "test robot other: the split has no such robot"),
+    "side": (("robots", TEST, "side"), "train", "train robot gantry-plane: the split has no such"),
+    "task": (("robots", TEST, "task"), "push", "task: push; expected reach"),
+    "body": (("robots", TEST, "body"), "0" * 32, f"body: {'0' * 32}; expected"),
+    "goals": (("robots", TEST, "goal_set"), "0", "goal_set: 0; expected"),
+    "few": (("robots", TEST, "score"), [1.0], "score: 1 episodes; expected 4 to 10000"),
+    "length": (("robots", TEST, "steps"), [300] * 3, "steps: 3 episodes; expected 4, as in score"),
+    "random": (("robots", TEST, "random_score"), [0.0], "random_score: 1 episodes, random_success"),
+    "high": (("robots", TEST, "score", 2), 200.5, "score[2]: 200.5; expected -"),
+    "low": (("robots", TEST, "random_score", 1), -1e9, "random_score[1]: -1e+09; expected -"),
+    "steps": (("robots", TEST, "steps", 0), 301, "steps[0]: 301; expected 1 to 300"),
+    "distance": (("robots", TEST, "distance", 3), -0.1, "distance[3]: -0.1; expected 0 to 1000"),
+    "success": (("robots", TEST, "success", 3), True, "episode 3: success at a distance of 0.2 m"),
+    "failure": (("robots", TEST, "success", 0), False, "episode 0: no success at a distance of"),
+    "diverged": (("robots", TEST, "diverged", 0), True, "success[0]: true in an episode that"),
+}
+
+
+@pytest.mark.parametrize(("keys", "value", "why"), FAULTS.values(), ids=FAULTS)
+def test_every_fault_is_named_with_robot_and_field(keys, value, why):
+    with pytest.raises(BenchmarkError) as caught:
+        check(changed(*keys, value=value))
+    text = str(caught.value)
+    assert why in text
+    assert text.startswith("s.json: ")
+    if keys[0] == "robots" and keys[-1] not in ("robot", "side"):
+        assert text.startswith("s.json: test robot gantry-plane: ")
+    assert "\n" not in text
+
+
+def test_missing_and_repeated_robots_are_named():
+    values = data()
+    first, second, test = values["robots"]
+    for robots, why in (
+        ([first, second], "test robot gantry-plane: is missing"),
+        ([first, test], "train robot gantry-cube: is missing"),
+        ([first, second, test, test], "test robot gantry-plane: is there twice"),
+        ([], "test robot gantry-plane: is missing"),
+    ):
+        with pytest.raises(BenchmarkError, match=why):
+            check({**values, "robots": robots})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"format": 2}, "format 2; this version reads 1"),
+        ({"kind": "other"}, "no submission; expected an object with the kind"),
+        ({"extra": 1}, "unknown key 'extra'"),
+        ({"method": "a\nb"}, "expected printable characters"),
+        ({"mode": "best"}, "mode: unknown value 'best'"),
+        ({"robots": [{"robot": "a"}]}, "robots[0]: missing key 'side'"),
+    ],
+)
+def test_malformed_submissions_are_refused(tmp_path, change, why):
+    path = tmp_path / "s.json"
+    path.write_text(json.dumps(data() | change))
+    with pytest.raises(BenchmarkError) as caught:
+        read_submission(path)
+    assert why in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, "1", None, 1e13])
+def test_numbers_must_be_finite(tmp_path, value):
+    path = tmp_path / "s.json"
+    path.write_text(json.dumps(changed("robots", TEST, "score", 1, value=value)))
+    with pytest.raises(BenchmarkError, match=r"robots\[2\]\.score\[1\]: "):
+        read_submission(path)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", "[" * 1000, "\xff"])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "s.json"
+    path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(BenchmarkError, match=r"s\.json"):
+        read_submission(path)
+    with pytest.raises(BenchmarkError, match="no such file"):
+        read_submission(tmp_path / "other.json")
+
+
+def test_scores_are_computed_from_the_episodes():
+    row = score_submission(submission())
+    assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
+    assert [(each.side, each.task, each.robots) for each in row.sides] == [
+        ("train", "reach", 2),
+        ("test", "reach", 1),
+    ]
+    test = row.group("test", "reach")
+    relative = np.array([150, 151, 152, -1]) + 2
+    assert (test.score, test.success) == (relative.mean(), 0.75)
+    interval = mean_interval(relative)
+    assert (test.low, test.high) == (interval.low, interval.high)
+    train = row.group("train", "reach")
+    assert train.score == relative.mean()
+    assert test.high - test.low > train.high - train.low > 0
+
+
+def test_the_random_scores_of_a_release_replace_those_of_a_submission():
+    forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
+    check(forged)
+    assert score_submission(submission(forged)).group("test", "reach").score > 600
+    random = random_scores(submission())
+    fair = score_submission(submission(forged), random)
+    assert fair.sides == score_submission(submission()).sides
+
+
+def test_the_stratified_interval_is_that_of_the_mean_for_one_stratum():
+    samples = np.random.default_rng(0).normal(size=40)
+    assert stratified_mean_interval([samples]) == mean_interval(samples)
+    two = stratified_mean_interval([samples, samples + 2])
+    assert two.value == pytest.approx(samples.mean() + 1)
+    assert math.isnan(stratified_mean_interval([samples, [1.0]]).low)
+
+
+def row(method, *sides):
+    return Row(method, "study", "", (), 34, tuple(SideScore(*side) for side in sides))
+
+
+def test_rows_are_ranked_by_the_test_robots():
+    rows = [
+        row("low", ("test", "reach", 1, 10.0, 0.5), ("train", "reach", 9, 99.0, 1.0)),
+        row("high", ("test", "reach", 1, 20.0, 0.1)),
+        row("none", ("train", "reach", 9, 99.0, 1.0)),
+    ]
+    assert [each.method for each in ranked(rows)] == ["high", "low", "none"]
+    mixed = [
+        row("a", ("test", "reach", 1, 90.0, 0.5), ("test", "push", 3, 0.1, 0.1)),
+        row("b", ("test", "reach", 1, 10.0, 0.3), ("test", "push", 3, 0.9, 0.9)),
+    ]
+    assert [each.method for each in ranked(mixed)] == ["b", "a"]
+    header, _, first, *_ = ranking_table(rows).splitlines()
+    assert header.split()[:4] == ["rank", "method", "from", "seeds"]
+    assert first.split()[:6] == ["1", "high", "study", "-", "20.0", "10%"]
+
+
+def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
+    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
+    for method in ("random", "ours"):
+        (tmp_path / f"{method}.json").write_text(json.dumps(data(method)))
+    cell = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed3"
+    write_cell(cell)
+    paths = [tmp_path / "random.json", tmp_path / "ours.json", tmp_path / "study"]
+    files = reference_files(paths, SPLIT, PROTOCOL, LIBRARY)
+    assert set(files) == {
+        *("scores.json", "submissions/ours-seed0.json", "submissions/random-seed0.json")
+    }
+    assert files == reference_files(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
+    for name, content in files.items():
+        (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "release" / name).write_bytes(content)
+    references = read_references(tmp_path / "release")
+    assert references.random.method == "random"
+    rows = references.all_rows()
+    assert {(each.method, each.source, each.seeds) for each in rows} == {
+        ("ours", "reference", (0,)),
+        ("random", "reference", (0,)),
+        ("me-mlp", "study", (3,)),
+    }
+    study = next(each for each in rows if each.source == "study")
+    assert study.group("test", "reach").low == 1
+    assert read_references(tmp_path).rows == ()
+
+
+def write_cell(folder, **changes):
+    """Write the scores of a study's cell."""
+    from dataclasses import asdict
+
+    from morphgen.rl.evaluation import EvalConfig
+    from morphgen.rl.scores import Score
+
+    scores = [
+        vars(Score(each.member.name, each.side, "reach", 4, 1200, 2.0, 1.0, 3.0, 1, -1, 1, 0, 0, 0))
+        for each in EXPECTED
+    ]
+    content = {
+        "eval": EvalConfig(episodes=4, sim="mujoco").as_data(),
+        "source": asdict(small_source()),
+        "scores": {"deterministic": scores},
+    }
+    folder.mkdir(parents=True)
+    (folder / "scores.json").write_text(json.dumps(content | changes))
+
+
+def test_references_of_other_splits_and_rules_are_refused(tmp_path):
+    write_cell(tmp_path / "a" / "seed0", eval={"sim": "pybullet", "episodes": 4, "seed": 0})
+    with pytest.raises(BenchmarkError, match=r"evaluation\.simulator: 'pybullet'"):
+        reference_files([tmp_path / "a"], SPLIT, PROTOCOL, LIBRARY)
+    write_cell(tmp_path / "b" / "seed0")
+    other = small_split(task="push")
+    with pytest.raises(BenchmarkError, match=r"b: no scores of split mine/small, id "):
+        reference_files([tmp_path / "b"], other, PROTOCOL, LIBRARY)
+    (tmp_path / "c.json").write_text('{"ik": []}')
+    with pytest.raises(BenchmarkError, match="neither a submission nor the scores of a study"):
+        reference_files([tmp_path / "c.json"], SPLIT, PROTOCOL, LIBRARY)
+    with pytest.raises(BenchmarkError, match="no such file or folder"):
+        reference_files([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
+
+
+def test_the_rules_of_an_evaluation_are_read_as_they_were_written():
+    rules = PROTOCOL.as_data(SPLIT)
+    assert protocol_from(json.loads(json.dumps(rules)), "a").as_data(SPLIT) == rules
+    assert set(rules["constants"]) == {"reach"}
+    for change, why in (
+        ({"simulator": "kinematic"}, "simulator 'kinematic': no simulator with contacts"),
+        ({"episodes": 0}, "0 episodes"),
+        ({"more": 1}, "unexpected keyword"),
+        ({"constants": {"reach": {"near": "x"}}}, "near"),
+        ({"goal_seed": "x"}, "invalid literal"),
+        ({"episodes": "4"}, "evaluation: "),
+    ):
+        with pytest.raises(MorphgenError, match="a: evaluation: ") as caught:
+            protocol_from({**rules, **change}, "a")
+        assert why in str(caught.value)
+    with pytest.raises(BenchmarkError, match="missing key 'constants'"):
+        protocol_from({"goal_seed": 0}, "a")
+
+
+def test_expected_goal_sets_are_those_of_episodes():
+    from morphgen.rl.robot_source import specs_of
+    from morphgen.tasks.env_specs import GoalConfig
+
+    specs = specs_of(small_source(), GoalConfig())
+    assert [spec.goals.key for spec in specs] == [each.goal_set for each in EXPECTED[:2]]
+    assert EvalProtocol().goals == GoalConfig()
+    assert split_id(SPLIT) == split_id(small_split())
