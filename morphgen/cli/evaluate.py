@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
+from morphgen.cli.eval_submission import plan_submission, rules_of
 from morphgen.cli.progress import TrainingProgress
 from morphgen.cli.training_robots import (
     GOAL_SEED,
@@ -22,7 +23,7 @@ from morphgen.cli.training_robots import (
 )
 from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
 from morphgen.tasks.registry import default_simulator
 
 if TYPE_CHECKING:
@@ -64,6 +65,13 @@ if TYPE_CHECKING:
     opt.SEED,
     GOAL_SEED,
     path_option("--out", "FILE", "write a table: .csv, .json or .md"),
+    path_option(
+        "--submission",
+        "FILE",
+        "write the outcome of every episode, for morphgen split score; the default mode is then "
+        "deterministic, and the default simulator that of the release, else mujoco",
+    ),
+    option("--method", metavar="NAME", help="with --submission: name of the method in rankings"),
     *opt.LIBRARY_JSON,
     details="Scores have 95% bootstrap intervals over episodes. The score of reach is relative to "
     "the random policy; that of push is the success rate.",
@@ -71,6 +79,7 @@ if TYPE_CHECKING:
         "eval runs/interpolation/arm3/reach/me-tf/seed0 --on test",
         "eval ik --split interpolation/arm3/reach",
         "eval zero-shot --split extrapolation/arms/reach --on test",
+        "eval ik --split interpolation/arm3/reach --submission ik.json",
     ),
 )
 def evaluate(args: argparse.Namespace) -> None:
@@ -80,8 +89,12 @@ def evaluate(args: argparse.Namespace) -> None:
 
     if args.out is not None:
         require_table(args.out)
+    if args.submission is None:
+        opt.reject_idle({"--method": args.method is not None}, "only with --submission")
+    is_baseline = args.checkpoint in BASELINES
+    if args.submission is not None and not is_baseline:
+        args.mode = args.mode or "deterministic"
     with closing(TrainingProgress()) as display:
-        is_baseline = args.checkpoint in BASELINES
         scores = (_baseline_scores if is_baseline else _policy_scores)(args, display)
     data = {mode: scores_to_json(results) for mode, results in scores.items()}
     opt.print_result(args, data, lambda: f"{score_table(scores)}\n{summary(scores)}")
@@ -90,7 +103,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
-    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
+    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, no_record
     from morphgen.tasks.env_specs import default_configs
 
     name = args.checkpoint
@@ -101,21 +114,21 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
     sources = _sources(args)
     config = EvalConfig(
         _num_episodes(args),
-        args.sim or default_simulator(),
+        _simulator(args) or default_simulator(),
         args.seed,
         args.workers,
         _with_goal(default_configs(), sources, args),
     )
+    plan = plan_submission(args, sources[0], config, method=name)
     _prepare(sources, config, display)
-    return {
-        name: [
-            score
-            for source in sources
-            for score in evaluate_baseline(
-                name, source, config, progress=display.evaluation(source.side)
-            )
-        ]
-    }
+    record = plan.record if plan else no_record
+    scores: list[Score] = []
+    for source in sources:
+        progress = display.evaluation(source.side)
+        scores += evaluate_baseline(name, source, config, progress=progress, record=record)
+    if plan:
+        plan.write()
+    return {name: scores}
 
 
 def _sources_of(source: RobotSource, sides: Sequence[Side]) -> list[RobotSource]:
@@ -134,7 +147,12 @@ def _prepare(sources: Sequence[RobotSource], config: EvalConfig, display: Traini
 
 
 def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
-    from morphgen.rl.evaluation import eval_config_of, evaluate_checkpoints, evaluate_run
+    from morphgen.rl.evaluation import (
+        eval_config_of,
+        evaluate_checkpoints,
+        evaluate_run,
+        no_record,
+    )
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint
     from morphgen.rl.training import checkpoint_files
@@ -155,8 +173,17 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
     sources = _sources(args) if args.words else [run.source]
     tasks = _with_goal(config.tasks, sources, args)
-    config = replace(config, sim=args.sim or config.sim, tasks=tasks)
+    config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
     sides = _sides(args, has_test=bool(run.source.split))
+    plan = plan_submission(
+        args,
+        sources[0],
+        config,
+        method=args.checkpoint if is_named(args.checkpoint) else run.policy.agent,
+        mode=args.mode or "",
+        training_seed=run.seed,
+    )
+    record = plan.record if plan else no_record
     _prepare(sources if args.words else _sources_of(run.source, sides), config, display)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
@@ -167,13 +194,30 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
             for source in sources:
                 progress = display.evaluation(f"{mode} on {source.side}")
                 scores += evaluate_checkpoints(
-                    files, source, config, mode, device=args.device, progress=progress
+                    files,
+                    source,
+                    config,
+                    mode,
+                    device=args.device,
+                    progress=progress,
+                    record=record,
                 )
             continue
         for side in sides:
             progress = display.evaluation(f"{mode} on {side}")
-            scores += evaluate_run(path, side, config, mode, device=args.device, progress=progress)
+            scores += evaluate_run(
+                path, side, config, mode, device=args.device, progress=progress, record=record
+            )
+    if plan:
+        plan.write()
     return results
+
+
+def _simulator(args: argparse.Namespace) -> str | None:
+    """Return the simulator of ``--sim``, or that of a submission's rules; None for the default."""
+    if args.sim is None and args.submission is not None:
+        return rules_of(args.words).simulator
+    return None if args.sim is None else str(args.sim)
 
 
 def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:

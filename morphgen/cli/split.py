@@ -15,6 +15,9 @@ from morphgen.cli.command import Command, command, flag, option
 from morphgen.cli.progress import bar
 from morphgen.cli.split_checks import audit, build, verify
 from morphgen.cli.split_regimes import new
+from morphgen.cli.split_release import release, reveal
+from morphgen.cli.split_score import score
+from morphgen.errors import PartError
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Member, Split
@@ -67,20 +70,28 @@ def list_splits(args: argparse.Namespace) -> None:
     "print the robots of a split",
     option("split", metavar="SPLIT", help="name of a split, or its file"),
     flag("--full", "print whole derivations, and how the robots were chosen"),
-    opt.JSON,
+    *opt.LIBRARY_JSON,
+    details="Names the licences of the parts, and the robots with a part under a non-commercial, "
+    "no-derivatives or unknown licence.",
     examples=("split show interpolation/panda/reach",),
 )
 def show(args: argparse.Namespace) -> None:
     """Print a split."""
+    from morphgen.benchmark.licences import licence_lines, licenced_parts
     from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import read_split
 
     split = read_split(args.split)
-    data = {"id": split_id(split), **split.as_dict()}
-    opt.print_result(args, data, lambda: _split_text(split, full=args.full))
+    try:
+        parts = licenced_parts(split, opt.library_of(args))
+        licences, lines = [part.as_dict() for part in parts], licence_lines(parts)
+    except PartError as error:
+        licences, lines = None, [f"licences: {error}; see --library"]
+    data = {"id": split_id(split), **split.as_dict(), "licences": licences}
+    opt.print_result(args, data, lambda: _split_text(split, lines, full=args.full))
 
 
-def _split_text(split: Split, *, full: bool) -> str:
+def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
     from tabulate import tabulate
 
     from morphgen.benchmark.split import SIDES, split_id
@@ -92,6 +103,7 @@ def _split_text(split: Split, *, full: bool) -> str:
         if full or isinstance(value, int | str):
             text = value if isinstance(value, str) else json.dumps(value).replace('"', "")
             lines.append(f"  {key}: {text}")
+    lines += [f"  {line}" for line in licences]
     lines += [f"  accepted {code}: {reason}" for code, reason in split.accepted.items()]
     headers = ("name", "task", "category", "body", "derivation")
     for side in SIDES:
@@ -138,6 +150,7 @@ def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
     from tabulate import tabulate
 
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
     from morphgen.benchmark.split_file import read_split, split_names
     from morphgen.benchmark.statistics import PAPER_TABLE, paper_row, statistics
 
@@ -149,12 +162,16 @@ def stats(args: argparse.Namespace) -> None:
             statistics_by_title[title] = statistics(
                 splits[0], library, jobs=args.jobs, progress=update
             )
+    limits = {
+        title: restricted(licenced_parts(splits[0], library)) for title, splits in groups.items()
+    }
     data = [
         {
             "robots": title,
             "splits": [split.name for split in splits],
             "ours": statistics_by_title[title],
             "paper": asdict(theirs) if (theirs := paper_row(title)) else None,
+            "restricted": [part.as_dict() for part in limits[title]],
         }
         for title, splits in groups.items()
     ]
@@ -164,11 +181,15 @@ def stats(args: argparse.Namespace) -> None:
             _stats_row(title, ours, paper_row(title)) for title, ours in statistics_by_title.items()
         ]
         style = "github" if args.markdown else "simple"
-        return (
-            f"{tabulate(rows, 'keys', tablefmt=style, disable_numparse=True)}\n"
-            "\nlinks, joints, mass: mean over the train robots; cosine: of test and train robots"
-            f"\nin parentheses: {PAPER_TABLE}"
-        )
+        lines = [
+            tabulate(rows, "keys", tablefmt=style, disable_numparse=True),
+            "",
+            "links, joints, mass: mean over the train robots; cosine: of test and train robots",
+            f"in parentheses: {PAPER_TABLE}",
+        ]
+        for title, parts in limits.items():
+            lines += [f"restricted licence in {title}: {restriction_text(part)}" for part in parts]
+        return "\n".join(lines)
 
     opt.print_result(args, {"rows": data, "paper": PAPER_TABLE}, text)
 
@@ -214,7 +235,7 @@ def _stats_row(
 
 split = Command(
     "split",
-    "list, make, audit, build and verify splits of train and test robots",
-    commands=(list_splits, show, new, audit, build, verify, stats),
+    "list, make, audit, build, release and score splits of train and test robots",
+    commands=(list_splits, show, new, audit, build, verify, stats, release, score, reveal),
     details="A split is a YAML file with the robots to train on and those to test on.",
 )

@@ -161,6 +161,7 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 )
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder_files import BuildSettings
     from morphgen.tasks.env_specs import GoalConfig
@@ -183,22 +184,29 @@ def build(args: argparse.Namespace) -> None:
             progress=update,
         )
     written, kept = report.num_written, report.num_kept
-    data = {"folder": str(report.folder), "made": written, "kept": kept}
+    data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
     lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
     if args.goals:
         data["goals"] = len(goals)
         lines.append(f"{len(goals)} goal sets, seed {config.seed}")
+    if limited := restricted(licenced_parts(split, opt.library_of(args))):
+        data["restricted"] = [part.as_dict() for part in limited]
+        lines += [f"restricted: {restriction_text(part)}" for part in limited]
     lines.append(f"verify it anywhere: morphgen split verify {report.folder}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 
 @command(
     "verify",
-    "verify that a split or its built folder has the robots that it claims",
-    option("path", metavar="PATH", help="name of a split, its file, or its built folder"),
+    "verify that a split, its built folder or its release has the robots that it claims",
+    option(
+        "path",
+        metavar="PATH",
+        help="name of a split, its file, its built folder, or the archive of a release",
+    ),
     *opt.JOBS_LIBRARY_JSON,
     details="Every robot is composed anew and compared: with the hashes of the split, or with all "
-    "files of a built folder. The exit code is 1 if something differs.",
+    "files of a built folder or a release. The exit code is 1 if something differs.",
 )
 def verify(args: argparse.Namespace) -> int:
     """Verify a split and print what differs."""
@@ -212,13 +220,17 @@ def verify(args: argparse.Namespace) -> int:
         "id": result.id,
         "differences": [{"where": each.where, "why": each.why} for each in differences],
         "passed": not differences,
+        **({"content": result.content} if result.content else {}),
     }
 
     def text() -> str:
         verdict = f"{len(differences)} difference{'' if len(differences) == 1 else 's'}"
         if not differences:
             verdict = f"all {len(split.train) + len(split.test)} robots are the same"
-        return "\n".join([f"{split.name}, id {result.id}: {verdict}", *_listed(differences)])
+        lines = [f"{split.name}, id {result.id}: {verdict}", *_listed(differences)]
+        if result.content and not differences:
+            lines.append(f"  content: {result.content}")
+        return "\n".join(lines)
 
     opt.print_result(args, data, text)
     return int(bool(differences))

@@ -1,0 +1,158 @@
+"""``morphgen split release`` and ``reveal``: publish a split, and its private test side later."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, number, option, path_option, repeated
+from morphgen.cli.progress import bar
+from morphgen.errors import BenchmarkError
+
+
+@command(
+    "release",
+    "write an archive of a split that others can verify, cite and score against",
+    option("split", metavar="SPLIT", help="name of a split, or its file"),
+    option(
+        "--version",
+        dest="release_version",  # `morphgen --version` has the other name
+        metavar="X.Y.Z",
+        default="1.0.0",
+        help="version of the release",
+    ),
+    path_option("--out", "DIR", "folder of the archive", default=Path("releases")),
+    option("--date", metavar="YYYY-MM-DD", default="", help="date of publication"),
+    repeated("--creator", "who publishes the release", metavar="NAME"),
+    option("--url", default="", help="address where the release will be"),
+    repeated(
+        "--licence-allow",
+        "licences with restrictions that parts may have, such as CC-BY-NC-ND-4.0",
+        metavar="LICENCE,...",
+    ),
+    option(
+        "--scores",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="PATH",
+        help="reference scores: submissions (morphgen eval --submission), or folders of studies",
+    ),
+    opt.sim_option("mujoco"),
+    number("--episodes", "least number of episodes per robot of a submission (default: 34)"),
+    flag("--light", "write the URDF and the derivation of robots only, without meshes"),
+    flag("--no-goals", "ship no goal sets"),
+    number("--private-test", "number of further test robots that are drawn with a secret"),
+    path_option(
+        "--secret-file",
+        "FILE",
+        "with --private-test: file of the secret, which is made if it does not exist",
+    ),
+    *opt.JOBS_LIBRARY_JSON,
+    details="The archive holds the built split, goal sets, licences of all parts, a Croissant "
+    "description, a dataset card, reference scores and SHA-256 of every file. A split that fails "
+    "its audit, or with a part under a non-commercial, no-derivatives or unknown licence that is "
+    "not allowed, is refused. The same inputs give the same bytes.",
+    examples=(
+        "split release interpolation/arm3/reach --version 1.0.0 --date 2027-01-31",
+        "split release extrapolation/arms/reach --licence-allow CC-BY-NC-ND-4.0",
+        "split release my_split.yaml --private-test 5 --secret-file secret.txt",
+    ),
+)
+def release(args: argparse.Namespace) -> None:
+    """Make a release and print where it is."""
+    from morphgen.benchmark.private_source import test_grammars
+    from morphgen.benchmark.private_test import make_secret
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder_files import BuildSettings
+    from morphgen.tasks.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
+    from morphgen.tasks.split_release import ReleaseRequest, release_split
+
+    if (args.private_test is None) != (args.secret_file is None):
+        raise BenchmarkError(
+            "--private-test and --secret-file: a private test side needs both; give both or none"
+        )
+    split, library = read_split(args.split), opt.library_of(args)
+    protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
+    extra: dict[str, bytes] = {}
+    if args.scores:
+        from morphgen.rl.reference_scores import reference_files
+
+        extra = reference_files(args.scores, split, protocol, library, jobs=args.jobs)
+    if args.private_test:
+        test_grammars(split, library)  # refuses other splits before a secret is made
+    request = ReleaseRequest(
+        version=args.release_version,
+        date=args.date,
+        creators=tuple(args.creator),
+        url=args.url,
+        allowed_licences=tuple(
+            word for text in args.licence_allow for word in text.split(",") if word
+        ),
+        protocol=protocol,
+        goals=not args.no_goals,
+        settings=BuildSettings(light=args.light),
+        private_robots=args.private_test or 0,
+        secret=make_secret(args.secret_file) if args.secret_file else "",
+    )
+    with bar(args, "releasing") as update:
+        report = release_split(
+            split, args.out, library, request, extra=extra, jobs=args.jobs, progress=update
+        )
+    private = report.release.private_test
+    data = {
+        "archive": str(report.archive),
+        "sha256": report.sha256,
+        "content": report.content,
+        "files": report.files,
+        "bytes": report.size,
+        "commitment": private.commitment if private else None,
+    }
+    lines = [
+        f"{report.archive}: {report.files} files, {report.size / 1e6:.2f} MB",
+        f"  sha256: {report.sha256}",
+        f"  content: {report.content}",
+    ]
+    if private is not None:
+        lines += [
+            f"  private test side: {private.robots} robots, commitment {private.commitment}",
+            f"  keep {args.secret_file} secret until you reveal them; without it they are lost",
+        ]
+    lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
+    opt.print_result(args, data, lambda: "\n".join(lines))
+
+
+@command(
+    "reveal",
+    "draw the private test robots of a release again, and verify its commitment",
+    path_option("release", "RELEASE", "archive of the release, or its folder"),
+    option("--secret-file", type=Path, required=True, metavar="FILE", help="file of the secret"),
+    path_option("--out", "DIR", "folder of the split's file", default=Path()),
+    *opt.LIBRARY_JSON,
+    details="Writes a split with the train robots of the release, whose test side are the private "
+    "robots. A secret that does not give the robots that the release committed to is refused.",
+    examples=("split reveal releases/my-split-1.0.0.zip --secret-file secret.txt",),
+)
+def reveal(args: argparse.Namespace) -> None:
+    """Reveal a private test side and print the split's file."""
+    from morphgen.benchmark.private_test import read_secret, reveal
+    from morphgen.benchmark.release_file import opened_folder, read_release
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder import SPLIT_FILE
+    from morphgen.benchmark.split_writing import write_new_splits
+
+    secret = read_secret(args.secret_file)
+    with opened_folder(args.release) as folder:
+        described = read_release(folder)
+        split = read_split(folder / SPLIT_FILE)
+    private = reveal(split, described, secret, opt.library_of(args))
+    path = args.out / f"{private.name}.yaml"
+    write_new_splits([private], [path])
+    robots = [member.as_dict() for member in private.test]
+    lines = [
+        f"{path}: {len(private.test)} private test robots, as committed to by {described.stem}",
+        *(f"  {member.name}  {member.robot_hash}" for member in private.test),
+        f"next: morphgen split audit {path}",
+    ]
+    opt.print_result(args, {"file": str(path), "test": robots}, lambda: "\n".join(lines))

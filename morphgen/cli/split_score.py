@@ -1,0 +1,105 @@
+"""``morphgen split score``: check submissions to a split and rank them."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, option
+from morphgen.cli.progress import bar
+
+if TYPE_CHECKING:
+    from morphgen.benchmark.split import Split
+    from morphgen.rl.reference_scores import References
+    from morphgen.tasks.eval_protocol import EvalProtocol
+
+
+@command(
+    "score",
+    "check submissions to a split, compute their scores and rank them",
+    option(
+        "submissions",
+        nargs="+",
+        type=Path,
+        metavar="SUBMISSION",
+        help="file that morphgen eval --submission wrote",
+    ),
+    option(
+        "--split",
+        metavar="SPLIT",
+        help="archive or folder of a release, or name or file of a split (default: the split that "
+        "the first submission names)",
+    ),
+    flag("--markdown", "print the table as Markdown"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="Every episode of every test robot must be there, with the goals, simulator and "
+    "constants of the release. Scores and 95% bootstrap intervals are computed from the episodes, "
+    "and ranked beside the reference scores of the release. A submission with a fault is refused "
+    "with one line, and nothing is ranked.",
+    examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
+)
+def score(args: argparse.Namespace) -> None:
+    """Score submissions and print the ranking."""
+    import msgspec
+
+    from morphgen.rl.leaderboard import random_scores, ranked, ranking_table, score_submission
+    from morphgen.rl.submission import read_submission
+    from morphgen.rl.submission_checks import check_submission
+    from morphgen.tasks.eval_protocol import expected_robots
+
+    submissions = [read_submission(path) for path in args.submissions]
+    library = opt.library_of(args)
+    name = args.split or submissions[0].split.name
+    with ExitStack() as stack:
+        split, protocol, references, version = _open(name, stack)
+    with bar(args, "composing robots") as update:
+        expected = expected_robots(split, protocol, library, jobs=args.jobs, progress=update)
+    for where, submission in [
+        *((f"{name}: reference {each.method}", each) for each in references.submissions),
+        *zip(map(str, args.submissions), submissions, strict=True),
+    ]:
+        check_submission(submission, where, split, protocol, expected, version)
+    random = random_scores(references.random) if references.random else None
+    rows = [score_submission(each, random) for each in submissions] + references.all_rows()
+    data = {
+        "split": split.name,
+        "random": "release" if random else "submission",
+        "rows": [msgspec.to_builtins(row) for row in ranked(rows)],
+    }
+    relative = "the release" if random else "each submission"
+    notes = [
+        "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of every robot",
+        f"scores of reach are relative to the random policy, by the episodes of {relative}",
+    ]
+    style = "github" if args.markdown else "simple"
+    opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
+
+
+def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:
+    """Return a split, its rules, reference scores, and the version of morphgen they are of."""
+    from importlib.metadata import version
+
+    from morphgen.benchmark.release_file import (
+        is_archive,
+        is_release,
+        opened_folder,
+        read_release,
+    )
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder import SPLIT_FILE
+    from morphgen.rl.reference_scores import References, read_references
+    from morphgen.tasks.eval_protocol import EvalProtocol, protocol_from
+
+    path = Path(name)
+    if not path.is_dir() and not is_archive(path):
+        return read_split(name), EvalProtocol(), References(), version("morphgen")
+    folder = stack.enter_context(opened_folder(path))
+    split = read_split(folder / SPLIT_FILE)
+    if not is_release(folder):
+        return split, EvalProtocol(), References(), version("morphgen")
+    release = read_release(folder)
+    protocol = protocol_from(release.evaluation, name)
+    return split, protocol, read_references(folder), release.morphgen

@@ -1,0 +1,197 @@
+"""``morphgen split release``, ``score`` and ``reveal``, and ``eval --submission``."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from helpers.splits import TEST, TRAIN, combined, member
+from morphgen.benchmark.split_file import read_split, split_text
+
+STICKS = ("split", "new", "interpolation", "--grammar", "stick", "--train", "4", "--name")
+RELEASE = ("split", "release", "--light", "--no-goals")
+
+
+@pytest.fixture
+def small():
+    """Write the file of a small split at reach."""
+    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
+    Path("small.yaml").write_text(split_text(combined(train, test, name="mine/small")))
+    return "small.yaml"
+
+
+def test_release_prints_archive_and_hashes_and_passes_verify(run, small):
+    code, out, err = run(*RELEASE, small, "--version", "2.0.0")
+    assert (code, err) == (0, "")
+    first, sha256, content, last = out.splitlines()
+    archive = "releases/mine-small-2.0.0.zip"
+    assert first.startswith(f"{archive}: ")
+    assert last == f"verify it anywhere: morphgen split verify {archive}"
+    code, out, _ = run(*RELEASE, small, "--version", "2.0.0", "--json")
+    data = json.loads(out)
+    assert (f"  sha256: {data['sha256']}", f"  content: {data['content']}") == (sha256, content)
+    assert data["commitment"] is None
+    code, out, err = run("split", "verify", archive)
+    assert (code, err) == (0, "")
+    assert out.splitlines()[1] == content
+    assert [path.name for path in Path("releases").iterdir()] == ["mine-small-2.0.0.zip"]
+
+
+def test_a_tampered_archive_fails_verify(run, small):
+    run(*RELEASE, small)
+    shutil.unpack_archive("releases/mine-small-1.0.0.zip", "unpacked")
+    path = Path("unpacked/mine-small-1.0.0/robots.jsonl")
+    path.write_text(path.read_text().replace("train", "test", 1))
+    shutil.make_archive("changed", "zip", "unpacked", "mine-small-1.0.0")
+    code, out, err = run("split", "verify", "changed.zip")
+    assert (code, err) == (1, "")
+    assert "robots.jsonl is not what SHA256SUMS was written for" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("extrapolation/arms/reach",), "--licence-allow CC-BY-NC-ND-4.0"),
+        (("interpolation/arm3/reach", "--licence-allow", "GPL"), "no part of interpolation/arm3"),
+        (("interpolation/arm3/reach", "--version", "1"), "expected one such as 1.0.0"),
+        (("interpolation/arm3/reach", "--private-test", "2"), "a private test side needs both"),
+        (("interpolation/arm3/reach", "--sim", "kinematic"), "no simulator with contacts"),
+        (("interpolation/arm3/reach", "--scores", "none.json"), "none.json: no such file"),
+        (
+            ("composition/ee-task", "--private-test", "2", "--secret-file", "s"),
+            "its test robots are not drawn from grammars",
+        ),
+    ],
+)
+def test_release_refuses(refused, words, why):
+    assert why in refused(*RELEASE, *words)
+
+
+def test_a_restricted_licence_is_released_when_it_is_allowed(run):
+    words = ("composition/ee-arm/reach", "--licence-allow", "CC-BY-NC-ND-4.0,MIT")
+    code, _, err = run(*RELEASE, *words)
+    assert (code, err) == (0, "")
+    shutil.unpack_archive("releases/composition-ee-arm-reach-1.0.0.zip", ".")
+    card = Path("composition-ee-arm-reach-1.0.0/README.md").read_text()
+    assert "- cc-by-nc-nd-4.0\n" in card
+    assert "**sake_ez is CC-BY-NC-ND-4.0 (non-commercial, no derivatives)**: robots ur5-ez" in card
+
+
+def test_a_private_test_side_is_revealed_with_its_secret(run, refused):
+    run(*STICKS, "my/sticks")
+    secret = ("--secret-file", "secret.txt")
+    code, out, err = run(*RELEASE, "my/sticks.yaml", "--private-test", "3", *secret)
+    assert (code, err) == (0, "")
+    text = Path("secret.txt").read_text().strip()
+    assert text not in out
+    archive = "releases/my-sticks-1.0.0.zip"
+    shutil.unpack_archive(archive, ".")
+    files = [path for path in Path("my-sticks-1.0.0").rglob("*") if path.is_file()]
+    code, out, err = run("split", "reveal", archive, *secret)
+    assert (code, err) == (0, "")
+    private = read_split("my/sticks-private.yaml")
+    assert len(private.test) == 3
+    contents = b"".join(path.read_bytes() for path in files)
+    for robot in private.test:
+        assert robot.robot_hash.encode() not in contents
+        assert robot.derivation.encode() not in contents
+    assert text.encode() not in contents
+    assert run("split", "audit", "my/sticks-private.yaml")[0] == 0
+    assert run("split", "reveal", "my-sticks-1.0.0", *secret)[0] == 0  # the folder, too
+    Path("secret.txt").write_text("5a" * 32)
+    err = refused("split", "reveal", archive, *secret)
+    assert "this secret does not give the robots that the release committed to" in err
+    assert "5a5a" not in err
+
+
+def test_reveal_refuses_releases_without_a_private_side(run, refused, small):
+    run(*RELEASE, small)
+    Path("secret.txt").write_text("5a" * 32)
+    words = ("releases/mine-small-1.0.0.zip", "--secret-file", "secret.txt")
+    assert "has no private test side" in refused("split", "reveal", *words)
+    run("split", "build", small, "--light")
+    words = ("data/mine/small", "--secret-file", "secret.txt")
+    assert "is no release: it has no release.json" in refused("split", "reveal", *words)
+
+
+def test_show_stats_and_build_name_restricted_parts(run):
+    line = "sake_ez (CC-BY-NC-ND-4.0: non-commercial, no derivatives) in robots ur5-ez"
+    out = run("split", "show", "composition/ee-arm/reach")[1]
+    assert f"  restricted: {line}\n" in out
+    data = json.loads(run("split", "show", "composition/ee-arm/reach", "--json")[1])
+    assert [each["part"] for each in data["licences"] if each["restrictions"]] == ["sake_ez"]
+    assert "restricted" not in run("split", "show", "composition/ee-task")[1]
+    out = run("split", "build", "composition/ee-arm/reach", "--light")[1]
+    assert f"\nrestricted: {line}\n" in out
+    out = run("split", "stats", "interpolation/arm3/reach")[1]
+    assert "restricted" not in out
+
+
+def test_show_works_without_the_library_of_the_parts(run):
+    other = member(TRAIN[0])
+    other = replace(other, name="other", derivation=other.derivation.replace("plane", "planf"))
+    Path("other.yaml").write_text(split_text(combined([*TRAIN, other])))
+    code, out, err = run("split", "show", "other.yaml")
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if line.startswith("  licences: ")]
+    assert "'planf'" in line
+    assert line.endswith("; see --library")
+
+
+def test_submission_options_are_refused_where_they_do_nothing(refused, small):
+    words = ("eval", "zero", "--split", small)
+    assert "--method: only with --submission" in refused(*words, "--method", "a")
+    words += ("--submission", "a.json")
+    assert "leave --on train out" in refused(*words, "--on", "train")
+    assert "expected 34 or more" in refused(*words, "--episodes", "2")
+    assert "evaluation.seed: 3; expected 0" in refused(*words, "--seed", "3")
+    assert "expected 'mujoco'" in refused(*words, "--sim", "pybullet")
+    words = ("eval", "zero", "--split", "prims", "task=reach", "--submission", "a.json")
+    assert "prims is no split" in refused(*words)
+    words = ("eval", "zero", "--split", small, "--submission", "none/a.json")
+    assert "there is no folder none" in refused(*words)
+
+
+def test_score_refuses_other_files(refused, small):
+    Path("a.json").write_text("{}")
+    assert "a.json: no submission" in refused("split", "score", "a.json", "--split", small)
+    assert "b.json: no such file" in refused("split", "score", "b.json", "--split", small)
+
+
+@pytest.mark.slow
+def test_submissions_are_recorded_scored_and_ranked(run, refused, small):
+    few = ("--episodes", "2")
+    run(*RELEASE, small, *few)
+    shutil.unpack_archive("releases/mine-small-1.0.0.zip", ".")
+    folder = "mine-small-1.0.0"
+    for name in ("random", "ik"):
+        words = ("eval", name, "--split", folder, *few, "--submission", f"{name}.json")
+        code, out, err = run(*words, "--json")
+        assert (code, err) == (0, "")
+        scores = json.loads(out)[name]
+        rows = json.loads(run("split", "score", f"{name}.json", "--split", folder, "--json")[1])
+        (row,) = rows["rows"]
+        assert (row["method"], row["source"], row["mode"]) == (name, "submission", "")
+        test = next(each for each in row["sides"] if each["side"] == "test")
+        expected = next(each for each in scores if each["side"] == "test")
+        for key in ("score", "success", "low", "high"):
+            assert test[key] == pytest.approx(expected[key]), key
+    words = ("--scores", "random.json", "ik.json", "--version", "1.1.0")
+    code, _, err = run(*RELEASE, small, *few, *words)
+    assert (code, err) == (0, "")
+    archive = "releases/mine-small-1.1.0.zip"
+    code, out, err = run("split", "score", "ik.json", "--split", archive)
+    assert (code, err) == (0, "")
+    assert [line.split()[1:3] for line in out.splitlines()[2:5]] == [
+        ["ik", "submission"],
+        ["ik", "reference"],
+        ["random", "reference"],
+    ]
+    assert "by the episodes of the release" in out
+    broken = json.loads(Path("ik.json").read_text())
+    broken["robots"][-1]["score"][0] = 999
+    Path("broken.json").write_text(json.dumps(broken))
+    err = refused("split", "score", "ik.json", "broken.json", "--split", archive)
+    assert err.startswith("morphgen: broken.json: test robot planar-plane: score[0]: 999; expected")
