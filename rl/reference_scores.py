@@ -32,7 +32,7 @@ from morphgen.rl.submission import (
     read_submission,
     submission_text,
 )
-from morphgen.rl.submission_checks import check_submission, require_rules
+from morphgen.rl.submission_checks import check_submission, require_rules, require_series
 from morphgen.tasks.env_specs import GoalConfig, task_configs
 from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
 from morphgen.tasks.registry import TASKS
@@ -197,6 +197,8 @@ def _cells(
         raise BenchmarkError(
             f"{file}: neither a submission nor the scores of a study's cell: {error!r}"
         ) from error
+    if "morphgen" in table:  # versions before 0.2.0 did not write it
+        require_series(str(table["morphgen"]), version("morphgen"), str(file))
     require_rules(found.as_data(split), protocol.as_data(split), str(file))
     parent = file.parent.name
     is_seed = parent.removeprefix("seed").isdecimal() and parent.startswith("seed")

@@ -101,16 +101,25 @@ def _check_head(
             f"{where}: split.id: {submission.split.id} ({submission.split.name}); expected "
             f"{expected_id} ({split.name})"
         )
-    if _series(submission.morphgen) != _series(version):
-        raise BenchmarkError(
-            f"{where}: morphgen: {submission.morphgen}; scores are compared with those of version "
-            f"{_series(version)}"
-        )
+    require_series(submission.morphgen, version, where)
     require_rules(submission.evaluation, protocol.as_data(split), where)
 
 
+def require_series(found: str, expected: str, where: str) -> None:
+    """Require that two versions of morphgen have scores that compare: the first numbers are equal.
+
+    Raises:
+        BenchmarkError: If they have not.
+    """
+    if _series(found) != _series(expected):
+        raise BenchmarkError(
+            f"{where}: morphgen: {found}; scores are compared with those of version "
+            f"{_series(expected)}"
+        )
+
+
 def _series(version: str) -> str:
-    """Return a version without its last number: episodes are the same within a series."""
+    """Return the first two numbers of a version."""
     return ".".join(version.split(".")[:2])
 
 

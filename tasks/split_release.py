@@ -30,7 +30,6 @@ from morphgen.benchmark.release_file import (
 )
 from morphgen.benchmark.release_texts import card_text, licences_json, licences_text
 from morphgen.benchmark.split import Split, split_id
-from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums
 from morphgen.benchmark.split_folder_files import BUNDLED, BuildSettings, sums_text
 from morphgen.benchmark.statistics import DIGITS, summarize_survey
@@ -42,12 +41,8 @@ from morphgen.formats.zip_files import write_zip
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.eval_protocol import EvalProtocol
-from morphgen.tasks.split_goals import (
-    GoalResult,
-    require_goal_sets,
-    sample_split_goals,
-    write_goals,
-)
+from morphgen.tasks.split_building import build_with_goals
+from morphgen.tasks.split_goals import GoalResult, require_goal_sets, sample_split_goals
 
 
 @dataclass(frozen=True)
@@ -139,16 +134,16 @@ def release_split(
         require_goal_sets(goals)
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".release-", dir=out) as temporary:
-        report = build_split(
+        report = build_with_goals(
             split,
             Path(temporary),
             library,
+            request.settings,
+            goals,
+            request.protocol.goals,
             jobs=jobs,
-            settings=request.settings,
             progress=progress,
         )
-        if request.goals:
-            write_goals(report.folder, goals, request.protocol.goals)
         texts = {
             RELEASE_FILE: release_text(release),
             LICENCES_FILE: licences_json(parts),
