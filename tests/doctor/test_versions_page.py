@@ -3,10 +3,10 @@
 import re
 from pathlib import Path
 
-from morphgen.benchmark import split, split_folder
+from morphgen.benchmark import release_file, split, split_folder
 from morphgen.formats import card
 from morphgen.grammar.robot_set import SetConfig
-from morphgen.rl import drawn_robots, runs
+from morphgen.rl import drawn_robots, runs, submission
 from morphgen.tasks import split_goals
 from morphgen.viewer import episode
 
@@ -22,6 +22,8 @@ FORMATS = {
     runs.CHECKPOINT: READABLE,
     drawn_robots.FILE: drawn_robots.FORMAT,
     "scores.json": "",
+    "release.json": release_file.FORMAT,
+    "eval --submission": submission.FORMAT,
     ".npz": f"{episode.FORMAT}; 1 is read",
 }
 
