@@ -35,6 +35,13 @@ def test_the_version_is_the_same_everywhere():
     assert f"version = {{{newest}}}" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+def test_the_readme_names_the_version_of_torch_in_the_constraints():
+    """With another version installed, pip would replace the CPU build by the CUDA build."""
+    constraints = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    (torch,) = [line for line in constraints if line.startswith("torch==")]
+    assert f"`{torch}`" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 def test_the_workflow_runs_what_the_script_runs_on_every_python():
     jobs = read_yaml(".github/workflows/ci.yml")["jobs"]
     scripts = {
