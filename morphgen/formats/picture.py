@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -180,6 +181,11 @@ def gl_context(width: int, height: int) -> GlContext:
     Raises:
         MissingDependencyError: If neither is installed.
     """
+    # Triton, a part of PyTorch's CUDA build, and Mesa's software renderer contain LLVM. A process
+    # that loads triton after Mesa crashes, such as one that draws and then loads a policy.
+    if find_spec("triton") is not None:
+        with suppress(ImportError):
+            import_module("triton")
     reasons = []
     for backend in ("egl", "osmesa"):
         try:
