@@ -16,6 +16,7 @@ from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.request import parse_words
+from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
@@ -106,7 +107,7 @@ def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) 
     """Read a robot from a bundle's folder, a URDF or a xacro.
 
     Examples:
-        >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
+        >>> folder = morphgen.write("ur5-plane", "robots", picture=False)
         >>> morphgen.read(folder).name
         'ur5-plane'
 
@@ -121,23 +122,32 @@ def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) 
     return read_robot(Path(path), root=None if root is None else Path(root))
 
 
-def write(robot: Robot, folder: str | PathLike[str], *, picture: bool = True) -> Path:
+def write(
+    robot: RobotLike,
+    folder: str | PathLike[str],
+    *,
+    picture: bool = True,
+    library: LibraryFolders = (),
+) -> Path:
     """Check a robot and write its bundle: URDF, MJCF, meshes, card and picture.
 
     Examples:
-        >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
+        >>> folder = morphgen.write("ur5-plane", "robots", picture=False)
         >>> print(folder)
         robots/ur5-plane
 
     Args:
-        robot: The robot.
-        folder: Folder in which the bundle's folder ``robot.name`` is created or replaced.
+        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``.
+        folder: Folder in which the bundle's folder, of the robot's name, is created or replaced.
         picture: Whether to render ``preview.png``.
+        library: Folders of your own parts.
 
     Returns:
         The bundle's folder.
 
     Raises:
         FormatError: If the folder cannot be written, or contains something else of that name.
+        MorphgenError: If the robot cannot be composed or read.
     """
+    robot = resolve_robot(robot, open_library(library))
     return write_bundle(robot, Path(folder) / robot.name, check(robot), picture=picture)
