@@ -30,18 +30,16 @@ OUTPUTS = {
     "01_compose": ([], "tool after 0.5 s: z = 0.352 m"),
     "02_own_part": ([], "error: .*length.*2"),
     "03_grammar": (["20"], "20 robots, last links: {'ee_plate': "),
+    "04_fit": ([], "ee_right_gripper_base_link: Cylinder, IoU 0.99"),
     "05_split": ([], "passed: True, 0 findings"),
     "06_gymnasium": ([], "jacobian controller: .* m from the goals"),
+    "07_stable_baselines3": (["512"], "after 512 steps: .* m from the goals"),
+    "08_train": (["4096"], "film: reach.mp4"),
     "09_custom_task": (["goals", "planar-cube", "--task", "follow"], "1 of 1 goal sets"),
     "10_viewer": (["0"], "http://127.0.0.1:[0-9]+ "),
     "11_goal_set": ([], r"faults: \[\]\nfaults: \['goal 0: the tool"),
 }
 """Arguments of each example, and a pattern that its output has."""
-SLOW_OUTPUTS = {
-    "04_fit": ([], "ee_right_gripper_base_link: Cylinder, IoU 0.99"),
-    "07_stable_baselines3": (["512"], "after 512 steps: .* m from the goals"),
-    "08_train": (["4096"], "film: reach.mp4"),
-}
 RUN = "runs/planar-cube-follow/me-graph/seed0"
 
 
@@ -61,17 +59,15 @@ def run(monkeypatch, tmp_path, capsys):
     return run_example
 
 
-@pytest.mark.parametrize(
-    "name", [*OUTPUTS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_OUTPUTS)]
-)
+@pytest.mark.parametrize("name", OUTPUTS)
 def test_example_prints_what_it_says(name, run):
-    arguments, pattern = (OUTPUTS | SLOW_OUTPUTS)[name]
+    arguments, pattern = OUTPUTS[name]
     assert re.search(pattern, run(name, *arguments))
 
 
 def test_every_example_is_run_and_listed():
     names = {path.stem for path in SCRIPTS}
-    assert names == OUTPUTS.keys() | SLOW_OUTPUTS.keys()
+    assert names == OUTPUTS.keys()
     readme = (EXAMPLES / "README.md").read_text(encoding="utf-8")
     assert re.findall(r"(?m)^\| \[(\w+)\.py\]", readme) == sorted(names)
 
