@@ -38,6 +38,15 @@ class SideScore(Record, frozen=True):
     high: FiniteNumber | None = None
     """Upper end of the interval."""
 
+    def __post_init__(self) -> None:
+        if self.robots < 1 or not 0 <= self.success <= 1:
+            raise ValueError(
+                f"{self.robots} robots, success {self.success:g}: expected 1 robot or more, and a "
+                "success rate from 0 to 1"
+            )
+        if (self.low is None) != (self.high is None):
+            raise ValueError("an interval with one end; expected low and high, or neither")
+
 
 class Row(Record, frozen=True):
     """A method in a ranking."""
@@ -51,6 +60,13 @@ class Row(Record, frozen=True):
     episodes: int
     """Episodes per robot."""
     sides: tuple[SideScore, ...]
+
+    def __post_init__(self) -> None:
+        if not self.method.isprintable():
+            raise ValueError(f"method {self.method!r}; expected printable characters")
+        groups = [(side.side, side.task) for side in self.sides]
+        if len(set(groups)) < len(groups):
+            raise ValueError("a side and task is there twice; expected once")
 
     def group(self, side: Side, task: str) -> SideScore | None:
         """Return the result of a side at a task."""

@@ -263,6 +263,29 @@ def write_cell(folder, **changes):
     (folder / "scores.json").write_text(json.dumps(content | changes))
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"robots": 0}, "0 robots"),
+        ({"success": 1.5}, "success 1.5"),
+        ({"high": None}, "an interval with one end"),
+    ],
+)
+def test_malformed_scores_of_a_release_are_refused(tmp_path, change, why):
+    side = {"side": "test", "task": "reach", "robots": 1, "score": 1, "success": 1}
+    side |= {"low": 0, "high": 2} | change
+    values = {"method": "a", "source": "study", "mode": "", "seeds": [], "episodes": 4}
+    content = {"format": 1, "rows": [values | {"sides": [side]}]}
+    (tmp_path / "scores.json").write_text(json.dumps(content))
+    with pytest.raises(BenchmarkError, match=why) as caught:
+        read_references(tmp_path)
+    assert "\n" not in str(caught.value)
+    content["rows"] = [values | {"method": "a\nb", "sides": []}]
+    (tmp_path / "scores.json").write_text(json.dumps(content))
+    with pytest.raises(BenchmarkError, match="expected printable characters"):
+        read_references(tmp_path)
+
+
 def test_references_of_other_splits_and_rules_are_refused(tmp_path):
     write_cell(tmp_path / "a" / "seed0", eval={"sim": "pybullet", "episodes": 4, "seed": 0})
     with pytest.raises(BenchmarkError, match=r"evaluation\.simulator: 'pybullet'"):
