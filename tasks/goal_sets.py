@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.files import write_cache_file
+from morphgen.formats.npz_files import read_npz
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.packaged_sets import packaged_set
@@ -137,11 +137,9 @@ def set_from_npz(content: bytes, kind: type[G]) -> G:
     Raises:
         ValueError: If it is not such a set; with the reason.
     """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as data:
-            return kind(**{f.name: _value(f.name, data[f.name]) for f in fields(kind)})
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise ValueError(str(error)) from error
+    names = [field.name for field in fields(kind)]
+    arrays = read_npz(io.BytesIO(content), names)
+    return kind(**{name: _value(name, array) for name, array in zip(names, arrays, strict=True)})
 
 
 def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:

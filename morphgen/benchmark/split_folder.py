@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from morphgen.benchmark.split import SIDES, Side
 from morphgen.benchmark.token_layout import TOKEN_SIZE
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import parse_json, read_text
+from morphgen.formats.npz_files import read_npz
 
 SPLIT_FILE = "split.yaml"
 ROBOTS_FILE = "robots.jsonl"
@@ -163,12 +163,16 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
         BenchmarkError: If it is missing or cannot be read, or the shapes of its arrays disagree.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            names, tokens, mask = data["names"], data["tokens"], data["mask"]
+        names, tokens, mask = read_npz(path, ("names", "tokens", "mask"))
     except FileNotFoundError as error:
         raise BenchmarkError(f"{path}: no such file") from error
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except ValueError as error:
         raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+    types = ", ".join(array.dtype.name for array in (names, tokens, mask))
+    if (names.dtype.kind, tokens.dtype, mask.dtype) != ("U", np.float64, np.bool_):
+        raise BenchmarkError(
+            f"{path}: names, tokens and mask are of types {types}; expected str, float64 and bool"
+        )
     if (
         names.ndim != 1
         or mask.shape != (len(names), *mask.shape[1:2])

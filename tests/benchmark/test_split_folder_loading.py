@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 
 from morphgen.benchmark.split_folder import Robots, load_split_folder
 from morphgen.errors import BenchmarkError
+from morphgen.formats import npz_files
 
 
 def test_loading_returns_plain_records_with_tokens(whole, example_split):
@@ -73,6 +75,34 @@ def test_inconsistent_token_arrays_are_errors(whole, change):
     del arrays[change]
     np.savez(whole / "tokens.npz", **arrays)
     with pytest.raises(BenchmarkError, match=f"cannot be read: .*{change}"):
+        load_split_folder(whole)
+
+
+@pytest.mark.parametrize("kind", ["U4", "M8[s]", "?", "c16"])
+def test_token_arrays_of_other_types_are_errors(whole, kind):
+    with np.load(whole / "tokens.npz") as data:
+        arrays = dict(data)
+    arrays["tokens"] = arrays["tokens"].astype(int).astype(kind)
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=r"are of types .*expected str, float64 and bool"):
+        load_split_folder(whole)
+
+
+def test_arrays_that_claim_or_hold_more_than_the_memory_are_errors(whole, monkeypatch):
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**9, 10**5)}
+    with zipfile.ZipFile(whole / "tokens.npz", "w") as archive:
+        for name in ("names", "tokens", "mask"):
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(BenchmarkError, match=r"tokens\.npz: cannot be read: "):
+        load_split_folder(whole)
+    monkeypatch.setattr(npz_files, "MAX_BYTES", 1000)
+    np.savez_compressed(whole / "tokens.npz", tokens=np.zeros(10_000))
+    with pytest.raises(BenchmarkError, match="its arrays have more than"):
+        load_split_folder(whole)
+    with (whole / "tokens.npz").open("wb") as file:
+        np.save(file, np.zeros(3))  # one array without an archive
+    with pytest.raises(BenchmarkError, match=r"tokens\.npz: cannot be read: "):
         load_split_folder(whole)
 
 
