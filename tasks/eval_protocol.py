@@ -47,10 +47,12 @@ class EvalProtocol:
                 f"simulator {self.simulator!r}: no simulator with contacts that comes with morphgen"
                 f"{nearest(self.simulator, valid)}"
             )
-        if not (1 <= self.episodes <= 10_000 and 0 <= self.seed < 2**63):
+        numbers = (self.episodes, self.seed)
+        is_whole = all(type(number) is int for number in numbers)
+        if not (is_whole and 1 <= self.episodes <= 10_000 and 0 <= self.seed < 2**63):
             raise BenchmarkError(
                 f"{self.episodes} episodes of seed {self.seed}: expected 1 to 10000 episodes, and "
-                "a seed of 0 or more"
+                "a seed of 0 or more, both whole numbers"
             )
 
     def as_data(self, split: Split) -> dict[str, Any]:
@@ -95,7 +97,7 @@ def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:
         return EvalProtocol(goals=goals, **rules)
     except KeyError as error:
         raise BenchmarkError(f"{where}: evaluation: missing key {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise BenchmarkError(f"{where}: evaluation: {error}") from error
     except MorphgenError as error:
         raise BenchmarkError(f"{where}: evaluation: {error}") from error
