@@ -114,8 +114,10 @@ def _relative(outcomes: RobotOutcomes, random: RandomScores | None) -> Array:
     scores = np.array(outcomes.score)
     if not TASKS[outcomes.task].relative_to_random:
         return scores
-    own = (random or {}).get((outcomes.side, outcomes.robot), outcomes.random_score)
-    relative: Array = scores - np.resize(np.array(own), len(scores))
+    own = np.array((random or {}).get((outcomes.side, outcomes.robot), outcomes.random_score))
+    if len(scores) % len(own):  # of another run: some episodes would count more often than others
+        own = np.array([own.mean()])
+    relative: Array = scores - np.resize(own, len(scores))
     return relative
 
 
@@ -123,14 +125,16 @@ def ranked(rows: Sequence[Row]) -> list[Row]:
     """Return rows by their result on the test robots, the best first.
 
     It is the mean score if the test robots have one task; scores of different tasks cannot be
-    added, so with several tasks it is the mean success rate. Rows without test robots come last.
+    added, so with several tasks it is the mean success rate. Rows without all of these tasks come
+    last.
     """
+    tasks = {side.task for row in rows for side in row.sides if side.side == "test"}
 
     def result(row: Row) -> float:
         test = [side for side in row.sides if side.side == "test"]
-        if not test:
+        if not test or len(test) < len(tasks):
             return -math.inf
-        if len(test) == 1:
+        if len(tasks) == 1:
             return test[0].score
         robots = sum(side.robots for side in test)
         return sum(side.success * side.robots for side in test) / robots

@@ -186,6 +186,14 @@ def test_the_random_scores_of_a_release_replace_those_of_a_submission():
     assert fair.sides == score_submission(submission()).sides
 
 
+def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
+    random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
+    for episodes in (4, 5, 8):
+        each = submission(data(episodes=episodes))
+        score = score_submission(each, random).group("test", "reach").score
+        assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
+
+
 def test_the_stratified_interval_is_that_of_the_mean_for_one_stratum():
     samples = np.random.default_rng(0).normal(size=40)
     assert stratified_mean_interval([samples]) == mean_interval(samples)
@@ -210,6 +218,9 @@ def test_rows_are_ranked_by_the_test_robots():
         row("b", ("test", "reach", 1, 10.0, 0.3), ("test", "push", 3, 0.9, 0.9)),
     ]
     assert [each.method for each in ranked(mixed)] == ["b", "a"]
+    # A baseline that can do one task only has a score, but no success rate over all robots.
+    partial = row("ik", ("test", "reach", 1, 200.0, 1.0))
+    assert [each.method for each in ranked([partial, *mixed])] == ["b", "a", "ik"]
     header, _, first, *_ = ranking_table(rows).splitlines()
     assert header.split()[:4] == ["rank", "method", "from", "seeds"]
     assert first.split()[:6] == ["1", "high", "study", "-", "20.0", "10%"]
@@ -308,10 +319,13 @@ def test_the_rules_of_an_evaluation_are_read_as_they_were_written():
     for change, why in (
         ({"simulator": "kinematic"}, "simulator 'kinematic': no simulator with contacts"),
         ({"episodes": 0}, "0 episodes"),
+        ({"episodes": 4.5}, "4.5 episodes"),
+        ({"seed": 1.5}, "seed 1.5"),
+        ({"goal_seed": math.inf}, "cannot convert float infinity"),
         ({"more": 1}, "unexpected keyword"),
         ({"constants": {"reach": {"near": "x"}}}, "near"),
         ({"goal_seed": "x"}, "invalid literal"),
-        ({"episodes": "4"}, "evaluation: "),
+        ({"episodes": "4"}, "expected 1 to 10000 episodes"),
     ):
         with pytest.raises(MorphgenError, match="a: evaluation: ") as caught:
             protocol_from({**rules, **change}, "a")
