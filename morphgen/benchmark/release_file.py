@@ -24,6 +24,7 @@ from typing import Any
 
 import msgspec
 
+from morphgen.benchmark.split_file import is_split_name
 from morphgen.benchmark.split_folder import require_split_folder
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import read_json
@@ -88,6 +89,8 @@ class Release(Record, frozen=True):
     def __post_init__(self) -> None:
         if self.format != FORMAT:
             raise ValueError(f"format {self.format}; this version reads {FORMAT}")
+        if not is_split_name(self.name):
+            raise ValueError(f"name {self.name!r}; expected the name of a split")
         if not _VERSION.fullmatch(self.version):
             raise ValueError(f"version {self.version!r}; expected one such as 1.0.0")
         if self.date and not _DATE.fullmatch(self.date):

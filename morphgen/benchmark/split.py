@@ -12,7 +12,7 @@ from importlib.metadata import version
 from typing import Literal
 
 from morphgen.benchmark.robot_hash import digest, robot_hash
-from morphgen.benchmark.token_layout import MAX_LINKS
+from morphgen.benchmark.token_layout import LARGEST_MAX_LINKS, MAX_LINKS
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
@@ -87,13 +87,13 @@ class Split:
         """Largest number of links of a robot, which scales link indices in tokens.
 
         Raises:
-            BenchmarkError: If the split's provenance has a value that is not an integer above 1.
+            BenchmarkError: If the split's provenance has a value that is not a valid number.
         """
         max_links = self.provenance.get(MAX_LINKS_KEY, MAX_LINKS)
-        if type(max_links) is not int or max_links < 2:
+        if type(max_links) is not int or not 2 <= max_links <= LARGEST_MAX_LINKS:
             raise BenchmarkError(
                 f"split {self.name!r}: made: {MAX_LINKS_KEY}: {max_links!r}; expected a whole "
-                "number, 2 or more"
+                f"number from 2 to {LARGEST_MAX_LINKS}"
             )
         return max_links
 

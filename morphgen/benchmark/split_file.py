@@ -38,7 +38,7 @@ OPTIONAL = ("reference", "made", "accepted", "statistics")
 MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
 """Keys of a robot, in order."""
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
-
+_ROBOT_RULE = "use letters, digits, '-', '_', '+' and '.'"
 TASK_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 _BODY = re.compile(rf"[0-9a-f]{{{HASH_LENGTH}}}")
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -52,6 +52,7 @@ _WORDS = frozenset(("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 _QUOTED = frozenset(("id", "body", "derivation"))
 """Keys whose values are always quoted, as some hashes must be."""
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][\w.-]*(?:/[A-Za-z0-9][\w.-]*)*")
+_NAME_RULE = "use letters, digits, '-', '_' and '.', in words parted by '/'"
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,8 @@ class _Reader:
         self._require_format(node)
         fields = self._fields(node, FIELDS, "a split", optional=OPTIONAL)
         names = {key: self._text(fields[key], key) for key in ("morphgen", "name", "id", "summary")}
+        if not is_split_name(names["name"]):
+            raise self._fail(fields["name"], f"name: {names['name']!r}: {_NAME_RULE}")
         split = Split(
             names["name"],
             cast(Regime, self._choice(fields["regime"], "regime", REGIMES)),
@@ -177,9 +180,7 @@ class _Reader:
         fields = self._fields(node, MEMBER, f"a robot of {side}")
         name = self._text(fields["name"], "name")
         if not ROBOT_NAME.fullmatch(name):
-            raise self._fail(
-                fields["name"], f"name: {name!r}: use letters, digits, '-', '_', '+' and '.'"
-            )
+            raise self._fail(fields["name"], f"name: {name!r}: {_ROBOT_RULE}")
         body = self._text(fields["body"], "body")
         if not _BODY.fullmatch(body):
             raise self._fail(
@@ -262,7 +263,7 @@ def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
         if not path.is_file():
             raise BenchmarkError(f"{path}: no such file")
         return path
-    if _SPLIT_NAME.fullmatch(name):
+    if is_split_name(name):
         for folder in (*folders, _shipped()):
             candidate = folder / f"{name}{SUFFIX}"
             if candidate.is_file():
@@ -347,10 +348,13 @@ def require_split_name(name: str) -> None:
     Raises:
         BenchmarkError: If it cannot.
     """
-    if not _SPLIT_NAME.fullmatch(name):
-        raise BenchmarkError(
-            f"name {name!r}: use letters, digits, '-', '_' and '.', in words parted by '/'"
-        )
+    if not is_split_name(name):
+        raise BenchmarkError(f"name {name!r}: {_NAME_RULE}")
+
+
+def is_split_name(name: str) -> bool:
+    """Return whether a text can be the name of a split: also the path of a file in a folder."""
+    return bool(_SPLIT_NAME.fullmatch(name))
 
 
 def _shipped() -> Path:
@@ -379,9 +383,7 @@ def _plain_data(value: object) -> object:
 
 def _member_line(member: Member) -> str:
     if not ROBOT_NAME.fullmatch(member.name):
-        raise BenchmarkError(
-            f"robot name {member.name!r}: use letters, digits, '-', '_', '+' and '.'"
-        )
+        raise BenchmarkError(f"robot name {member.name!r}: {_ROBOT_RULE}")
     values = ", ".join(
         _pair(key, member.robot_hash if key == "body" else getattr(member, key)) for key in MEMBER
     )

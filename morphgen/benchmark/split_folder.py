@@ -169,7 +169,7 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
     except ValueError as error:
         raise BenchmarkError(f"{path}: cannot be read: {error}") from error
     types = ", ".join(array.dtype.name for array in (names, tokens, mask))
-    if (names.dtype.kind, tokens.dtype, mask.dtype) != ("U", np.float64, np.bool_):
+    if names.dtype.kind != "U" or tokens.dtype != np.float64 or mask.dtype != np.bool_:
         raise BenchmarkError(
             f"{path}: names, tokens and mask are of types {types}; expected str, float64 and bool"
         )

@@ -24,6 +24,8 @@ from morphgen.typing import Array
 TOKEN_SIZE = 48
 MAX_LINKS = 23
 """Number of links of the paper's largest robot: 22 and the base."""
+LARGEST_MAX_LINKS = 10_000
+"""Largest ``max_links``: a robot's tokens have as many rows, so a larger one fills the memory."""
 TOLERANCE = 1e-4
 """Largest error of a number that is still decoded; single-precision tokens are within it."""
 
@@ -84,13 +86,15 @@ def default_max_links(link_counts: Iterable[int]) -> int:
 
 
 def require_max_links(n_links: int, what: str, max_links: int) -> None:
-    """Require at most ``max_links`` links, and a ``max_links`` of at least 2.
+    """Require at most ``max_links`` links, and a valid ``max_links``.
 
     Raises:
         BenchmarkError: If one of the two is violated; ``what`` names the robot in the message.
     """
-    if max_links < 2:
-        raise BenchmarkError(f"max_links {max_links}: expected 2 or more, such as {MAX_LINKS}")
+    if not 2 <= max_links <= LARGEST_MAX_LINKS:
+        raise BenchmarkError(
+            f"max_links {max_links}: expected 2 to {LARGEST_MAX_LINKS}, such as {MAX_LINKS}"
+        )
     if n_links > max_links:
         raise BenchmarkError(
             f"{what} has {n_links} links, more than max_links {max_links}; "

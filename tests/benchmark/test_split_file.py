@@ -164,6 +164,7 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
         ("obstacles: true", "obstacles: maybe", 0, "obstacles: 'maybe'; valid: false, true"),
         ("name: ur5-stick", "nmae: ur5-stick", 0, "unknown key 'nmae'; did you mean 'name'?"),
         ("name: ur5-stick, ", "", 0, "a robot of test lacks 'name'"),
+        ("name: mine/first", "name: ../first", 0, "name: '../first': use letters, digits"),
         ("name: ur5-stick", "name: ../x", 0, "name: '../x': use letters, digits"),
         ("name: arm3-000001", "name: ur5-plane", 0, "train: two robots are named 'ur5-plane'"),
         ('body: "1e5', 'body: "1g5', 0, "body: '1g500"),
@@ -262,3 +263,10 @@ def test_a_failed_write_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         write_split(SPLIT, tmp_path / "x.yaml")
     assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("max_links", [1, 10**9, 2.5])
+def test_an_invalid_number_of_links_is_an_error(max_links):
+    split = replace(SPLIT, provenance={"max_links": max_links})
+    with pytest.raises(BenchmarkError, match="expected a whole number from 2 to 10000"):
+        _ = split.max_links
