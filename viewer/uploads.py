@@ -29,9 +29,9 @@ from morphgen.formats.bundle import CARD, PICTURE, URDF
 from morphgen.formats.resolve import PackageFinder, resolve_uri
 from morphgen.formats.xml import parse_xml
 from morphgen.formats.zip_files import (
-    ENTRY_SIGNATURE,
     UNREADABLE,
     ZipLimits,
+    require_few_entries,
     safe_entries,
     stays_inside,
 )
@@ -102,10 +102,8 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
 
 def _unzip(name: str, content: bytes) -> dict[str, bytes]:
     """Return the files of a zip by their paths, after checking its table of contents."""
-    # Counted in the raw bytes, because zipfile would read a table of millions of entries.
-    if content.count(ENTRY_SIGNATURE) > LIMITS.max_files:
-        raise UploadError(f"{name}: holds more than {LIMITS.max_files} files; nothing was kept")
     try:
+        require_few_entries(io.BytesIO(content), LIMITS)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return {path: archive.read(entry) for entry, path in safe_entries(archive, LIMITS)}
     except FormatError as error:

@@ -18,7 +18,7 @@ from typing import IO
 from morphgen.errors import FormatError
 from morphgen.formats.files import replacing_file
 
-ENTRY_SIGNATURE = b"PK\x01\x02"
+_ENTRY_SIGNATURE = b"PK\x01\x02"
 """First bytes of every entry in a zip's table of contents."""
 _COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Accepted methods; others (LZMA) can allocate gigabytes before they return a byte."""
@@ -102,6 +102,8 @@ def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
     try:
         if path.stat().st_size > limits.max_bytes:
             raise FormatError(f"{path}: more than {limits.max_bytes // 2**20} MB")
+        with path.open("rb") as file:
+            require_few_entries(file, limits)
         with zipfile.ZipFile(path) as archive:
             for entry, name in safe_entries(archive, limits):
                 target = folder / name
@@ -113,6 +115,24 @@ def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
         raise FormatError(f"{path}: no such file") from error
     except UNREADABLE as error:
         raise FormatError(f"{path}: not a readable zip: {_shortened(str(error))}") from error
+
+
+def require_few_entries(file: IO[bytes], limits: ZipLimits) -> None:
+    """Require that the table of contents of an archive is not too large to be read.
+
+    The entries are counted in the raw bytes, because ``zipfile`` reads a table of millions of them
+    into memory.
+
+    Raises:
+        FormatError: If it holds too many files; the message does not name the archive.
+    """
+    count, end = 0, b""
+    while chunk := file.read(_CHUNK):
+        count += (end + chunk).count(_ENTRY_SIGNATURE)
+        end = chunk[1 - len(_ENTRY_SIGNATURE) :]  # one byte too short to be counted again
+    # Folders are entries, too; compressed data may hold the signature by chance.
+    if count > 2 * limits.max_files:
+        raise FormatError(f"holds more than {limits.max_files} files")
 
 
 def safe_entries(archive: zipfile.ZipFile, limits: ZipLimits) -> list[tuple[zipfile.ZipInfo, str]]:

@@ -7,6 +7,7 @@ import zipfile
 import pytest
 
 from morphgen.errors import FormatError
+from morphgen.formats import zip_files
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_entries, write_zip
 
 LIMITS = ZipLimits(max_bytes=10_000, max_files=5)
@@ -99,3 +100,15 @@ def test_a_failed_write_leaves_nothing(tmp_path):
     with pytest.raises(FormatError, match="cannot write"):
         write_zip(tmp_path / "a.zip", {"x": tmp_path / "missing"})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_table_of_too_many_entries_is_not_read(tmp_path, monkeypatch):
+    path = archive(tmp_path / "many.zip", [(f"folder{i}/", b"") for i in range(11)])
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr(zipfile, "ZipFile", None)
+    for chunk in (2**20, 7):  # signatures at the ends of chunks count once
+        monkeypatch.setattr(zip_files, "_CHUNK", chunk)
+        with pytest.raises(FormatError, match=r"many\.zip: holds more than 5 files"):
+            unpack_zip(path, tmp_path / "out", LIMITS)
+    with path.open("rb") as file:
+        zip_files.require_few_entries(file, ZipLimits(max_bytes=10_000, max_files=6))
