@@ -27,6 +27,7 @@ FORMAT = 1
 KIND = "morphgen submission"
 Name = Annotated[str, Meta(min_length=1, max_length=200)]
 Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
 class SplitName(Record, frozen=True):
@@ -70,7 +71,7 @@ class Submission(Record, frozen=True):
     """Name of the method in rankings."""
     mode: Literal["", "deterministic", "stochastic"]
     """How the policy acts; empty for a baseline."""
-    training_seed: Count | None
+    training_seed: Seed | None
     """Seed of the training; None for a baseline."""
     morphgen: Name
     """Version of morphgen that ran the episodes."""

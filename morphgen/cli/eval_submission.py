@@ -71,7 +71,7 @@ def plan_submission(
 
     Raises:
         TaskError: If the robots are not those of a split, or the test side is left out.
-        BenchmarkError: If the evaluation does not follow the rules.
+        BenchmarkError: If the evaluation does not follow the rules, or the name is invalid.
     """
     from morphgen.benchmark.split_file import parse_split
     from morphgen.rl.submission import SubmissionRecorder
@@ -86,16 +86,15 @@ def plan_submission(
         raise TaskError("--submission: the test robots are needed; leave --on train out")
     if not args.submission.parent.is_dir():
         raise TaskError(f"{args.submission}: there is no folder {args.submission.parent}")
+    if args.submission.is_dir():
+        raise TaskError(f"{args.submission}: is a folder; expected the name of a file")
     split = parse_split(source.split, Path(source.name)).split
     rules = rules_of(args.words)
     goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)
     followed = EvalProtocol(config.sim, config.episodes, config.seed, goals).as_data(split)
     require_rules(followed, rules.as_data(split), "--submission")
-    return PlannedSubmission(
-        args.submission,
-        args.method or method,
-        mode,
-        training_seed,
-        followed,
-        SubmissionRecorder(split),
-    )
+    name = method if args.method is None else args.method
+    record = SubmissionRecorder(split)
+    # Refuses an invalid name or seed now, not after hours of episodes.
+    record.submission(name, mode, training_seed, followed)
+    return PlannedSubmission(args.submission, name, mode, training_seed, followed, record)

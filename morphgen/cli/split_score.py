@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     option(
         "--split",
         metavar="SPLIT",
-        help="archive or folder of a release, or name or file of a split (default: the split that "
-        "the first submission names)",
+        help="archive or folder of a release, or name or file of a split (default: the split of "
+        "morphgen that the first submission names)",
     ),
     flag("--markdown", "print the table as Markdown"),
     *opt.JOBS_LIBRARY_JSON,
@@ -52,7 +52,7 @@ def score(args: argparse.Namespace) -> None:
 
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
-    name = args.split or submissions[0].split.name
+    name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
     with ExitStack() as stack:
         split, protocol, references, version = _open(name, stack)
     with bar(args, "composing robots") as update:
@@ -76,6 +76,19 @@ def score(args: argparse.Namespace) -> None:
     ]
     style = "github" if args.markdown else "simple"
     opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
+
+
+def _shipped_split(name: str, where: Path) -> str:
+    """Return the name of a split that comes with morphgen; a submission cannot name other files."""
+    from morphgen.benchmark.split_file import split_names
+    from morphgen.errors import BenchmarkError
+
+    if name not in split_names():
+        raise BenchmarkError(
+            f"{where}: split.name: {name} is not a split that comes with morphgen; name its "
+            "release or file with --split"
+        )
+    return name
 
 
 def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:

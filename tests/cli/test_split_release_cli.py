@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from helpers.splits import TEST, TRAIN, combined, member
+from helpers.submissions import data
 from morphgen.benchmark.split_file import read_split, split_text
 
 STICKS = ("split", "new", "interpolation", "--grammar", "stick", "--train", "4", "--name")
@@ -152,12 +153,22 @@ def test_submission_options_are_refused_where_they_do_nothing(refused, small):
     assert "prims is no split" in refused(*words)
     words = ("eval", "zero", "--split", small, "--submission", "none/a.json")
     assert "there is no folder none" in refused(*words)
+    words = ("eval", "zero", "--split", small, "--submission")
+    Path("folder").mkdir()
+    assert "folder: is a folder" in refused(*words, "folder")
+    for name, why in (("", "length >= 1"), ("a\nb", "printable"), ("a" * 201, "length <= 200")):
+        assert why in refused(*words, "a.json", "--method", name)
 
 
 def test_score_refuses_other_files(refused, small):
     Path("a.json").write_text("{}")
     assert "a.json: no submission" in refused("split", "score", "a.json", "--split", small)
     assert "b.json: no such file" in refused("split", "score", "b.json", "--split", small)
+    values = data()
+    Path("c.json").write_text(json.dumps(values))
+    assert "c.json: split.name: mine/small is not" in refused("split", "score", "c.json")
+    Path("c.json").write_text(json.dumps(values | {"split": values["split"] | {"name": small}}))
+    assert "c.json: split.name: small.yaml is not" in refused("split", "score", "c.json")
 
 
 @pytest.mark.slow
