@@ -1,4 +1,4 @@
-"""Map a function over items in one process or in several, and connect to Ray."""
+"""Processes and threads: map a function over items in several processes, connect to Ray."""
 
 from __future__ import annotations
 
@@ -207,6 +207,23 @@ def _working() -> Iterator[Callable[[], bool]]:
         yield lambda: not stopped.value
     finally:
         _is_working = False
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run the networks and tensors of a block, or of a decorated function, in one thread.
+
+    The order of a sum, and so its last bits, depend on the number of threads. Threads that wait for
+    each other in small operations also slow a busy machine down, many times over.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def require_ray() -> ModuleType:

@@ -9,6 +9,7 @@ from typing import Any
 
 from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
+from morphgen.processes import one_torch_thread
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
@@ -152,8 +153,9 @@ def play(
         scores: list[float] = []
         successes, over = 0, False
         while not over:
-            action = controller.act(env.batch)[0, links].cpu().numpy()
-            _, _, terminated, truncated, info = env.step(action)
+            with one_torch_thread():
+                action = controller.act(env.batch)[0, links].cpu().numpy()
+                _, _, terminated, truncated, info = env.step(action)
             scores.append(info["score"])
             successes = successes + 1 if info["success"] else 0
             over = terminated or truncated or successes == max_successes

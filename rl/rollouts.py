@@ -9,6 +9,7 @@ from typing import Protocol
 
 import torch
 
+from morphgen.processes import one_torch_thread
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
@@ -48,6 +49,7 @@ class Episode:
         return self.steps * CONTROL_PERIOD
 
 
+@one_torch_thread()
 def run_episodes(
     batch: TaskBatch,
     controller: Controller,

@@ -5,13 +5,10 @@ Initial guesses are improved by gradient ascent on a soft IoU; counted sample po
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -24,6 +21,7 @@ from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import normalize
+from morphgen.processes import one_torch_thread
 from morphgen.typing import Array
 
 COARSE_POINTS = 2**11
@@ -135,7 +133,7 @@ def sample_solid(solid: Solid, seed: int) -> SampledSolid:
 
 def best_single(target: SampledSolid) -> SearchResult:
     """Return the single primitive of largest IoU."""
-    with _one_torch_thread():
+    with one_torch_thread():
         cloud = target.points[target.inside]
         start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
         return _climb(target, start, (0.03, 0.008))
@@ -150,7 +148,7 @@ def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> Search
     subset = slice(4 * COARSE_POINTS)
     cloud = target.points[subset], target.inside[subset], target.weights[subset]
     k = len(fewer.shapes) + 1
-    with _one_torch_thread():
+    with one_torch_thread():
         starts = by_pieces(*cloud, k, seeds), by_growth(fewer.candidate, *cloud, seeds[0])
         start = [guesses for guesses in starts if guesses is not None]
         return _climb(target, Candidates.stack(start), (0.02, 0.006)) if start else None
@@ -181,14 +179,3 @@ def _climb(target: SampledSolid, start: Candidates, tau: tuple[float, float]) ->
     ious = overlaps(fine, points, inside, weights)
     row = int(np.argmax(ious))
     return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Use one thread: the order of a sum, and so its last bits, depend on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
