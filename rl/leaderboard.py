@@ -10,6 +10,7 @@ import numpy as np
 from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
+from morphgen.errors import BenchmarkError
 from morphgen.formats.records import FiniteNumber, Record
 from morphgen.rl.eval_report import SIDES as SIDE_NAMES
 from morphgen.rl.intervals import stratified_mean_interval
@@ -82,6 +83,9 @@ def score_submission(
         submission: The submission.
         random: Scores of the random policy; by default those in the submission.
         source: Source of the row.
+
+    Raises:
+        BenchmarkError: If ``random`` lacks a robot of the submission.
     """
     groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
     for side in SIDES:
@@ -114,7 +118,14 @@ def _relative(outcomes: RobotOutcomes, random: RandomScores | None) -> Array:
     scores = np.array(outcomes.score)
     if not TASKS[outcomes.task].relative_to_random:
         return scores
-    own = np.array((random or {}).get((outcomes.side, outcomes.robot), outcomes.random_score))
+    if random is None:
+        random = {(outcomes.side, outcomes.robot): outcomes.random_score}
+    if (outcomes.side, outcomes.robot) not in random:
+        raise BenchmarkError(
+            f"{outcomes.side} robot {outcomes.robot}: the release has no episodes of the random "
+            "policy; leave the robots of this side out"
+        )
+    own = np.array(random[outcomes.side, outcomes.robot])
     if len(scores) % len(own):  # of another run: some episodes would count more often than others
         own = np.array([own.mean()])
     relative: Array = scores - np.resize(own, len(scores))

@@ -60,7 +60,7 @@ class References:
     @property
     def random(self) -> Submission | None:
         """The submission of the random policy, if the release holds one."""
-        return next((each for each in self.submissions if each.method == RANDOM), None)
+        return next((each for each in self.submissions if _is_random(each)), None)
 
     def all_rows(self) -> list[Row]:
         """Return the scores of the submissions, and the rows of other runs in studies."""
@@ -106,6 +106,11 @@ def reference_files(
                 continue
             expected = expected or expected_robots(split, protocol, library, jobs=jobs)
             check_submission(submission, str(file), split, protocol, expected, version("morphgen"))
+            if _is_random(submission) and len(submission.robots) < len(expected):
+                raise BenchmarkError(
+                    f"{file}: {RANDOM}: the train robots are missing, to whose episodes the scores "
+                    "of other submissions are relative; evaluate it on both sides"
+                )
             name = f"{SUBMISSIONS_DIR}/{_file_name(submission)}"
             if name in submissions and submissions[name] != submission:
                 raise BenchmarkError(f"{file}: another submission of {submission.method} is there")
@@ -239,6 +244,12 @@ def _rows(cells: Sequence[_Cell]) -> list[Row]:
         episodes = min(score.episodes for score in scores)
         rows.append(Row(method, "study", mode, seeds, episodes, tuple(sides)))
     return rows
+
+
+def _is_random(submission: Submission) -> bool:
+    """Return whether a submission is of the baseline, not of a policy with its name."""
+    is_baseline = submission.mode == "" and submission.training_seed is None
+    return submission.method == RANDOM and is_baseline
 
 
 def _file_name(submission: Submission) -> str:

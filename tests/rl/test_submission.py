@@ -228,30 +228,40 @@ def test_rows_are_ranked_by_the_test_robots():
 
 def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
     monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
-    for method in ("random", "ours"):
-        (tmp_path / f"{method}.json").write_text(json.dumps(data(method)))
+    baseline = data("random") | {"mode": "", "training_seed": None}
+    for method, values in (("random", baseline), ("ours", data()), ("other", data("random"))):
+        (tmp_path / f"{method}.json").write_text(json.dumps(values))
     cell = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed3"
     write_cell(cell)
-    paths = [tmp_path / "random.json", tmp_path / "ours.json", tmp_path / "study"]
+    names = ("random.json", "ours.json", "other.json", "study")
+    paths = [tmp_path / name for name in names]
     files = reference_files(paths, SPLIT, PROTOCOL, LIBRARY)
     assert set(files) == {
-        *("scores.json", "submissions/ours-seed0.json", "submissions/random-seed0.json")
+        *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
+        "submissions/random-seed0.json",  # a policy of this name
     }
     assert files == reference_files(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
     for name, content in files.items():
         (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "release" / name).write_bytes(content)
     references = read_references(tmp_path / "release")
-    assert references.random.method == "random"
+    assert references.random.training_seed is None
     rows = references.all_rows()
     assert {(each.method, each.source, each.seeds) for each in rows} == {
         ("ours", "reference", (0,)),
+        ("random", "reference", ()),
         ("random", "reference", (0,)),
         ("me-mlp", "study", (3,)),
     }
     study = next(each for each in rows if each.source == "study")
     assert study.group("test", "reach").low == 1
     assert read_references(tmp_path).rows == ()
+    baseline["robots"] = baseline["robots"][TEST:]
+    (tmp_path / "random.json").write_text(json.dumps(baseline))
+    with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
+        reference_files(paths, SPLIT, PROTOCOL, LIBRARY)
+    with pytest.raises(BenchmarkError, match=r"train robot [a-z-]+: the release has no episodes"):
+        score_submission(submission(), random_scores(submission(baseline)))
 
 
 def write_cell(folder, **changes):
