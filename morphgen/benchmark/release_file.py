@@ -14,6 +14,7 @@ An archive is a zip of this folder.
 
 from __future__ import annotations
 
+import datetime
 import json
 import re
 import tempfile
@@ -42,8 +43,8 @@ FORMAT = 1
 LIMITS = ZipLimits(max_bytes=4 * 2**30, max_files=100_000)
 """Bounds on an archive: a split of 1,000 robots with meshes has 2 GB and 20,000 files."""
 
-_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}(?:[-+.]?[0-9A-Za-z]{1,20})?")
-_DATE = re.compile(r"\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")
+_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}(?:[-+.]?[0-9A-Za-z]{1,20})?", re.ASCII)
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 _URL = re.compile(r"https?://[^\s\"<>]{1,500}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
@@ -93,7 +94,7 @@ class Release(Record, frozen=True):
             raise ValueError(f"name {self.name!r}; expected the name of a split")
         if not _VERSION.fullmatch(self.version):
             raise ValueError(f"version {self.version!r}; expected one such as 1.0.0")
-        if self.date and not _DATE.fullmatch(self.date):
+        if self.date and not _is_date(self.date):
             raise ValueError(f"date {self.date!r}; expected one such as 2027-01-31")
         if self.url and not _URL.fullmatch(self.url):
             raise ValueError(f"url {self.url!r}; expected an address such as https://example.org")
@@ -102,6 +103,14 @@ class Release(Record, frozen=True):
     def stem(self) -> str:
         """Name of the archive without its suffix, and of the folder in it."""
         return f"{self.name.replace('/', '-')}-{self.version}"
+
+
+def _is_date(text: str) -> bool:
+    """Return whether a text is a day of the calendar, such as ``2027-01-31``."""
+    try:
+        return bool(_DATE.fullmatch(text) and datetime.date.fromisoformat(text))
+    except ValueError:
+        return False
 
 
 def release_text(release: Release) -> str:

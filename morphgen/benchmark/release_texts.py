@@ -140,7 +140,8 @@ def _part_lines(part: LicencedPart) -> list[str]:
 
 
 def _front_matter(split: Split, release: Release, parts: Sequence[LicencedPart]) -> str:
-    ids = [find_licence(each).hub_id for each in licence_ids(parts)]
+    # Several licences may have one identifier there, such as gpl-3.0.
+    ids = list(dict.fromkeys(find_licence(each).hub_id for each in licence_ids(parts)))
     robots = len(split.train) + len(split.test)
     tasks = sorted({member.task for side in SIDES for member in split.side(side)})
     data = {
