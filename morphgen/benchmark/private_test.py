@@ -54,7 +54,7 @@ def make_secret(path: Path) -> str:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
-        if os.name == "posix" and path.stat().st_mode & _OTHERS:
+        if os.name == "posix" and path.is_file() and path.stat().st_mode & _OTHERS:
             raise BenchmarkError(
                 f"{path}: others can read this secret; allow only its owner: chmod 600 {path}"
             ) from None

@@ -96,6 +96,9 @@ class Release(Record, frozen=True):
             raise ValueError(f"version {self.version!r}; expected one such as 1.0.0")
         if self.date and not _is_date(self.date):
             raise ValueError(f"date {self.date!r}; expected one such as 2027-01-31")
+        for creator in self.creators:
+            if not creator or not creator.isprintable():
+                raise ValueError(f"creator {creator!r}; expected printable characters")
         if self.url and not _URL.fullmatch(self.url):
             raise ValueError(f"url {self.url!r}; expected an address such as https://example.org")
 

@@ -100,7 +100,10 @@ def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
             files may have been written to ``folder``, and nowhere else.
     """
     try:
-        if path.stat().st_size > limits.max_bytes:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe may never end
+            raise FormatError(f"{path}: is not a regular file")
+        if status.st_size > limits.max_bytes:
             raise FormatError(f"{path}: more than {limits.max_bytes // 2**20} MB")
         with path.open("rb") as file:
             require_few_entries(file, limits)

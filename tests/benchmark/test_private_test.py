@@ -159,6 +159,8 @@ def test_a_new_secret_is_random_and_its_owners_alone(tmp_path):
     assert [read_secret(path) for path in paths] == secrets
     assert [make_secret(path) for path in paths] == secrets
     assert stat.S_IMODE(paths[0].stat().st_mode) == 0o600
+    with pytest.raises(BenchmarkError, match="is not a regular file"):
+        make_secret(tmp_path)
     paths[0].chmod(0o644)
     with pytest.raises(BenchmarkError, match="others can read this secret"):
         make_secret(paths[0])

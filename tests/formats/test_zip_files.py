@@ -83,6 +83,8 @@ def test_other_compression_and_broken_archives_are_refused(tmp_path):
             unpack_zip(tmp_path / "cut.zip", tmp_path / "out", LIMITS)
     with pytest.raises(FormatError, match="no such file"):
         unpack_zip(tmp_path / "none.zip", tmp_path / "out", LIMITS)
+    with pytest.raises(FormatError, match="out: is not a regular file"):
+        unpack_zip(tmp_path / "out", tmp_path / "out", LIMITS)
 
 
 def test_an_entry_that_is_larger_than_it_says_is_refused(tmp_path):

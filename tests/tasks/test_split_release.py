@@ -154,6 +154,7 @@ def test_leaky_splits_and_restricted_parts_are_not_released(tmp_path):
         ({"version": "one"}, "release: version 'one'; expected one such as 1.0.0"),
         ({"date": "2027-02-30"}, "release: date '2027-02-30'; expected one such as 2027-01-31"),
         ({"date": "31.1.2027"}, "release: date '31.1.2027'; expected one such as 2027-01-31"),
+        ({"creators": ("a\nb",)}, "release: creator 'a\\nb'; expected printable characters"),
         ({"url": "nowhere"}, "release: url 'nowhere'; expected an address"),
     ],
 )
