@@ -205,12 +205,26 @@ def _cells(
     if "morphgen" in table:  # versions before 0.2.0 did not write it
         require_series(str(table["morphgen"]), version("morphgen"), str(file))
     require_rules(found.as_data(split), protocol.as_data(split), str(file))
+    for records in scores.values():
+        _require_all_robots(records, split, file)
     parent = file.parent.name
     is_seed = parent.removeprefix("seed").isdecimal() and parent.startswith("seed")
     seed = int(parent.removeprefix("seed")) if is_seed else None
     method = file.parent.parent.name if is_seed else parent
     for mode, records in scores.items():
         yield _Cell(file, method, "" if mode in BASELINES else mode, seed, records)
+
+
+def _require_all_robots(scores: Sequence[Score], split: Split, file: Path) -> None:
+    """Require a score of every robot of a side with a task: means of fewer do not compare."""
+    for side, task in {(score.side, score.task) for score in scores}:
+        found = sorted(s.robot for s in scores if (s.side, s.task) == (side, task))
+        expected = sorted(each.name for each in split.side(side) if each.task == task)
+        if found != expected:
+            raise BenchmarkError(
+                f"{file}: scores of {side} robots at {task}: {', '.join(found)}; expected one of "
+                f"each: {', '.join(expected) or 'none'}"
+            )
 
 
 def _rows(cells: Sequence[_Cell]) -> list[Row]:

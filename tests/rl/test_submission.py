@@ -311,6 +311,13 @@ def test_references_of_other_splits_and_rules_are_refused(tmp_path):
     write_cell(tmp_path / "a" / "seed0", eval={"sim": "pybullet", "episodes": 4, "seed": 0})
     with pytest.raises(BenchmarkError, match=r"evaluation\.simulator: 'pybullet'"):
         reference_files([tmp_path / "a"], SPLIT, PROTOCOL, LIBRARY)
+    write_cell(tmp_path / "e" / "seed0")
+    path = tmp_path / "e" / "seed0" / "scores.json"
+    content = json.loads(path.read_text())
+    del content["scores"]["deterministic"][0]
+    path.write_text(json.dumps(content))
+    with pytest.raises(BenchmarkError, match=r"scores of train robots at reach: .*; expected one"):
+        reference_files([tmp_path / "e"], SPLIT, PROTOCOL, LIBRARY)
     write_cell(tmp_path / "b" / "seed0")
     other = small_split(task="push")
     with pytest.raises(BenchmarkError, match=r"b: no scores of split mine/small, id "):
