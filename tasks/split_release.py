@@ -35,7 +35,7 @@ from morphgen.benchmark.split_folder_files import BUNDLED, BuildSettings, sums_t
 from morphgen.benchmark.statistics import DIGITS, summarize_survey
 from morphgen.benchmark.survey import SplitSurvey, survey_split
 from morphgen.errors import BenchmarkError, FormatError
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import file_sha256, write_atomic
 from morphgen.formats.records import read_record
 from morphgen.formats.zip_files import write_zip
 from morphgen.grammar.library import Library
@@ -231,8 +231,8 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
     files = {f"{release.stem}/{name}": folder / name for name in names}
     made, archive = folder.parent / "archive.zip", out / f"{release.stem}.zip"
     write_zip(made, files)
-    digest = _sha256(made)
-    if archive.is_file() and _sha256(archive) != digest:
+    digest = file_sha256(made)
+    if archive.is_file() and file_sha256(archive) != digest:
         raise BenchmarkError(
             f"{archive} exists with another content; a release does not change: name another "
             "--version or --out"
@@ -241,10 +241,5 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
         made.replace(archive)
     except OSError as error:
         raise FormatError(f"cannot write {archive}: {error.strerror}") from error
-    content = _sha256(folder / SUMS_FILE)
+    content = file_sha256(folder / SUMS_FILE)
     return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size, release)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator, Mapping
@@ -40,7 +39,7 @@ from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import locked_folder, partial_path, write_atomic
+from morphgen.formats.files import file_sha256, locked_folder, partial_path, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
@@ -184,7 +183,7 @@ def _finish(
     write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
     write_atomic(split_folder / README_FILE, readme_text(split, settings))
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
-    sums = {name: hashlib.sha256((split_folder / name).read_bytes()).hexdigest() for name in single}
+    sums = {name: file_sha256(split_folder / name) for name in single}
     paths = robot_paths(split)
     for robot_hash, robot in robots.items():
         sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -23,7 +22,7 @@ from morphgen.formats.bundle import (
 )
 from morphgen.formats.card import card_text, robot_card
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import replacing_folder
+from morphgen.formats.files import file_sha256, replacing_folder
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.robot_set import DERIVATION, light_urdf
 from morphgen.model.robot import Robot
@@ -74,7 +73,7 @@ def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
 def hashes(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of every file in a folder, hexadecimal, by its path, sorted."""
     return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        path.relative_to(folder).as_posix(): file_sha256(path)
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }

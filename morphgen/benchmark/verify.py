@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -46,6 +45,7 @@ from morphgen.benchmark.split_folder_robots import differences, hashes, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_json
+from morphgen.formats.files import file_sha256
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
@@ -116,7 +116,7 @@ def verify(
             differences += _release_differences(folder, split_file.split, library)
     else:
         differences += compare_robots(split_file.split, library, jobs=jobs, progress=progress)
-    content = _sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
+    content = file_sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
     return Verification(split_file.split, computed_id, tuple(differences), content)
 
 
@@ -304,7 +304,3 @@ def _token_differences(
             yield Difference(
                 name, f"{path.name}: {token_field.name} of link {link} is not the robot's"
             )
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

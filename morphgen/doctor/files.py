@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -12,6 +11,7 @@ from pathlib import Path
 from morphgen.doctor import reference
 from morphgen.doctor.entry import Entry, attempt
 from morphgen.errors import MorphgenError, PartError
+from morphgen.formats.files import file_sha256
 from morphgen.formats.resolve import REQUIREMENTS, distribution_file
 from morphgen.grammar.catalogue import source_digest, stored_facts
 from morphgen.grammar.library import (
@@ -113,7 +113,7 @@ def _goal_sets() -> Entry:
 
 
 def _has_hash(path: Path, sha256: str) -> bool:
-    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+    return path.is_file() and file_sha256(path) == sha256
 
 
 def _policies() -> Entry:

@@ -9,7 +9,6 @@ needs a new minor version; then record the new values and describe them in ``doc
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -23,10 +22,12 @@ import numpy as np
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.split_folder_robots import hashes
 from morphgen.benchmark.token_layout import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES
 from morphgen.benchmark.tokens import tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import CARD, write_bundle
+from morphgen.formats.files import file_sha256
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import Library, default_library
@@ -71,13 +72,13 @@ def splits() -> dict[str, str]:
 
 def goal_sets() -> str:
     """Return the hash of the index of the shipped goal sets, which has the hash of each file."""
-    return hashlib.sha256((FOLDER / INDEX).read_bytes()).hexdigest()
+    return file_sha256(FOLDER / INDEX)
 
 
 def checkpoints() -> dict[str, str]:
     """Return the hashes of the shipped policies' files."""
     files = {name: POLICIES[name].file for name in POLICIES.builtin}
-    return {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    return {name: file_sha256(file) for name, file in files.items()}
 
 
 def constants() -> dict[str, Any]:
@@ -129,11 +130,7 @@ def file_hashes(robot: Robot) -> dict[str, str]:
     """Return the hashes of a bundle's files by path, without the card, which has the version."""
     with TemporaryDirectory() as parent:
         folder = write_bundle(robot, Path(parent) / robot.name, (), picture=False)
-        return {
-            path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in sorted(folder.rglob("*"))
-            if path.is_file() and path.name != CARD
-        }
+        return {name: value for name, value in hashes(folder).items() if name != CARD}
 
 
 def score() -> float:

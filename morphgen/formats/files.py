@@ -1,7 +1,8 @@
-"""Write files and folders atomically, and lock folders against concurrent runs."""
+"""Write files and folders atomically, lock folders against concurrent runs, and hash files."""
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -14,6 +15,16 @@ from morphgen.errors import FormatError
 
 LOCK = ".lock"
 """Name of the lock file in a folder."""
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
