@@ -18,6 +18,7 @@ from morphgen.benchmark.robot_factory import RobotFactory, SampledRecipe, member
 from morphgen.benchmark.robot_hash import digest
 from morphgen.benchmark.split import Member
 from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.token_layout import LARGEST_MAX_LINKS
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_atomic
@@ -41,8 +42,6 @@ MIN_DRAWS = 20
 ROBOTS_PER_JOB = 16
 """Robots that a process draws before it reports; a process takes seconds to start, an arm3 with its
 goals 0.06 s."""
-NO_LIMIT = 1_000_000
-"""Number of links that no robot has."""
 HELD_OUT, DRAWN_BEFORE, UNFIT = "held out", "drawn before", "without goals"
 """Reasons for skipping a robot."""
 
@@ -315,7 +314,7 @@ class _Drawer:
 
     @cached_property
     def _factory(self) -> RobotFactory:
-        return RobotFactory(self.folders, max_links=NO_LIMIT)
+        return RobotFactory(self.folders, max_links=LARGEST_MAX_LINKS)
 
     def __call__(self, recipe: SampledRecipe) -> _Draw:
         """Draw a robot.
