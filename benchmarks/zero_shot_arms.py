@@ -58,7 +58,6 @@ class Measuring:
 
     def __call__(self, arm: str) -> tuple[str, list[ZeroShotResult]]:
         """Run the episodes of one arm."""
-        torch.set_num_threads(1)
         source = robot_source(f"arm={arm} ee=stick", "reach", obstacles=self.obstacles)
         config = EvalConfig(self.episodes, "mujoco", self.seed)
         (score,) = evaluate([FollowPath], source, config, Interface(channels=PATH))

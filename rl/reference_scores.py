@@ -30,6 +30,7 @@ from morphgen.rl.submission import (
     Submission,
     is_submission,
     read_submission,
+    submission_from,
     submission_text,
 )
 from morphgen.rl.submission_checks import check_submission, require_rules, require_series
@@ -101,7 +102,7 @@ def reference_files(
             if not is_submission(data):
                 cells += _cells(file, data, split, protocol)
                 continue
-            submission = read_submission(file)
+            submission = submission_from(data, file)
             if submission.split.id != split_id(split) and file != path:
                 continue
             expected = expected or expected_robots(split, protocol, library, jobs=jobs)

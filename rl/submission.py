@@ -190,4 +190,13 @@ def read_submission(path: Path) -> Submission:
             f"{path}: no submission; expected an object with the kind {KIND!r}, as morphgen eval "
             "--submission writes it"
         )
+    return submission_from(data, path)
+
+
+def submission_from(data: object, path: Path) -> Submission:
+    """Return the submission of a JSON file's content, and check its form.
+
+    Raises:
+        BenchmarkError: If it is malformed; the message names file, robot and field.
+    """
     return read_record(data, Submission, str(path), BenchmarkError)

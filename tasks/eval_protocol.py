@@ -70,7 +70,7 @@ class EvalProtocol:
 
 @dataclass(frozen=True)
 class ExpectedRobot:
-    """What a submission must hold for a member of a split."""
+    """A robot of a split whose episodes a submission must hold."""
 
     side: Side
     member: Member
@@ -97,9 +97,7 @@ def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:
         return EvalProtocol(goals=goals, **rules)
     except KeyError as error:
         raise BenchmarkError(f"{where}: evaluation: missing key {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise BenchmarkError(f"{where}: evaluation: {error}") from error
-    except MorphgenError as error:
+    except (TypeError, ValueError, AttributeError, OverflowError, MorphgenError) as error:
         raise BenchmarkError(f"{where}: evaluation: {error}") from error
 
 

@@ -43,7 +43,7 @@ class RobotChoice:
     regime: Regime
     """Regime of the split; the other fields have an effect with some regimes only."""
     hold_out: tuple[str, ...] = ()
-    """What test robots have and train robots do not, see ``hold_out_rules.parse_rules``."""
+    """Rules of parts that only test robots have; ``hold_out_rules.parse_rules`` reads them."""
     robots: tuple[str, ...] = ()
     """Words of ``morphgen compose`` with choices in braces and wildcards."""
     grammar: tuple[str, ...] = ()

@@ -24,7 +24,7 @@ _GRAMMAR_NAME = re.compile(r"[A-Za-z0-9][\w-]*")
 
 @dataclass(frozen=True, eq=False)
 class PrivateSource:
-    """Where private robots come from, and which draws are rejected."""
+    """Grammars of private robots, and the public robots that they must differ from."""
 
     grammars: tuple[Grammar, ...]
     public: tuple[Candidate, ...]

@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from morphgen.errors import MeshError
+from morphgen.formats.files import file_sha256
 from morphgen.formats.resolve import file_stamp
 from morphgen.model.geometry import Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import (
@@ -120,6 +121,6 @@ def _content(path: Path, stamp: tuple[int, int]) -> str:
     """Return the SHA-256 of a file; the stamp makes the cache notice a changed file."""
     del stamp
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return file_sha256(path)
     except OSError as error:
         raise MeshError(f"{path}: cannot be read: {error.strerror}") from error

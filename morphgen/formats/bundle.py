@@ -16,7 +16,7 @@ from trimesh.exchange.stl import export_stl
 from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import replacing_folder
+from morphgen.formats.files import file_sha256, replacing_folder
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
@@ -88,7 +88,7 @@ def write_bundle(
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         _write_fits(robot, partial)
         hashes = {
-            path.relative_to(partial).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            path.relative_to(partial).as_posix(): file_sha256(path)
             for path in sorted(partial.rglob("*"))
             if path.is_file()
         }
@@ -157,7 +157,7 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
             raise FormatError(f"{folder / CARD}: hashes: {name!r} leads out of the folder")
         if not exists:
             code, why = "file-missing", "the card names it, but it does not exist"
-        elif hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+        elif file_sha256(path) != expected:
             code, why = "file-changed", "its content differs from the card's hash"
         else:
             continue

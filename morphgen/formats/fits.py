@@ -20,6 +20,7 @@ from msgspec import Meta
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
+from morphgen.formats.files import file_sha256
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.rounding import format_number
@@ -278,4 +279,4 @@ def _digest(path: Path) -> str:
 @lru_cache(maxsize=1024)
 def _digest_of(path: Path, stamp: tuple[int, int]) -> str:
     del stamp
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return file_sha256(path)

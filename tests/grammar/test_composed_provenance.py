@@ -1,4 +1,4 @@
-"""What a composed robot says of its origin: derivation, licences, accepted findings."""
+"""Provenance of composed robots: derivation, licences and accepted findings."""
 
 import json
 from dataclasses import replace
