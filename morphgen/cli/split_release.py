@@ -82,6 +82,7 @@ def release(args: argparse.Namespace) -> None:
         extra = reference_files(args.scores, split, protocol, library, jobs=args.jobs)
     if args.private_test:
         test_grammars(split, library)  # refuses other splits before a secret is made
+    is_new_secret = args.secret_file is not None and not args.secret_file.exists()
     request = ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -96,10 +97,15 @@ def release(args: argparse.Namespace) -> None:
         private_robots=args.private_test or 0,
         secret=make_secret(args.secret_file) if args.secret_file else "",
     )
-    with bar(args, "releasing") as update:
-        report = release_split(
-            split, args.out, library, request, extra=extra, jobs=args.jobs, progress=update
-        )
+    try:
+        with bar(args, "releasing") as update:
+            report = release_split(
+                split, args.out, library, request, extra=extra, jobs=args.jobs, progress=update
+            )
+    except BaseException:  # an interrupt, too: no release needs the new secret
+        if is_new_secret:
+            args.secret_file.unlink(missing_ok=True)
+        raise
     private = report.release.private_test
     data = {
         "archive": str(report.archive),

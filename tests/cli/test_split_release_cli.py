@@ -107,6 +107,19 @@ def test_a_private_test_side_is_revealed_with_its_secret(run, refused):
     assert "5a5a" not in err
 
 
+def test_a_release_that_is_refused_leaves_no_new_secret_and_keeps_an_old_one(run, refused):
+    run(*STICKS, "my/sticks")
+    words = ("my/sticks.yaml", "--private-test", "2", "--secret-file")
+    assert run(*RELEASE, *words, "secret.txt")[0] == 0
+    refused(*RELEASE, *words, "new.txt")  # the version is released, with other private robots
+    assert not Path("new.txt").exists()
+    old = Path("old.txt")
+    old.write_text("5a" * 32)
+    old.chmod(0o600)
+    refused(*RELEASE, *words, "old.txt")
+    assert old.read_text() == "5a" * 32
+
+
 def test_reveal_refuses_releases_without_a_private_side(run, refused, small):
     run(*RELEASE, small)
     Path("secret.txt").write_text("5a" * 32)
