@@ -1,0 +1,198 @@
+"""Random numbers of episodes by a counter-based generator: Philox4x32-10.
+
+A counter-based generator is a function of a key and a counter, without a state (Salmon, Moraes,
+Dror and Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3"). The key is a seed. The counter
+is the number of an environment, the number of its episode, a stream, and a block of four numbers.
+Thus the episodes of an environment do not depend on its batch, and are the same on CPU and GPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+
+from morphgen.errors import TaskError
+
+MAX_SEED = 2**64 - 1
+"""Largest seed."""
+AHEAD = 16
+"""Number of episodes whose random numbers are computed together: a hundred tensor operations."""
+STREAMS_AHEAD = 2
+"""Number of streams, the first ones, of which that is done."""
+ROUNDS = 10
+"""Number of rounds of the generator."""
+WORD = 2**32
+"""Number of values of a word, the unit in which the generator computes."""
+_MULTIPLIERS = (0xCD9E8D57 - WORD, 0xD2511F53 - WORD)
+"""Multipliers of the third and the first word of a counter, minus ``WORD``: products with words
+then fit into 64 bits with a sign, and ``WORD`` times the other factor is added afterwards."""
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+"""Increments of the two words of the key from round to round."""
+_FLOAT_BITS = 24
+"""Bits of a number in [0, 1) in single precision."""
+
+
+class Stream(IntEnum):
+    """Purposes of random numbers; each has its own numbers in every episode."""
+
+    LAYOUT = 0
+    """Layout of the obstacles."""
+    START = 1
+    """Start of the episode, and its goal."""
+    SPREAD = 2
+    """Step at which a first episode begins; see ``TaskBatch.reset``."""
+    POINTS = 3
+    """Points of clouds."""
+    TASK = 16
+    """First of the numbers that tasks are free to use for purposes of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeRandom:
+    """Random numbers of an episode in each of k environments; the same however often it is asked.
+
+    The numbers of an environment depend on the seed and on its row of the two tensors.
+    """
+
+    seed: int
+    """Seed, 0 to ``MAX_SEED``."""
+    env_number: torch.Tensor
+    """Number of each environment, shape (k,), int64, 0 to 2^32 - 1."""
+    episode: torch.Tensor
+    """Number of the episode of each environment, shape (k,), int64, 0 to 2^32 - 1."""
+    words: torch.Tensor | None = None
+    """First words of the first streams if they are known, (k, ``STREAMS_AHEAD``, 4), int64."""
+
+    def select(self, rows: torch.Tensor) -> EpisodeRandom:
+        """Return the numbers of some of the environments, by their rows (m,), int64."""
+        words = None if self.words is None else self.words[rows]
+        return EpisodeRandom(self.seed, self.env_number[rows], self.episode[rows], words)
+
+    def uniform(self, stream: int, count: int) -> torch.Tensor:
+        """Return numbers that are uniform in [0, 1), multiples of 2^-24.
+
+        Args:
+            stream: A ``Stream``, or a number from ``Stream.TASK`` on.
+            count: Numbers of each environment.
+
+        Returns:
+            Numbers, shape (k, count), float32.
+        """
+        words = self._words(stream, count)
+        return (words >> (32 - _FLOAT_BITS)).float() * 2.0**-_FLOAT_BITS
+
+    def integers(self, stream: int, high: torch.Tensor) -> torch.Tensor:
+        """Return integers that are uniform in [0, high).
+
+        Their probabilities differ by 2^-32 at most: a word times ``high``, divided by 2^32.
+
+        Args:
+            stream: As of ``uniform``.
+            high: Bounds, shape (k,) or (k, count), int64, 1 to 2^31; a bound of 0 gives 0.
+
+        Returns:
+            Integers of the shape of ``high``, int64.
+        """
+        words = self._words(stream, high.shape[1] if high.ndim > 1 else 1)
+        return (words.reshape(high.shape) * high) >> 32
+
+    def _words(self, stream: int, count: int) -> torch.Tensor:
+        """Return uniform words, shape (k, count), int64."""
+        if self.words is not None and stream < STREAMS_AHEAD and count <= 4:
+            return self.words[:, stream, :count]
+        k, num_blocks = len(self.episode), -(-count // 4)
+        counter = self.episode.new_empty(4, k, num_blocks)
+        counter[0], counter[1] = self.env_number[:, None], self.episode[:, None]
+        counter[2].fill_(stream)
+        counter[3] = torch.arange(num_blocks, device=counter.device)
+        words = philox(counter.flatten(1), self.seed)
+        return words.T.reshape(k, 4 * num_blocks)[:, :count]
+
+
+class EpisodeSequence:
+    """The episodes of n environments, one after the other.
+
+    Attributes:
+        seed: Seed of the random numbers, 0 to ``MAX_SEED``.
+        env_number: Number of each environment, shape (n,), int64.
+        next_episode: Number of the next episode of each environment, shape (n,), int64.
+    """
+
+    def __init__(self, seed: int, env_number: torch.Tensor, next_episode: torch.Tensor) -> None:
+        """Set up; for the arguments see the attributes.
+
+        Raises:
+            TaskError: If the seed is out of range.
+        """
+        if not 0 <= seed <= MAX_SEED:
+            raise TaskError(f"seed {seed}: expected 0 to 2^64 - 1")
+        self.seed, self.env_number, self.next_episode = seed, env_number, next_episode
+        self._uses_left = 0
+        # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
+        self._first_row = AHEAD * torch.arange(len(env_number), device=env_number.device)
+
+    def begin(self, mask: torch.Tensor) -> EpisodeRandom:
+        """Begin episodes in some environments.
+
+        Args:
+            mask: The environments, shape (n,), bool.
+
+        Returns:
+            Random numbers of the next episode of every environment, of those outside of the mask,
+            too.
+        """
+        if not self._uses_left:
+            self._look_ahead()
+        self._uses_left -= 1
+        row = self._first_row + (self.next_episode - self._first_ahead)
+        words = self._ahead.index_select(0, row).view(-1, STREAMS_AHEAD, 4)
+        random = EpisodeRandom(self.seed, self.env_number, self.next_episode, words)
+        self.next_episode = self.next_episode + mask
+        return random
+
+    def _look_ahead(self) -> None:
+        """Compute words for the next episodes.
+
+        They are enough for ``AHEAD`` calls of ``begin``, which begin one episode at most.
+        """
+        n, device = len(self.env_number), self.env_number.device
+        self._first_ahead, self._uses_left = self.next_episode, AHEAD
+        counter = self.env_number.new_zeros(4, n, AHEAD, STREAMS_AHEAD)
+        counter[0] = self.env_number[:, None, None]
+        counter[1] = (self.next_episode[:, None] + torch.arange(AHEAD, device=device))[..., None]
+        counter[2] = torch.arange(STREAMS_AHEAD, device=device)
+        words = philox(counter.flatten(1), self.seed)
+        self._ahead = words.T.reshape(n * AHEAD, 4 * STREAMS_AHEAD)
+
+
+def philox(counter: torch.Tensor, seed: int) -> torch.Tensor:
+    """Return the random words of counters by Philox4x32-10.
+
+    Args:
+        counter: Words of m counters, the lowest first, shape (4, m), int64.
+        seed: The key, 0 to ``MAX_SEED``.
+
+    Returns:
+        Random words, shape (4, m), int64.
+    """
+    # A round multiplies the third and the first word, in this order, and mixes in the others.
+    factors, others = counter[::2].flip(0), counter[1::2]
+    low_key, high_key = seed % WORD, seed // WORD
+    multipliers = _column(_MULTIPLIERS, counter)
+    for k in range(ROUNDS):
+        keys = (low_key + k * _KEY_STEPS[0]) % WORD, (high_key + k * _KEY_STEPS[1]) % WORD
+        product = factors * multipliers
+        high = (product >> 32).add_(factors).bitwise_xor_(others)
+        factors = high.bitwise_xor_(_column(keys, counter)).flip(0)
+        others = product.bitwise_and_(WORD - 1)
+    return torch.stack([factors[1], others[0], factors[0], others[1]])
+
+
+def _column(numbers: tuple[int, int], like: torch.Tensor) -> torch.Tensor:
+    """Return two numbers as a column, shape (2, 1), without a copy from the CPU."""
+    column = like.new_empty(2, 1)
+    column[0].fill_(numbers[0])
+    column[1].fill_(numbers[1])
+    return column
