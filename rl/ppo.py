@@ -23,6 +23,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.advantages import gae, normalized_advantages
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.final_observations import FinalObservations
 from morphgen.rl.heads import joint_entropy
 from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
 from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
@@ -176,7 +177,7 @@ class Learner:
     def _collect_rollout(self) -> Metrics:
         """Act for ``num_steps`` control steps and fill the buffers; return rollout metrics."""
         obs = self._network_input(self._current_observation())
-        reward_terms, final_observations = [], []
+        reward_terms, final_observations = [], FinalObservations()
         for step in range(self.config.num_steps):
             for name, buffer in self.observations.items():
                 buffer[step].copy_(obs[name])
@@ -192,16 +193,12 @@ class Learner:
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated
             reward_terms.append({name: term.mean() for name, term in result.terms.items()})
-            final_observations.append(
-                {name: value[result.truncated] for name, value in result.final_observation.items()}
-            )
+            final_observations.add(result.final_observation, result.truncated)
             self._observation = result.observation
             obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
         self.next_observation = {name: value.clone() for name, value in obs.items()}
-        self.final_observations = self._network_input(
-            {name: torch.cat([final[name] for final in final_observations]) for name in obs}
-        )
+        self.final_observations = self._network_input(final_observations.gather())
         metrics = self._rollout_metrics()
         metrics["terms"] = {
             name: float(torch.stack([terms[name] for terms in reward_terms]).mean())

@@ -10,9 +10,15 @@ from typing import Protocol
 import torch
 
 from morphgen.processes import one_torch_thread
-from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.batch import Step, TaskBatch
+from morphgen.tasks.host import is_host
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
+
+STEPS_UNREAD = 32
+"""Number of control steps after which the results on a GPU are read."""
+_NUMBERS = ("success", "distance", "total", "last", "steps", "diverged", "angle")
+"""Numbers that are recorded of an episode."""
 
 
 class Controller(Protocol):
@@ -62,8 +68,8 @@ def run_episodes(
         batch: Environments; they are reset first.
         controller: The controller.
         count: Episodes per environment.
-        progress: Called after every step with the number of episodes done; running ones count as
-            fractions.
+        progress: Called with the number of episodes done, where running ones count as fractions:
+            after every step, or every ``STEPS_UNREAD`` steps on a GPU.
 
     Returns:
         Episodes, ordered by environment and then by time.
@@ -73,34 +79,82 @@ def run_episodes(
     """
     batch.reset()
     n = batch.num_envs
-    episodes: list[list[Episode]] = [[] for _ in range(n)]
-    robot_indices = batch.env_robot_index.tolist()
-    total = torch.zeros(n, device=batch.device)
-    steps = torch.zeros(n, dtype=torch.int64, device=batch.device)
-    done = 0
-    left = torch.full_like(steps, count)
-    while done < n * count:
+    results = _Results(n, count, batch.device)
+    on_host = is_host(batch.device)
+    num_steps = 0
+    while True:
         step = batch.step(controller.act(batch))
-        total += step.score
-        steps += 1
-        ended = torch.nonzero(step.terminated | step.truncated)[:, 0]
-        left[ended] -= 1
-        for env in ended.tolist():
-            if len(episodes[env]) < count:
-                numbers = float(total[env]), float(step.score[env]), int(steps[env])
-                episodes[env].append(
+        results.add(step)
+        num_steps += 1
+        if on_host or num_steps % STEPS_UNREAD == 0:
+            is_running = results.finished < count
+            fractions = (results.steps / batch.max_episode_steps)[is_running]
+            progress(float(results.finished.clamp(max=count).sum() + fractions.sum()))
+            if not is_running.any():
+                return results.episodes(batch)
+
+
+class _Results:
+    """Results of the first episodes of every environment, on the device of the batch.
+
+    Attributes:
+        finished: Number of episodes that ended, shape (n,), int64.
+        steps: Control steps of the running episodes, shape (n,), int64.
+    """
+
+    def __init__(self, n: int, count: int, device: torch.device) -> None:
+        """Prepare to record ``count`` episodes of each of n environments."""
+        self.finished = torch.zeros(n, dtype=torch.int64, device=device)
+        self.steps = torch.zeros_like(self.finished)
+        self._total = torch.zeros(n, device=device)
+        self._numbers = torch.zeros(n, count, len(_NUMBERS), dtype=torch.float64, device=device)
+        self._rows = torch.arange(n, device=device)
+
+    def add(self, step: Step) -> None:
+        """Record a step, and the episodes that ended in it."""
+        self._total += step.score
+        self.steps += 1
+        ended = step.terminated | step.truncated
+        if is_host(ended.device) and not ended.any():
+            return
+        angle = torch.full_like(step.score, math.nan) if step.angle is None else step.angle
+        values = (
+            step.success,
+            step.distance,
+            self._total,
+            step.score,
+            self.steps,
+            step.diverged,
+            angle,
+        )
+        numbers = torch.stack([value.double() for value in values], dim=1)
+        count = self._numbers.shape[1]
+        column = self.finished.clamp(max=count - 1)
+        is_new = (ended & (self.finished < count))[:, None]
+        old = self._numbers[self._rows, column]
+        self._numbers[self._rows, column] = torch.where(is_new, numbers, old)
+        self.finished += ended
+        self._total.masked_fill_(ended, 0)
+        self.steps.masked_fill_(ended, 0)
+
+    def episodes(self, batch: TaskBatch) -> list[Episode]:
+        """Return the episodes, ordered by environment and then by time."""
+        robots = batch.env_robot_index.tolist()
+        episodes = []
+        for env, rows in enumerate(self._numbers.tolist()):
+            task = TASKS[batch.specs[robots[env]].task]
+            for success, distance, total, last, steps, diverged, angle in rows:
+                score = task.episode_score(total, last, int(steps))
+                episodes.append(
                     Episode(
                         env,
-                        robot_indices[env],
-                        bool(step.success[env]),
-                        float(step.distance[env]),
-                        TASKS[batch.specs[robot_indices[env]].task].episode_score(*numbers),
-                        int(steps[env]),
-                        bool(step.diverged[env]),
-                        math.nan if step.angle is None else float(step.angle[env]),
+                        robots[env],
+                        bool(success),
+                        distance,
+                        score,
+                        int(steps),
+                        bool(diverged),
+                        angle,
                     )
                 )
-                done += 1
-        total[ended], steps[ended] = 0, 0
-        progress(done + float((steps / batch.max_episode_steps)[left > 0].sum()))
-    return [episode for env_episodes in episodes for episode in env_episodes]
+        return episodes
