@@ -40,10 +40,10 @@ class FollowEnvs(ReachEnvs):
         self.config = specs[0].config
         self.first, self.time = torch.zeros_like(self.goal), torch.zeros_like(self.goal[:, 0])
 
-    def begin(self, rows, random, layouts):
-        """Begin episodes of some rows; their circles begin at goals of the robots' sets."""
-        begun = super().begin(rows, random, layouts)
-        self.first[rows], self.time[rows] = self.goal[rows], 0.0
+    def begin(self, mask, random, layout):
+        """Begin episodes where the mask is set; circles begin at goals of the robots' sets."""
+        begun = super().begin(mask, random, layout)
+        self.first, self.time = self.goal.where(mask[:, None], self.first), self.time * ~mask
         return begun
 
     def evaluate(self, state):

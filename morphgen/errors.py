@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 _MAX_LISTED = 24
 """Largest number of valid names that a hint lists completely."""
@@ -44,28 +44,7 @@ class TaskError(MorphgenError):
 
 
 class SimulationError(MorphgenError):
-    """A simulator cannot load a scene, diverged or ended."""
-
-
-class DivergedError(SimulationError):
-    """Some environments diverged and must be reset; all others are valid.
-
-    The text of the error is the reason of the first environment.
-    """
-
-    def __init__(self, reasons: Mapping[int, str]) -> None:
-        """Create the error from the reasons by environment index; there must be at least one."""
-        super().__init__(dict(sorted(reasons.items())))
-
-    @property
-    def reasons(self) -> dict[int, str]:
-        """Reason of the divergence by environment index."""
-        reasons: dict[int, str] = self.args[0]
-        return reasons
-
-    def __str__(self) -> str:
-        """Return the reason of the first environment."""
-        return next(iter(self.reasons.values()))
+    """A simulator cannot load a scene, or ended."""
 
 
 class GrammarError(MorphgenError):

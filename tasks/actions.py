@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 import torch
 
 from morphgen.errors import TaskError
+from morphgen.tasks.host import is_host
 
 if TYPE_CHECKING:
     from morphgen.tasks.robot_tables import RobotTables
@@ -30,23 +32,37 @@ def decode_actions(
         shape: Expected shape, (n, L).
         device: Device of the result.
 
+    On a GPU, which is not read here, actions that are not finite or out of range become nan: their
+    environments diverge.
+
     Raises:
-        TaskError: If the shape differs, a number is not finite, or an index is out of range.
+        TaskError: If the shape or the type differs or, on the CPU, a number is not finite or an
+            index is out of range.
     """
     if tuple(actions.shape) != shape:
         raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {shape}")
     actions = actions.to(device)
-    if kind == "continuous":
-        invalid = torch.nonzero(~torch.isfinite(actions))
-        if len(invalid):
-            env, link = invalid[0].tolist()
-            raise TaskError(f"the action of environment {env}, link {link} is not finite")
-        return actions.float().clamp(-1, 1)
-    invalid = torch.nonzero((actions < 0) | (actions >= len(BINS)))
-    if len(invalid) or actions.is_floating_point():
-        where = f"environment {invalid[0, 0]}, link {invalid[0, 1]}: " if len(invalid) else ""
-        raise TaskError(f"{where}discrete actions are integers from 0 to {len(BINS) - 1}")
-    return torch.tensor(BINS, device=device)[actions.long()]
+    is_index = kind == "discrete"
+    if is_index and actions.is_floating_point():
+        raise TaskError(f"discrete actions are integers from 0 to {len(BINS) - 1}")
+    is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else torch.isfinite(actions)
+    if is_host(device) and not is_valid.all():
+        env, link = torch.nonzero(~is_valid)[0].tolist()
+        where = f"environment {env}, link {link}"
+        if is_index:
+            raise TaskError(f"{where}: discrete actions are integers from 0 to {len(BINS) - 1}")
+        raise TaskError(f"the action of {where} is not finite")
+    if is_index:
+        numbers = _bins(device)[actions.long().clamp(0, len(BINS) - 1)]
+    else:
+        numbers = actions.float().clamp(-1, 1)
+    return numbers if is_host(device) else torch.where(is_valid, numbers, torch.nan)
+
+
+@cache
+def _bins(device: torch.device) -> torch.Tensor:
+    """Return ``BINS`` on a device."""
+    return torch.tensor(BINS, device=device)
 
 
 def encode_actions(normalized: torch.Tensor, kind: ActionKind) -> torch.Tensor:
@@ -56,7 +72,7 @@ def encode_actions(normalized: torch.Tensor, kind: ActionKind) -> torch.Tensor:
     """
     if kind == "continuous":
         return normalized
-    bins = torch.tensor(BINS, device=normalized.device)
+    bins = _bins(normalized.device)
     size = normalized.abs()[..., None] + _TOLERANCE
     fits = (bins.abs() <= size) & (bins * normalized[..., None] >= 0)
     return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)

@@ -8,27 +8,20 @@ from typing import Any
 
 import torch
 
-from morphgen.errors import DivergedError, TaskError
-from morphgen.model.kinematics_torch import FramePositions, frame_pose
+from morphgen.errors import TaskError
+from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
+from morphgen.tasks.batch_observation import BatchObservation, PhysicsState, copied
 from morphgen.tasks.episode_layouts import EpisodeLayouts
-from morphgen.tasks.kinematic_channels import KinematicChannels
-from morphgen.tasks.observation import (
-    LinkTokens,
-    Observation,
-    ObservationConfig,
-    PointClouds,
-    joint_to_link,
-    tree_entries,
-)
+from morphgen.tasks.host import is_host
+from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.obstacles import LayoutSide
-from morphgen.tasks.random_streams import random_streams
+from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
 from morphgen.tasks.step_result import TaskState
-from morphgen.tasks.straight_paths import StraightPaths
-from morphgen.tasks.task import OBJECT, EnvSpec
+from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
 
@@ -70,10 +63,13 @@ class Step:
 
 
 class TaskBatch:
-    """Environments; each has a robot at a task, and its own stream of random numbers.
+    """Environments; each has a robot at a task, and its own random numbers.
 
     Robots stand at the origin of the world. The tensors of targets, actions, velocities and episode
     steps are updated in place, so that NumPy views of them stay valid.
+
+    A step computes all environments as tensors. On a GPU it reads none of them, so it never waits
+    for the GPU; the channel ``ik``, which plans on the CPU, is the exception.
 
     Attributes:
         robot_tables: The robots as tensors.
@@ -115,14 +111,15 @@ class TaskBatch:
             simulation: Simulation of the environments, with the scenes of their specifications.
             kind: Kind of the actions.
             observe: Optional entries of observations.
-            seed: Seed of all episodes.
+            seed: Seed of all episodes, 0 to 2^64 - 1.
             first: Number of the first environment. An environment's episodes depend on its number
                 and the seed only, whatever batch it is in.
             layouts: Layouts of obstacles that episodes draw from: those of training or of
                 evaluation.
 
         Raises:
-            TaskError: If a task is unknown, has different constants, or too few goals of a robot.
+            TaskError: If a task is unknown, has different constants, or too few goals of a robot,
+                or if the seed is out of range.
         """
         self.robot_tables, self.specs, self.action_kind = robot_tables, tuple(specs), kind
         self.simulation, self.device = simulation, robot_tables.device
@@ -137,8 +134,8 @@ class TaskBatch:
         self.max_episode_steps = self.groups.max_episode_steps
         self.targets = torch.zeros(n, robot_tables.max_joints, device=device)
         self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
-        self._env_numbers = range(first, first + n)
-        self._streams = random_streams(seed, self._env_numbers)
+        env_number = torch.arange(first, first + n, device=device)
+        self._episodes = EpisodeSequence(seed, env_number, torch.zeros_like(env_number))
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
         self._num_sim_joints = simulation.q.shape[1]
         self.previous_qd = torch.zeros(n, robot_tables.max_joints, device=device)
@@ -146,31 +143,16 @@ class TaskBatch:
         self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
         self.observation_config = observe or ObservationConfig()
         self.layouts = EpisodeLayouts(self.specs, index, layouts, self.observation_config)
-        self._tokens = LinkTokens(robot_tables, index)
-        self._tool_positions = FramePositions(robot_tables.tool_chain, index)
         self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
-        scenes = [self.specs[i].scene for i in env_robot_index]
-        self._constant_entries = {
-            "links": robot_tables.link_mask[index],
-            "actions": self.action_mask,
-            **self.groups.masks,
-            **self.layouts.entries,
-        }
-        if self.observation_config.tree:
-            self._constant_entries |= tree_entries(
-                robot_tables, index, self.action_mask, self.observation_config.tree_joints
-            )
-        self._kinematics: KinematicChannels | None = None
-        if names := self.observation_config.kinematic_channels:
-            has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
-            paths = StraightPaths(self.layouts, index)
-            self._kinematics = KinematicChannels(
-                robot_tables, index, names, has_block=has_block, first_free=paths
-            )
-        self._points: PointClouds | None = None
-        if self.observation_config.points:
-            self._points = PointClouds(scenes, self.observation_config.points, device)
-            self._constant_entries["point_mask"] = self._points.mask
+        self._observation = BatchObservation(
+            robot_tables,
+            self.specs,
+            index,
+            self.groups,
+            self.layouts,
+            self.action_mask,
+            self.observation_config,
+        )
 
     @property
     def num_envs(self) -> int:
@@ -180,7 +162,7 @@ class TaskBatch:
     @property
     def q(self) -> torch.Tensor:
         """Positions of the independent joints, shape (n, J) [rad or m]; a copy."""
-        return self._q.clone()
+        return self._padded(self.simulation.q).clone()
 
     def task_mask(self, task: str) -> torch.Tensor:
         """Return which environments are at a task, shape (n,), bool."""
@@ -194,17 +176,20 @@ class TaskBatch:
         """Begin an episode in every environment.
 
         Args:
-            seed: Seed of all episodes from now on; by default the random streams continue.
+            seed: Seed of all episodes from now on, which begin with the first; by default the next
+                episodes begin.
             spread: Whether these first episodes begin at random fractions of their time limit, so
                 that they do not all end at the same step; for learners.
+
+        Raises:
+            TaskError: If the seed is out of range.
         """
         if seed is not None:
-            self._streams = random_streams(seed, self._env_numbers)
-        self._begin(torch.arange(self.num_envs, device=self.device))
+            env_number = self._episodes.env_number
+            self._episodes = EpisodeSequence(seed, env_number, torch.zeros_like(env_number))
+        random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool))
         if spread:
-            fractions = [stream.random() for stream in self._streams["random"]]
-            fraction = torch.tensor(fractions, device=self.device)
-            self.episode_step.copy_(fraction * self.max_episode_steps)
+            self.episode_step.copy_(random.integers(Stream.SPREAD, self.max_episode_steps))
         return self.observe()
 
     def step(self, actions: torch.Tensor) -> Step:
@@ -218,20 +203,19 @@ class TaskBatch:
             SimulationError: If the simulator failed.
         """
         self._act(actions)
-        diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        diverged[self._simulate()] = True
+        state, diverged = self._simulate()
         self.episode_step += 1
-        result = self._evaluate(diverged)
+        result = self._evaluate(state, diverged)
         timed_out = self.episode_step >= self.max_episode_steps
         truncated = (timed_out | diverged) & ~result.terminated
-        final_observation = self.observe()
-        q, block_pose = self.q, self.simulation.block_pose.clone()
-        ended = torch.nonzero(truncated | result.terminated)[:, 0]
-        if len(ended):
+        final_observation = self._observe(state)
+        q, block_pose = state.q.clone(), state.block_pose.clone()
+        ended = truncated | result.terminated
+        if is_host(self.device) and not ended.any():
+            observation = copied(final_observation)
+        else:
             self._begin(ended)
             observation = self.observe()
-        else:
-            observation = _copied(final_observation)
         return Step(
             observation=observation,
             reward=result.reward,
@@ -248,54 +232,37 @@ class TaskBatch:
             angle=result.angle,
         )
 
-    def _simulate(self) -> list[int]:
-        """Step the simulation towards the targets; undo the step of environments that diverged.
+    def _simulate(self) -> tuple[PhysicsState, torch.Tensor]:
+        """Step the simulation towards the targets.
 
         Returns:
-            The environments that diverged.
+            The state after the step, which is undone where the simulation diverged; and where it
+            did, shape (n,), bool.
 
         Raises:
             SimulationError: If the simulator failed.
         """
-        q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
-        try:
-            self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
-        except DivergedError as error:
-            diverged = list(error.reasons)
-            envs = torch.tensor(diverged, device=self.device)
-            self.simulation.reset(envs, q[envs], block[envs])
-            self.previous_qd[envs] = 0
-            return diverged
-        return []
+        q, block_pose = self.q, self.simulation.block_pose.clone()
+        diverged = self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
+        state = self._state
+        if is_host(self.device) and not diverged.any():
+            return state, diverged.clone()
+        rows = diverged[:, None]
+        self.previous_qd.masked_fill_(rows, 0)
+        undone = PhysicsState(
+            q=torch.where(rows, q, state.q),
+            qd=state.qd.masked_fill(rows, 0),
+            block_pose=torch.where(rows, block_pose, state.block_pose),
+        )
+        return undone, diverged.clone()
 
     def observe(self) -> Observation:
         """Return the current observation, in tensors that the caller owns."""
-        return {
-            "tokens": self._tokens(self._q),
-            **self.groups.fields(self.simulation.block_pose),
-            **_copied(self._constant_entries),
-            **self.requested_entries(),
-        }
+        return self._observe(self._state)
 
     def requested_entries(self) -> Observation:
         """Return the entries of the current observation that the configuration asks for."""
-        observation: Observation = {}
-        if not self.observation_config.state:
-            observation["object"] = torch.zeros(self.num_envs, OBJECT.size, device=self.device)
-        if self.observation_config.velocity:
-            qd = self._padded(self.simulation.qd)
-            observation["velocity"] = joint_to_link(self.robot_tables, self.env_robot_index, qd)
-        if self.observation_config.previous_action:
-            observation["previous_action"] = self.previous_action.clone()
-        if self.observation_config.tool:
-            observation["tool"] = self._tool_positions(self._q)
-        if self._kinematics is not None:
-            block_pose = self.simulation.block_pose
-            goals = self.groups.tool_targets(block_pose)
-            observation |= self._kinematics(self._q, self.targets, goals, block_pose)
-        if self._points is not None:
-            observation["points"] = self._points(self.simulation.block_pose)
-        return observation
+        return self._observation.requested(self._state, self.targets, self.previous_action)
 
     def advance(self, progress: float) -> None:
         """Advance the curricula of the tasks that have one.
@@ -307,28 +274,31 @@ class TaskBatch:
         self.groups.advance(progress)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that the next ``reset`` depends on: random streams and tasks' states."""
-        states = {
-            name: [stream.bit_generator.state for stream in streams]
-            for name, streams in self._streams.items()
-        }
-        return {**states, **self.groups.state_dict()}
+        """Return the state that the next ``reset`` depends on.
+
+        It is the seed, the number of each environment's next episode, and the tasks' states.
+        """
+        episodes = {"seed": self._episodes.seed, "next_episode": self._episodes.next_episode}
+        return {**episodes, **self.groups.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what ``state_dict`` returned; ``reset`` must follow.
 
         Raises:
-            TaskError: If the state has another number of environments, or is of an older morphgen.
+            TaskError: If the state has another number of environments, or is of morphgen 0.2.
         """
-        if len(state["random"]) != self.num_envs:
+        if "next_episode" not in state:
             raise TaskError(
-                f"the state is of {len(state['random'])} environments; expected {self.num_envs}"
+                "the state is of morphgen 0.2, whose random numbers were others: its episodes "
+                "cannot go on; load the weights alone, as finetune does"
             )
-        if self._streams.keys() - state.keys():
-            raise TaskError("the state is of an older morphgen: points had no stream of their own")
-        for name, streams in self._streams.items():
-            for stream, saved in zip(streams, state[name], strict=True):
-                stream.bit_generator.state = saved
+        next_episode = state["next_episode"]
+        if len(next_episode) != self.num_envs:
+            raise TaskError(
+                f"the state is of {len(next_episode)} environments; expected {self.num_envs}"
+            )
+        env_number = self._episodes.env_number
+        self._episodes = EpisodeSequence(state["seed"], env_number, next_episode.to(self.device))
         self.groups.load_state_dict(state)
 
     def close(self) -> None:
@@ -339,62 +309,61 @@ class TaskBatch:
         """Advance the joint targets by the decoded actions."""
         shape = (self.num_envs, self.robot_tables.max_links)
         normalized = decode_actions(actions, self.action_kind, shape, self.device)
-        self.previous_action.copy_(normalized * self.action_mask)
+        self.previous_action.copy_(torch.where(self.action_mask, normalized, 0.0))
         self.targets.copy_(self._joint_targets(self.targets, self.previous_action))
 
-    def _evaluate(self, diverged: torch.Tensor) -> BatchResult:
+    def _evaluate(self, state: PhysicsState, diverged: torch.Tensor) -> BatchResult:
         """Let the tasks evaluate the step that was simulated."""
-        q, qd = self._q, self._padded(self.simulation.qd)
-        state = TaskState(
-            tool=self._tool_positions(q),
-            block_pose=self.simulation.block_pose,
+        q, qd = state.q, state.qd
+        task_state = TaskState(
+            tool=self._observation.tool_positions(q),
+            block_pose=state.block_pose,
             limit_violation=limit_violation(q, self._lower, self._upper),
             acceleration=row_sums((qd - self.previous_qd).abs()) / CONTROL_PERIOD,
             diverged=diverged,
             tool_rotation=self._tool_rotation(q) if self.groups.needs_tool_rotation else None,
         )
         self.previous_qd.copy_(qd)
-        return self.groups.evaluate(state)
+        return self.groups.evaluate(task_state)
 
     def _tool_rotation(self, q: torch.Tensor) -> torch.Tensor:
         """Return the rotation matrices of the tools, shape (n, 3, 3)."""
         T_root_tool = frame_pose(self.robot_tables.tool_chain, self.env_robot_index, q)
         return T_root_tool[:, :3, :3]
 
-    def _begin(self, envs: torch.Tensor) -> None:
-        """Begin episodes in the environments with these indices, shape (k,), int64."""
-        q = torch.zeros(len(envs), self.robot_tables.max_joints, device=self.device)
-        block_pose = torch.zeros(len(envs), 7, device=self.device)
-        streams = self._streams["random"]
-        self.layouts.draw(envs.tolist(), streams)
-        for rows, (task_q, task_block_pose) in self.groups.begin(
-            envs, streams, self.layouts.current
-        ):
-            q[rows], block_pose[rows] = task_q, task_block_pose
-        if self._points is not None:
-            for env in envs.tolist():
-                stream = self._streams["points"][env]
-                self._points.begin(env, stream, self.layouts.obstacles(env))
+    def _begin(self, mask: torch.Tensor) -> EpisodeRandom:
+        """Begin episodes in some environments; return their random numbers.
+
+        Args:
+            mask: The environments, shape (n,), bool.
+        """
+        random = self._episodes.begin(mask)
+        self.layouts.draw(mask, random)
+        layout = self.layouts.current if self.layouts.any else None
+        q, block_pose = self.groups.begin(mask, random, layout)
+        self._observation.begin(mask, random)
+        obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()
-        obstacles = (self.layouts.poses[envs],) if self.layouts.any else ()
-        self.simulation.reset(envs, sim_q, block_pose, *obstacles)
-        self.targets[envs] = q
-        self.episode_step[envs] = 0
-        self.previous_qd[envs] = 0
-        self.previous_action[envs] = 0
-        if self._kinematics is not None:
-            self._kinematics.begin(envs)
+        self.simulation.reset(mask, sim_q, block_pose, *obstacles)
+        rows = mask[:, None]
+        self.targets.copy_(torch.where(rows, q, self.targets))
+        self.episode_step.masked_fill_(mask, 0)
+        self.previous_qd.masked_fill_(rows, 0)
+        self.previous_action.masked_fill_(rows, 0)
+        return random
+
+    def _observe(self, state: PhysicsState) -> Observation:
+        """Return the observation in a state of the simulation."""
+        return self._observation(state, self.targets, self.previous_action)
 
     @property
-    def _q(self) -> torch.Tensor:
-        """Joint positions; a view of the simulation's tensor where nothing has to be padded."""
-        return self._padded(self.simulation.q)
+    def _state(self) -> PhysicsState:
+        """State of the simulation; views of its tensors where nothing has to be padded."""
+        simulation = self.simulation
+        q, qd = self._padded(simulation.q), self._padded(simulation.qd)
+        return PhysicsState(q, qd, simulation.block_pose)
 
     def _padded(self, values: torch.Tensor) -> torch.Tensor:
         """Return values of the simulation's joints padded to J columns."""
         missing = self.robot_tables.max_joints - self._num_sim_joints
         return torch.nn.functional.pad(values, (0, missing)) if missing else values
-
-
-def _copied(observation: Observation) -> Observation:
-    return {name: values.clone() for name, values in observation.items()}

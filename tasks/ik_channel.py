@@ -32,7 +32,8 @@ class IkSolutions:
     It is found by damped least squares from the joint targets and from other starts, which are the
     same for all robots as fractions of their joints' ranges. Of several solutions it is the one
     that the robot reaches first on a straight path without a collision; if all paths collide, the
-    nearest. A solution is kept until the episode ends or the target moves.
+    nearest. A solution is kept until the episode ends or the target moves. The paths are tested on
+    the CPU: on a GPU, ``update`` copies tensors from it.
     """
 
     def __init__(
@@ -63,13 +64,13 @@ class IkSolutions:
         """Distance from tool to target there, shape (n,) [m]."""
         self._solved_for = torch.full((n, 3), math.inf, device=device)
 
-    def forget(self, envs: torch.Tensor) -> None:
+    def forget(self, mask: torch.Tensor) -> None:
         """Forget the solutions of environments whose episode begins.
 
         Args:
-            envs: Their indices, shape (k,), int64.
+            mask: The environments, shape (n,), bool.
         """
-        self._solved_for[envs] = math.inf
+        self._solved_for.masked_fill_(mask[:, None], math.inf)
 
     def update(self, targets: torch.Tensor, goals: ToolTargets, metres_per_radian: float) -> None:
         """Solve where an episode has begun or the tool's target has moved.

@@ -117,7 +117,8 @@ class KinematicChannels:
         The straight path from the joint's target to a configuration that brings the tool to the
         first target point, with its orientation if it has one (``IkSolutions``): in largest steps
         at three gains, in rad or m, and as a share of the joint that needs the most steps; and the
-        logarithm of the tool's distance from the target there.
+        logarithm of the tool's distance from the target there. Paths are planned on the CPU: on a
+        GPU this channel alone copies tensors from it.
 
     Links without an independent joint have zeros, except in ``poses``.
     """
@@ -165,10 +166,10 @@ class KinematicChannels:
             self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
             self._shape_pose = tokens[..., SHAPE_POSE.columns]
 
-    def begin(self, envs: torch.Tensor) -> None:
-        """Note that episodes begin in the environments with these indices, shape (k,), int64."""
+    def begin(self, mask: torch.Tensor) -> None:
+        """Note that episodes begin in some environments, shape (n,), bool."""
         if self._solutions is not None:
-            self._solutions.forget(envs)
+            self._solutions.forget(mask)
 
     def __call__(
         self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor

@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
-from morphgen.errors import DivergedError
 from morphgen.model.frame_positions import FramePosition
 from morphgen.tasks.actions import BINS, decode_actions
 from morphgen.tasks.batch import TaskBatch
@@ -175,13 +174,13 @@ class NumpyStepper:
 
     def _simulate(self) -> bool:
         """Step the simulation, undo the step if it diverged; return whether it did."""
-        q, block_pose, diverged = self._q.copy(), self._block_pose.copy(), False
-        try:
-            self._batch.simulation.step(self._batch.targets)
-        except DivergedError:
+        q, block_pose = self._q.copy(), self._block_pose.copy()
+        mask = self._batch.simulation.step(self._batch.targets)
+        diverged = bool(mask.item())
+        if diverged:
             state = torch.from_numpy(q[None]), torch.from_numpy(block_pose[None])
-            self._batch.simulation.reset(torch.tensor([0]), *state)
-            self._previous_qd[:], diverged = 0, True
+            self._batch.simulation.reset(mask, *state)
+            self._previous_qd[:] = 0
         simulation = self._batch.simulation
         current = simulation.q, simulation.qd, simulation.block_pose
         if not all(map(operator.is_, current, self._tensors)):

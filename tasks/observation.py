@@ -1,4 +1,4 @@
-"""Observations: optional entries, tokens of links and boxes, and point clouds."""
+"""Observations: optional entries, and tokens of links and boxes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
-from morphgen.model.rotation_torch import matrix_from_quaternion
 from morphgen.tasks.channels import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.robot_tables import RobotTables
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import Scene
 
 Observation = dict[str, torch.Tensor]
 """``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``obstacles`` (n, O, 13) and
@@ -24,10 +21,6 @@ Observation = dict[str, torch.Tensor]
 bool. On request: ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 3), ``points``
 (n, P, 3) and ``point_mask`` (n, P) bool, the channels of ``kinematic_channels``, (n, L, size), and
 the entries of ``tree_entries``."""
-
-NOISE = 0.005
-"""Standard deviation of a point's position along each axis, as of a depth camera [m]."""
-
 
 NUM_POINTS = 128
 """Number of points of a cloud that is asked for by name."""
@@ -59,7 +52,8 @@ class ObservationConfig:
     dls: bool = False
     """Whether to observe a damped least-squares step towards the targets."""
     ik: bool = False
-    """Whether to observe the straight path to a configuration that reaches the target."""
+    """Whether to observe the straight path to a configuration that reaches the target. It is
+    planned on the CPU: steps of a batch on a GPU then wait for copies."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True
@@ -155,7 +149,7 @@ def joint_to_link(
 def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
     """Return tokens of boxes, shape (..., 13), from poses (..., 7) and edge lengths (..., 3)."""
     shape = torch.zeros_like(size)
-    shape[..., 2] = 1
+    shape[..., 2].fill_(1)
     return torch.cat([pose, shape, size], dim=-1)
 
 
@@ -227,75 +221,3 @@ def tree_entries(
         "joint_parents": parents,
         "joint_relations": distance + (MAX_TREE_DISTANCE + 1) * kind,
     }
-
-
-class PointClouds:
-    """P points on the surfaces of every environment's block and obstacles.
-
-    Each episode draws its points and their noise at its beginning.
-    """
-
-    def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
-        """Prepare; ``begin`` draws the points.
-
-        Args:
-            scenes: Scene of each environment.
-            num_points: Number of points of each environment, P.
-            device: Device of the tensors.
-        """
-        n = len(scenes)
-        self._blocks = [[] if scene.block is None else [scene.block] for scene in scenes]
-        self._num_points = num_points
-        self._local = torch.zeros(n, num_points, 3, device=device)
-        self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
-        has_boxes = torch.tensor(
-            [scene.block is not None or bool(scene.obstacles) for scene in scenes], device=device
-        )
-        self.mask = has_boxes[:, None].repeat(1, num_points)
-        """Existing points, shape (n, P), bool."""
-
-    def begin(self, env: int, rng: np.random.Generator, obstacles: Sequence[Block] = ()) -> None:
-        """Draw the points of an episode, uniformly over the surfaces of all boxes.
-
-        Args:
-            env: Environment whose episode begins.
-            rng: Its source of random numbers.
-            obstacles: Its obstacles.
-        """
-        boxes = [*self._blocks[env], *obstacles]
-        if not boxes:
-            return
-        areas = np.array([_face_areas(box).sum() for box in boxes])
-        box_index = rng.choice(len(boxes), self._num_points, p=areas / areas.sum())
-        local = np.array([_surface_point(boxes[k], rng) for k in box_index])
-        local += rng.normal(0.0, NOISE, local.shape)
-        on_block = (box_index == 0) & bool(self._blocks[env])
-        for row in np.flatnonzero(~on_block):
-            local[row] = boxes[box_index[row]].pose.apply(tuple(local[row]))
-        self._local[env] = torch.from_numpy(local).to(self._local)
-        self._on_block[env] = torch.from_numpy(on_block).to(self._on_block.device)
-
-    def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
-        """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes.
-
-        Args:
-            block_pose: Poses of the blocks, shape (n, 7).
-        """
-        R = matrix_from_quaternion(block_pose[:, 3:])
-        moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
-        return torch.where(self._on_block[..., None], moved, self._local)
-
-
-def _face_areas(box: Block) -> NDArray[np.float64]:
-    """Return the areas of the faces across x, y and z [m^2]."""
-    x, y, z = box.size
-    return np.array([y * z, x * z, x * y])
-
-
-def _surface_point(box: Block, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a point uniformly on the surface, in the box's frame."""
-    areas = _face_areas(box)
-    axis = rng.choice(3, p=areas / areas.sum())
-    point = rng.uniform(-0.5, 0.5, 3) * np.array(box.size)
-    point[axis] = rng.choice([-0.5, 0.5]) * box.size[axis]
-    return np.asarray(point)

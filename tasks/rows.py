@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.tasks.task import GoalSet
-
 
 def row_sums(values: torch.Tensor) -> torch.Tensor:
     """Return the sums of rows (n, k), shape (n,).
@@ -52,15 +50,6 @@ def positive_part(values: torch.Tensor) -> torch.Tensor:
 def limit_violation(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
     """Return the sum over joints of their distance outside of the limits, shape (n,) [rad, m]."""
     return row_sums(torch.clamp(torch.maximum(q - upper, lower - q), min=0))
-
-
-def goal_choices(goals: GoalSet) -> dict[int | None, NDArray[np.int64]]:
-    """Return the indices of the goals that each layout of the obstacles leaves possible.
-
-    The key None, for environments without obstacles, has all goals.
-    """
-    choices: dict[int | None, NDArray[np.int64]] = {None: np.arange(len(goals.q))}
-    return choices | {k: np.flatnonzero(row) for k, row in enumerate(goals.usable)}
 
 
 def padded_rows(

@@ -70,7 +70,7 @@ def measure_speed(
     parts: dict[str, list[tuple[Any, str]]] = {
         "actions": [(batch, "_act")],
         "rewards": [(batch, "_evaluate")],
-        "observation": [(batch, "observe")],
+        "observation": [(batch, "_observe")],
         "new episodes": [(batch, "_begin")],
         "around the simulator": [(batch.simulation, "step")],
         "simulator": list(own),

@@ -26,6 +26,8 @@ from morphgen.typing import Array
 if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
     import torch
 
+    from morphgen.tasks.random_numbers import EpisodeRandom
+
 
 class TaskConfig(Protocol):
     """Constants of a task: a frozen dataclass whose fields all have defaults."""
@@ -165,29 +167,33 @@ class Marker:
 
 
 class TaskEnvs(ABC):
-    """The environments of one task in a batch, k rows; only ``begin`` may loop over them."""
+    """The environments of one task in a batch, k rows.
+
+    Methods that a step calls compute all rows as tensors on the batch's device and read none: no
+    loops over environments, no ``nonzero``, no boolean index and no ``item``. So a step on a GPU
+    never waits for it.
+    """
 
     needs_tool_rotation: bool = False
     """Whether ``evaluate`` needs ``TaskState.tool_rotation``."""
 
     @abstractmethod
     def begin(
-        self,
-        rows: torch.Tensor,
-        random: Sequence[np.random.Generator],
-        layouts: Sequence[int | None],
+        self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Begin episodes.
+        """Begin episodes in some of the environments.
+
+        Compute all rows, and change the own state only where the mask is set (``torch.where``).
 
         Args:
-            rows: Indices below k of environments whose episodes begin, shape (m,), int64.
-            random: Random number generator of each of these environments.
-            layouts: Layout of the obstacles in each of them, an index of ``GoalSet.layouts``, or
-                None without obstacles.
+            mask: Environments whose episodes begin, shape (k,), bool.
+            random: Random numbers of the episodes; rows outside of the mask hold any.
+            layout: Layout of the obstacles in each environment, an index of ``GoalSet.layouts``,
+                shape (k,), int64, -1 without obstacles; None if no environment has any.
 
         Returns:
-            Joint positions at the start, shape (m, J), and poses of the block, shape (m, 7), zeros
-            if there is none.
+            Joint positions at the start, shape (k, J), and poses of the block, shape (k, 7), zeros
+            if there is none. Rows outside of the mask are ignored.
         """
 
     @abstractmethod

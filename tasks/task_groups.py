@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
+from morphgen.tasks.random_numbers import EpisodeRandom
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.step_result import StepResult, TaskState
 from morphgen.tasks.task import (
@@ -66,6 +67,7 @@ class TaskGroups:
         """
         n, device = len(env_robot_index), env_robot_index.device
         env_specs = [specs[i] for i in env_robot_index.tolist()]
+        self._num_joints = num_joints
         self._groups: dict[str, _Group] = {}
         self._row = torch.zeros(n, dtype=torch.int64, device=device)
         """Row of each environment in its group."""
@@ -111,28 +113,22 @@ class TaskGroups:
         return mask
 
     def begin(
-        self,
-        envs: torch.Tensor,
-        random: Sequence[np.random.Generator],
-        layouts: Sequence[int | None],
-    ) -> Iterator[tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]]:
-        """Begin episodes.
-
-        Args:
-            envs: Environments whose episodes begin, shape (m,), int64.
-            random: A stream of random numbers for each environment of the batch.
-            layouts: Layout of the obstacles in each environment of the batch, or None without.
-
-        Yields:
-            For each task, its rows in ``envs``, and the result of ``TaskEnvs.begin``.
-        """
-        for name, group in self._groups.items():
-            rows = torch.nonzero(self.task_mask(name)[envs])[:, 0]
-            if len(rows):
-                task_envs = envs[rows]
-                streams = [random[i] for i in task_envs.tolist()]
-                task_layouts = [layouts[i] for i in task_envs.tolist()]
-                yield rows, group.envs.begin(self._row[task_envs], streams, task_layouts)
+        self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Begin episodes; the arguments and the result are those of ``TaskEnvs.begin``, n rows."""
+        if len(self._groups) == 1:
+            (group,) = self._groups.values()
+            return group.envs.begin(mask, random, layout)
+        n, device = len(mask), mask.device
+        q = torch.zeros(n, self._num_joints, device=device)
+        block_pose = torch.zeros(n, 7, device=device)
+        for group in self._groups.values():
+            rows = group.rows
+            task_layout = None if layout is None else layout[rows]
+            q[rows], block_pose[rows] = group.envs.begin(
+                mask[rows], random.select(rows), task_layout
+            )
+        return q, block_pose
 
     def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""
@@ -202,14 +198,14 @@ class TaskGroups:
         rotations, has_rotation = None, None
         for group, values in zip(groups, task_points, strict=True):
             points[group.rows, : values.shape[1]] = values
-            exists[group.rows, : values.shape[1]] = True
+            exists[:, : values.shape[1]].index_fill_(0, group.rows, True)
             task_rotations = group.envs.target_rotations()
             if task_rotations is not None:
                 if rotations is None or has_rotation is None:
                     rotations = torch.eye(3, device=device).repeat(n, 1, 1)
                     has_rotation = torch.zeros(n, dtype=torch.bool, device=device)
                 rotations[group.rows] = task_rotations
-                has_rotation[group.rows] = True
+                has_rotation.index_fill_(0, group.rows, True)
         return ToolTargets(points, exists, rotations, has_rotation)
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:

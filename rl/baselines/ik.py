@@ -45,7 +45,7 @@ class InverseKinematics:
     def __init__(self, seed: int) -> None:
         self._seed, self._generator = seed, torch.Generator().manual_seed(seed)
         self._specs: Sequence[EnvSpec] = ()
-        self._planners: dict[tuple[int, int | None], PathPlanner] = {}
+        self._planners: dict[tuple[int, int], PathPlanner] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
@@ -64,7 +64,7 @@ class InverseKinematics:
     def _planner(self, task: TaskBatch, env: int) -> PathPlanner:
         """Return the planner of an environment's robot among its obstacles."""
         robot = int(task.env_robot_index[env])
-        key = robot, task.layouts.current[env]
+        key = robot, int(task.layouts.current[env])
         if key not in self._planners:
             self._planners[key] = self._new_planner(task, robot, task.layouts.scene(env))
         return self._planners[key]

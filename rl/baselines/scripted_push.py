@@ -185,6 +185,6 @@ class ScriptedPush:
         return targets
 
 
-def _robot_and_layout(task: TaskBatch, env: int) -> tuple[int, int | None]:
+def _robot_and_layout(task: TaskBatch, env: int) -> tuple[int, int]:
     """Return the indices of an environment's robot and of the layout of its obstacles."""
-    return int(task.env_robot_index[env]), task.layouts.current[env]
+    return int(task.env_robot_index[env]), int(task.layouts.current[env])

@@ -10,10 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.tasks.goal_choices import GoalChoices
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.rows import choose, goal_choices, padded_rows, positive_part, row_norms
+from morphgen.tasks.random_numbers import EpisodeRandom, Stream
+from morphgen.tasks.rows import choose, padded_rows, positive_part, row_norms
 from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.tasks.task import EnvSpec, TaskEnvs
 
@@ -32,7 +34,7 @@ class PushEnvs(TaskEnvs):
         sets: list[PushStartSet] = [spec.goals for spec in specs]  # type: ignore[misc]
         device = env_spec_index.device
         self._env_spec_index = env_spec_index
-        self._choices = [goal_choices(pushes) for pushes in sets]
+        self._choices = GoalChoices(sets, 1, env_spec_index)
         self._q = padded_rows([pushes.q for pushes in sets], num_joints, device)
         self._blocks = padded_rows([pushes.blocks for pushes in sets], 7, device)
         self._final_line = torch.tensor([pushes.line for pushes in sets], device=device)[
@@ -50,19 +52,12 @@ class PushEnvs(TaskEnvs):
         """Current y that the block must cross, shape (k,) [m]."""
 
     def begin(
-        self,
-        rows: torch.Tensor,
-        random: Sequence[np.random.Generator],
-        layouts: Sequence[int | None],
+        self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw starts of the robots' sets that the layout leaves possible."""
-        spec = self._env_spec_index[rows]
-        drawn = [
-            int(self._choices[i][layout][stream.integers(len(self._choices[i][layout]))])
-            for stream, i, layout in zip(random, spec.tolist(), layouts, strict=True)
-        ]
-        start = torch.tensor(drawn, device=spec.device)
-        return self._q[spec, start], self._blocks[spec, start]
+        number = random.integers(Stream.START, self._choices.count(layout))
+        start = self._choices.goals(layout, number[:, None])[:, 0]
+        return self._q[self._env_spec_index, start], self._blocks[self._env_spec_index, start]
 
     def evaluate(self, state: TaskState) -> StepResult:
         """Compare the block with the line; see ``evaluate_push``."""

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
+from morphgen.tasks.goal_choices import GoalChoices
+from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.rows import choose, goal_choices, padded_rows, row_norms
+from morphgen.tasks.rows import choose, padded_rows, row_norms
 from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.tasks.task import EnvSpec, TaskEnvs
 
@@ -32,11 +33,10 @@ class ReachEnvs(TaskEnvs):
         self._config: ReachConfig = specs[0].config  # type: ignore[assignment]  # its own type
         self._env_spec_index = env_spec_index
         sets = [spec.goals for spec in specs]
-        for goals in sets:
-            if len(goals.q) < 2:
-                raise TaskError(f"robot {goals.robot!r}: {len(goals.q)} goals; expected 2 or more")
         device = env_spec_index.device
-        self._choices = [goal_choices(goals) for goals in sets]
+        self._choices = GoalChoices(sets, 2, env_spec_index)
+        # Numbers of the goals that a start and a goal cannot be: none, and the start.
+        self._excluded = torch.tensor([0, 1], device=device)
         self._q = padded_rows([goals.q for goals in sets], num_joints, device)
         self._poses = padded_rows([goals.goal_poses for goals in sets], 7, device)
         self.goal = torch.zeros(len(env_spec_index), 7, device=device)
@@ -47,23 +47,23 @@ class ReachEnvs(TaskEnvs):
         self._goal_rotation = torch.eye(3, device=device).repeat(len(env_spec_index), 1, 1)
 
     def begin(
-        self,
-        rows: torch.Tensor,
-        random: Sequence[np.random.Generator],
-        layouts: Sequence[int | None],
+        self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw a start and another goal of each robot's set that the layout leaves free."""
-        spec = self._env_spec_index[rows]
-        pairs = [
-            stream.choice(self._choices[i][layout], size=2, replace=False)
-            for stream, i, layout in zip(random, spec.tolist(), layouts, strict=True)
-        ]
-        start, goal = torch.tensor(np.array(pairs), device=spec.device).T
-        self.goal_configuration[rows] = self._q[spec, goal]
-        self.goal[rows] = self._poses[spec, goal]
+        count = self._choices.count(layout)[:, None]
+        # The second number counts on from the first: it is never the same, modulo the count.
+        numbers = random.integers(Stream.START, count - self._excluded)
+        numbers[:, 1] += numbers[:, 0] + 1
+        pair = self._choices.goals(layout, numbers % count)
+        q = self._q[self._env_spec_index[:, None], pair]
+        pose = self._poses[self._env_spec_index, pair[:, 1]]
+        rows = mask[:, None]
+        self.goal_configuration.copy_(torch.where(rows, q[:, 1], self.goal_configuration))
+        self.goal.copy_(torch.where(rows, pose, self.goal))
         if self.needs_tool_rotation:
-            self._goal_rotation[rows] = matrix_from_quaternion(self.goal[rows, 3:])
-        return self._q[spec, start], torch.zeros(len(rows), 7, device=spec.device)
+            rotation = matrix_from_quaternion(self.goal[:, 3:])
+            self._goal_rotation.copy_(torch.where(rows[..., None], rotation, self._goal_rotation))
+        return q[:, 0], torch.zeros_like(self.goal)
 
     def evaluate(self, state: TaskState) -> StepResult:
         """Compare the tool with its goal; see ``evaluate_reach``."""

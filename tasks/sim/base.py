@@ -63,9 +63,11 @@ class Contacts:
 class Simulation(Protocol):
     """Environments with a scene each, stepped together.
 
-    Tensors are float32 on ``device``, padded with zeros to the largest number of independent
-    joints, J. They are views that the next call may overwrite. Environments do not influence each
-    other: each gives the same numbers whatever else is in the batch.
+    Tensors are on ``device``; numbers are float32, padded with zeros to the largest number of
+    independent joints, J. They are views that the next call may overwrite. Environments do not
+    influence each other: each gives the same numbers whatever else is in the batch.
+
+    On a GPU, ``reset`` and ``step`` read no tensor, so that the caller never waits for them.
     """
 
     device: torch.device
@@ -92,32 +94,44 @@ class Simulation(Protocol):
 
     def reset(
         self,
-        envs: torch.Tensor,
+        mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
         """Put some environments at rest; clear everything that earlier steps left behind.
 
+        All other arguments have a row for each environment, of which those outside of the mask may
+        hold anything.
+
         Args:
-            envs: Indices of environments, shape (k,), int64.
-            q: Positions of their independent joints, which become the targets, shape (k, J).
-            block_pose: Poses of their blocks, shape (k, 7); ignored without a block.
-            obstacle_poses: Poses of their obstacles in the world, shape (k, O, 7), padded to the
+            mask: Environments to reset, shape (n,), bool.
+            q: Positions of the independent joints, which become the targets, shape (n, J).
+            block_pose: Poses of the blocks, shape (n, 7); ignored without a block.
+            obstacle_poses: Poses of the obstacles in the world, shape (n, O, 7), padded to the
                 largest number of obstacles; None leaves them where they are.
+
+        Raises:
+            ValueError: If a shape is wrong or, on the CPU, a number is not finite.
         """
 
-    def step(self, targets: torch.Tensor) -> None:
+    def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step.
 
         Args:
             targets: Target positions of the independent joints, shape (n, J).
 
+        Returns:
+            Environments that diverged, shape (n,), bool: each must be reset before the next step.
+            All others have moved. On a GPU, targets that are not finite diverge, too.
+
         Raises:
-            DivergedError: If environments diverged; it names them, and each must be reset before
-                the next step. All others have moved.
+            ValueError: If the shape is wrong or, on the CPU, a target is not finite.
             SimulationError: If a worker died.
         """
+
+    def faults(self) -> dict[int, str]:
+        """Return why each environment diverged in the last step; waits for the device."""
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -147,7 +161,7 @@ class Simulator:
 def require_reset_shapes(
     scenes: Sequence[Scene],
     num_joints: int,
-    envs: torch.Tensor,
+    mask: torch.Tensor,
     q: torch.Tensor,
     block_pose: torch.Tensor,
     obstacle_poses: torch.Tensor | None,
@@ -157,27 +171,29 @@ def require_reset_shapes(
     Args:
         scenes: Scene of each environment.
         num_joints: Number of independent joints with padding, J.
-        envs: As of ``reset``, like the others.
+        mask: As of ``reset``, like the others.
         q: Joint positions.
         block_pose: Poses of blocks.
         obstacle_poses: Poses of obstacles, or None.
 
     Raises:
-        ValueError: If a shape is wrong, or an environment does not exist.
+        ValueError: If a shape is wrong, or the mask is not of type bool.
     """
-    k, n = len(envs), len(scenes)
-    if tuple(q.shape) != (k, num_joints) or tuple(block_pose.shape) != (k, 7):
+    n = len(scenes)
+    if tuple(mask.shape) != (n,) or str(mask.dtype) != "torch.bool":
         raise ValueError(
-            f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
-            f"{tuple(block_pose.shape)}; expected ({k}, {num_joints}) and ({k}, 7)"
+            f"reset with a mask of shape {tuple(mask.shape)} and type {mask.dtype}; expected "
+            f"({n},) and torch.bool"
         )
-    if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
-        raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
+    if tuple(q.shape) != (n, num_joints) or tuple(block_pose.shape) != (n, 7):
+        raise ValueError(
+            f"reset to q of shape {tuple(q.shape)} and blocks of shape {tuple(block_pose.shape)}; "
+            f"expected ({n}, {num_joints}) and ({n}, 7)"
+        )
     if obstacle_poses is None:
         return
     most = max(len(scene.obstacles) for scene in scenes)
-    if tuple(obstacle_poses.shape) != (k, most, 7):
+    if tuple(obstacle_poses.shape) != (n, most, 7):
         raise ValueError(
-            f"reset of {k} environments with obstacles of shape {tuple(obstacle_poses.shape)}; "
-            f"expected ({k}, {most}, 7)"
+            f"reset to obstacles of shape {tuple(obstacle_poses.shape)}; expected ({n}, {most}, 7)"
         )

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.errors import DivergedError, SimulationError
+from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, Share
@@ -26,7 +26,7 @@ from morphgen.tasks.sim.bullet_workers import (
     start,
 )
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
-from morphgen.tasks.sim.short_arrays import TensorView, all_finite
+from morphgen.tasks.sim.short_arrays import TensorView, all_finite, mask_of
 
 BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
 """Arguments of ``BulletBatch.reset``."""
@@ -81,6 +81,7 @@ class BulletSimulation:
         self._has_block = np.array([scene.block is not None for scene in scenes], bool)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
         self._view = TensorView()
+        self._faults: dict[int, str] = {}
         self._workers: list[Worker] = []
         self._local_batches: list[BulletBatch] = []
         self._free = weakref.finalize(self, _free, self._workers, self._local_batches, folder)
@@ -99,7 +100,7 @@ class BulletSimulation:
                 self._workers.append(start(number, share, shared))
             self._local_batches.append(BulletBatch(first, buffers))
             self._envs = np.array(first.envs)
-            failures = gather(self._workers)
+            _, failures = gather(self._workers)
             if failures:
                 raise failures[0]
         except BaseException:
@@ -108,7 +109,7 @@ class BulletSimulation:
 
     def reset(
         self,
-        envs: torch.Tensor,
+        mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
@@ -121,11 +122,14 @@ class BulletSimulation:
         """
         self._require_open()
         joints = self._is_joint.shape[1]
-        require_reset_shapes(self.scenes, joints, envs, q, block_pose, obstacle_poses)
-        indices, positions, poses = self._checked_state(envs, q, block_pose)
-        obstacles: Float32 | None = None if obstacle_poses is None else obstacle_poses.numpy()
-        if obstacles is not None and not np.isfinite(obstacles).all():
-            raise ValueError(f"reset of {len(envs)} environments: obstacles are not finite")
+        require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
+        indices = np.flatnonzero(mask.numpy())
+        positions, poses = self._checked_state(indices, q, block_pose)
+        obstacles: Float32 | None = None
+        if obstacle_poses is not None:
+            obstacles = obstacle_poses.numpy()[indices]
+            if not np.isfinite(obstacles).all():
+                raise ValueError(f"reset of {len(indices)} environments: obstacles are not finite")
 
         def state(rows: NDArray[np.bool_]) -> BulletState:
             moved = None if obstacles is None else obstacles[rows]
@@ -139,18 +143,23 @@ class BulletSimulation:
         local_state = state(np.isin(indices, self._envs))
         self._run(messages, lambda batch: batch.reset(*local_state))
 
-    def step(self, targets: torch.Tensor) -> None:
+    def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``.
 
         Raises:
             ValueError: If the shape is wrong, or a target is not finite.
-            DivergedError: If environments diverged.
-            SimulationError: If the simulation is closed, or a worker died, which closes it.
+            SimulationError: If the simulation is closed, an environment diverged before and was not
+                reset, or a worker died, which closes the simulation.
         """
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
         messages = [(worker, STEP) for worker in self._workers]
-        self._run(messages, lambda batch: batch.step(self._targets))
+        self._faults = self._run(messages, lambda batch: batch.step(self._targets))
+        return torch.from_numpy(mask_of(self._faults, len(self.scenes)))
+
+    def faults(self) -> dict[int, str]:
+        """Return why environments diverged in the last step; see ``Simulation.faults``."""
+        return self._faults
 
     def close(self) -> None:
         """Free the clients and end the workers; a second call does nothing."""
@@ -161,31 +170,33 @@ class BulletSimulation:
             raise SimulationError("the simulation is closed")
 
     def _run(
-        self, messages: Sequence[tuple[Worker, bytes]], work_here: Callable[[BulletBatch], None]
-    ) -> None:
+        self,
+        messages: Sequence[tuple[Worker, bytes]],
+        work_here: Callable[[BulletBatch], dict[int, str] | None],
+    ) -> dict[int, str]:
         """Send messages to workers, do this process's share, and wait for all answers.
 
         An interruption closes the simulation: it leaves answers in the pipes that nobody reads.
+
+        Returns:
+            The reason for each environment that diverged.
         """
         failures: list[Exception] = []
+        reasons: dict[int, str] = {}
         try:
             for worker, message in messages:
                 send(worker, message)
             try:
-                work_here(self._local_batches[0])
+                reasons |= work_here(self._local_batches[0]) or {}
             except (SimulationError, ValueError) as error:
                 failures.append(error)
-            failures += gather([worker for worker, _ in messages])
+            of_workers, failed = gather([worker for worker, _ in messages])
         except BaseException:
             self.close()
             raise
-        reasons: dict[int, str] = {}
-        for failure in failures:
-            if not isinstance(failure, DivergedError):
-                raise failure
-            reasons |= failure.reasons
-        if reasons:
-            raise DivergedError(reasons)
+        for failure in (*failures, *failed):
+            raise failure
+        return dict(sorted((reasons | of_workers).items()))
 
     def _checked_targets(self, targets: torch.Tensor) -> Float32:
         """Return valid targets of ``step`` as a contiguous array; padding may be anything."""
@@ -200,10 +211,10 @@ class BulletSimulation:
         return array
 
     def _checked_state(
-        self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor
-    ) -> tuple[NDArray[np.int64], Float32, Float32]:
-        """Return valid arguments of ``reset`` as arrays."""
-        indices, positions, poses = envs.numpy(), q.numpy(), block_pose.numpy()
+        self, indices: NDArray[np.int64], q: torch.Tensor, block_pose: torch.Tensor
+    ) -> tuple[Float32, Float32]:
+        """Return valid positions and block poses of some environments."""
+        positions, poses = q.numpy()[indices], block_pose.numpy()[indices]
         invalid = (self._is_joint[indices] & ~np.isfinite(positions)).any(axis=1)
         invalid |= self._has_block[indices] & ~np.isfinite(poses).all(axis=1)
         if invalid.any():
@@ -212,7 +223,7 @@ class BulletSimulation:
                 f"{self._label(int(indices[k]))}: reset to q {positions[k].tolist()}, "
                 f"block {poses[k].tolist()}"
             )
-        return indices, positions, poses
+        return positions, poses
 
     def _label(self, env: int) -> str:
         return f"environment {env} ({self.scenes[env].robot.name!r})"

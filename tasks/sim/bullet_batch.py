@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import DivergedError
+from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
@@ -172,17 +172,21 @@ class BulletBatch:
                 buffers.block_velocity[env] = 0
             self._num_steps_at_reset[i] = self._num_steps
 
-    def step(self, targets: Float32) -> None:
+    def step(self, targets: Float32) -> dict[int, str]:
         """Advance the environments by one control step; see ``Simulation.step``.
 
         Args:
             targets: Targets of all environments, shape (n, J), contiguous and finite.
 
+        Returns:
+            The reason for each environment that diverged: not finite, or beyond ``MAX_VELOCITY``.
+
         Raises:
-            DivergedError: If environments diverged: not finite, or beyond ``MAX_VELOCITY``. All
-                have stepped; the diverged ones must be reset before the next step.
+            SimulationError: If an environment diverged before and was not reset.
         """
-        self._require_no_divergence()
+        if self._diverged:
+            reason = next(iter(self._diverged.values()))
+            raise SimulationError(f"{reason}; expected a reset before the next step")
         desired = targets.reshape(-1)[self._source] * self._gain + self._offset
         ends, last = self._undisturbed(desired)
         mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
@@ -213,7 +217,7 @@ class BulletBatch:
             is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
         if not is_sane:
             self._find_diverged()
-            self._require_no_divergence()
+        return dict(self._diverged)
 
     def _undisturbed(
         self, desired: NDArray[np.float64]
@@ -245,10 +249,6 @@ class BulletBatch:
                     f"environment {env} ({name!r}) diverged in step {steps} after its "
                     f"reset: q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
                 )
-
-    def _require_no_divergence(self) -> None:
-        if self._diverged:
-            raise DivergedError(self._diverged)
 
     def close(self) -> None:
         """Free every scene; a second call does nothing."""

@@ -104,21 +104,30 @@ def send(worker: Worker, message: bytes) -> None:
         raise _death(worker) from error
 
 
-def gather(workers: Sequence[Worker]) -> list[Exception]:
-    """Wait for the answer of each worker; return the exceptions raised there.
+def gather(workers: Sequence[Worker]) -> tuple[dict[int, str], list[Exception]]:
+    """Wait for the answer of each worker.
+
+    Returns:
+        The reason for each environment that diverged; and the exceptions raised in the workers.
 
     Raises:
         SimulationError: If a worker died.
     """
+    reasons: dict[int, str] = {}
     failures: list[Exception] = []
     for worker in workers:
         try:
             answer = worker.pipe.recv_bytes()
         except (EOFError, OSError) as error:
             raise _death(worker) from error
-        if answer != _DONE:
-            failures.append(pickle.loads(answer))
-    return failures
+        if answer == _DONE:
+            continue
+        content: dict[int, str] | Exception = pickle.loads(answer)
+        if isinstance(content, Exception):
+            failures.append(content)
+        else:
+            reasons |= content
+    return reasons, failures
 
 
 def end(workers: Sequence[Worker]) -> None:
@@ -149,11 +158,12 @@ def _serve(pipe: Connection, shared: SharedBuffers) -> None:
     try:
         while True:
             message = pipe.recv_bytes()
+            reasons: dict[int, str] = {}
             try:
                 if batch is None:
                     batch = BulletBatch(pickle.loads(message), buffers)
                 elif message == STEP:
-                    batch.step(targets)
+                    reasons = batch.step(targets)
                 else:
                     batch.reset(*pickle.loads(message))
             except (SimulationError, ValueError) as error:
@@ -163,7 +173,7 @@ def _serve(pipe: Connection, shared: SharedBuffers) -> None:
                 pipe.send_bytes(pickle.dumps(unexpected))
                 raise
             else:
-                answer = _DONE
+                answer = pickle.dumps(reasons) if reasons else _DONE
             pipe.send_bytes(answer)
     except (EOFError, ConnectionError):
         return

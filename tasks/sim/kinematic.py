@@ -9,6 +9,7 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
+from morphgen.tasks.host import is_host
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, LAG, speed_limit
 from morphgen.typing import Array
@@ -90,11 +91,13 @@ class KinematicSimulation:
         self.qd = torch.zeros_like(self.q)
         self.block_pose = torch.zeros(n, 7, device=self.device)
         self.block_velocity = torch.zeros(n, 6, device=self.device)
+        self._diverged = torch.zeros(n, dtype=torch.bool, device=self.device)
+        self._on_host = is_host(self.device)
         self._closed = False
 
     def reset(
         self,
-        envs: torch.Tensor,
+        mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
@@ -102,23 +105,28 @@ class KinematicSimulation:
         """Put some environments at rest; see ``Simulation.reset``. There are no obstacles.
 
         Raises:
-            ValueError: If a shape is wrong, an environment does not exist, or a position is not
-                finite; then nothing has changed.
+            ValueError: If a shape is wrong or, on the CPU, a position is not finite; then nothing
+                has changed.
             SimulationError: If the simulation is closed.
         """
         self._require_open()
-        require_reset_shapes(self.scenes, self.q.shape[1], envs, q, block_pose, None)
-        positions = torch.where(self._is_joint[envs], q, 0.0)
-        if (row := _first_not_finite(positions)) is not None:
-            env = int(envs[row])
-            raise ValueError(f"{self._label(env)}: reset to q {q[row].tolist()}")
-        self.q[envs], self.qd[envs] = positions, 0.0
+        require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, None)
+        rows = mask[:, None]
+        positions = torch.where(rows, torch.where(self._is_joint, q, 0.0), self.q)
+        if self._on_host and (env := _first_not_finite(positions)) is not None:
+            raise ValueError(f"{self._label(env)}: reset to q {q[env].tolist()}")
+        self.q.copy_(positions)
+        self.qd.masked_fill_(rows, 0.0)
 
-    def step(self, targets: torch.Tensor) -> None:
+    def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``.
 
+        On the CPU no environment diverges. On a GPU those do whose targets or positions are not
+        finite.
+
         Raises:
-            ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
+            ValueError: If the shape is wrong or, on the CPU, a target is not finite; then nothing
+                has moved.
             SimulationError: If the simulation is closed.
         """
         self._require_open()
@@ -127,7 +135,7 @@ class KinematicSimulation:
                 f"targets have shape {tuple(targets.shape)}; expected {tuple(self.q.shape)}"
             )
         targets = torch.where(self._is_joint, targets, 0.0)
-        if (env := _first_not_finite(targets)) is not None:
+        if self._on_host and (env := _first_not_finite(targets)) is not None:
             raise ValueError(f"{self._label(env)}: targets {targets[env].tolist()} are not finite")
         error = torch.clamp(targets, self._lower, self._upper) - self.q
         error = torch.clamp(error, -self._farthest, self._farthest)
@@ -135,6 +143,14 @@ class KinematicSimulation:
         # A clamped error is that of a nearer target, towards which the joint moves in this step.
         self.q += (1 - error_to_error) * error - velocity_to_error * self.qd
         self.qd.mul_(by_velocity).add_(by_error * error)
+        if not self._on_host:
+            self._diverged = ~(torch.isfinite(self.q) & torch.isfinite(targets)).all(dim=1)
+        return self._diverged
+
+    def faults(self) -> dict[int, str]:
+        """Return why environments diverged in the last step; see ``Simulation.faults``."""
+        envs = torch.nonzero(self._diverged)[:, 0].tolist()
+        return {env: f"{self._label(env)}: a target or position is not finite" for env in envs}
 
     def close(self) -> None:
         """End the simulation; a second call does nothing."""

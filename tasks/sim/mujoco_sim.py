@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
-from morphgen.errors import DivergedError, SimulationError
+from morphgen.errors import SimulationError
 from morphgen.formats.mujoco_warnings import MujocoWarnings
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import (
@@ -23,7 +23,7 @@ from morphgen.tasks.sim.base import (
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import MujocoState
-from morphgen.tasks.sim.short_arrays import TensorView, all_finite
+from morphgen.tasks.sim.short_arrays import TensorView, all_finite, mask_of
 from morphgen.typing import Array
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
@@ -92,6 +92,7 @@ class MujocoSimulation:
             self._put_obstacles(i, poses)
         self._state.read()
         self._view = TensorView()
+        self._faults: dict[int, str] = {}
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
@@ -103,7 +104,7 @@ class MujocoSimulation:
 
     def reset(
         self,
-        envs: torch.Tensor,
+        mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
@@ -111,27 +112,28 @@ class MujocoSimulation:
         """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
-            ValueError: If a shape is wrong, an environment does not exist, or a position is not
-                finite; the environments before that one have been reset.
+            ValueError: If a shape is wrong or a position is not finite; the environments before
+                that one have been reset.
+            SimulationError: If the simulation is closed.
         """
         self._require_open()
         joints = self._targets.shape[1]
-        require_reset_shapes(self.scenes, joints, envs, q, block_pose, obstacle_poses)
-        rows = zip(envs.tolist(), q.tolist(), block_pose.tolist(), strict=True)
-        for row, (env, positions, pose) in enumerate(rows):
-            self._put(env, positions[: self._worlds[env].robot.dof], pose)
+        require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
+        for env in np.flatnonzero(mask.numpy()).tolist():
+            dof = self._worlds[env].robot.dof
+            self._put(env, q[env, :dof].tolist(), block_pose[env].tolist())
             if obstacle_poses is not None:
                 count = len(self._worlds[env].obstacles)
-                self._put_obstacles(env, obstacle_poses[row, :count].tolist())
+                self._put_obstacles(env, obstacle_poses[env, :count].tolist())
         self._state.read()
 
-    def step(self, targets: torch.Tensor) -> None:
+    def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``.
+
+        Environments also diverge if their contacts do not fit into MuJoCo's memory.
 
         Raises:
             ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            DivergedError: If environments diverged, or their contacts do not fit into MuJoCo's
-                memory; all others have moved, and these must be reset.
             SimulationError: If the simulation is closed.
         """
         self._require_open()
@@ -149,9 +151,13 @@ class MujocoSimulation:
             )
             refused = self._advance()
             self._state.read()
-        faults = self._state.faults() | refused
-        if faults:
-            raise DivergedError({env: f"{self._label(env)}: {why}" for env, why in faults.items()})
+        faults = dict(sorted((self._state.faults() | refused).items()))
+        self._faults = {env: f"{self._label(env)}: {why}" for env, why in faults.items()}
+        return torch.from_numpy(mask_of(self._faults, len(self.scenes)))
+
+    def faults(self) -> dict[int, str]:
+        """Return why environments diverged in the last step; see ``Simulation.faults``."""
+        return self._faults
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""

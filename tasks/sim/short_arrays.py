@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,13 @@ def consecutive(indices: NDArray[np.intp]) -> NDArray[np.intp] | slice:
     first = int(indices[0]) if len(indices) else 0
     is_slice = np.array_equal(indices, np.arange(first, first + len(indices)))
     return slice(first, first + len(indices)) if is_slice else indices
+
+
+def mask_of(rows: Iterable[int], count: int) -> NDArray[np.bool_]:
+    """Return a mask of ``count`` rows that is set in some of them."""
+    mask = np.zeros(count, bool)
+    mask[list(rows)] = True
+    return mask
 
 
 class TensorView:

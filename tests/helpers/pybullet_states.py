@@ -4,6 +4,8 @@ import numpy as np
 import pybullet
 import torch
 
+from helpers.resets import reset_envs
+
 PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 """The gantry's plate upright behind the block, off the ground."""
 
@@ -25,7 +27,7 @@ def reset(simulation, q=None, pose=None, envs=None):
     home, blocks = starts(simulation)
     q = home[envs] if q is None else torch.as_tensor(q, dtype=torch.float32).reshape(len(envs), -1)
     pose = blocks[envs] if pose is None else torch.as_tensor(pose, dtype=torch.float32)
-    simulation.reset(envs, q, pose.reshape(len(envs), 7))
+    reset_envs(simulation, envs, q, pose.reshape(len(envs), 7))
     return q
 
 

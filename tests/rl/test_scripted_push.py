@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.resets import reset_envs
 from helpers.scenes import robot
 from helpers.simulators import PYBULLET
 from morphgen.model.kinematics_torch import frame_positions
@@ -100,13 +101,12 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
     monkeypatch.setattr(PushPlanner, "plan", counted)
     task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
     task.reset()
-    env = torch.tensor([0])
     for i in range(PUSH.max_episode_steps):
         if i % 60 == 59:
             away = task.simulation.block_pose.clone()
             away[0, 0] = -away[0, 0] + (0.15 if away[0, 0] < 0 else -0.15)
             away[0, 1] = -0.2
-            task.simulation.reset(env, task.simulation.q.clone(), away)
+            reset_envs(task.simulation, [0], task.simulation.q.clone(), away)
             task.targets[:] = task.q
         if task.step(controller.act(task)).terminated.any():
             break

@@ -8,6 +8,7 @@ import torch
 
 import morphgen
 from helpers.goal_sets import draw_spec
+from helpers.resets import reset_envs
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
@@ -16,7 +17,8 @@ from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.make import batch_from_specs, make_batch
-from morphgen.tasks.observation import NOISE, ObservationConfig
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.point_clouds import NOISE
 from morphgen.tasks.reach.config import ReachConfig
 
 CONFIG = replace(ReachConfig(), num_goals=20)
@@ -319,10 +321,7 @@ def test_observed_tool_position_matches_forward_kinematics(build_batch):
 def test_goal_configuration_puts_the_tool_at_the_goal(build_batch):
     batch = build_batch(observe=ObservationConfig(tool=True))
     batch.reset()
-    envs = torch.arange(3)
-    batch.simulation.reset(
-        envs, batch.groups["reach"].goal_configuration, batch.simulation.block_pose
-    )
+    reset_envs(batch.simulation, torch.arange(3), batch.groups["reach"].goal_configuration)
     torch.testing.assert_close(
         batch.observe()["tool"], batch.field("goal")[:, :3], rtol=0, atol=1e-5
     )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.resets import reset_envs
 from helpers.scenes import robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, joint_limits
@@ -44,7 +45,7 @@ def test_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
     paths = []
     for contacts in (Contacts(self_collision=False), Contacts(False, False)):
         sim = simulation([scene] * n, contacts)
-        sim.reset(torch.arange(n), q, places)
+        reset_envs(sim, torch.arange(n), q, places)
         path = []
         for i in range(1, 16):
             turned = q.clone()
@@ -67,7 +68,7 @@ def test_links_on_a_turntable_collide_with_obstacles(simulation):
     places = torch.zeros(1, 7)
     for obstacles in ((), (post,)):
         sim = simulation([Scene(body, obstacles=obstacles)], Contacts(self_collision=False))
-        sim.reset(torch.arange(1), q, places)
+        reset_envs(sim, [0], q, places)
         for i in range(1, 40):
             turned = q.clone()
             turned[0, 0] = min(float(q[0, 0]) + 0.05 * i, 3.1)

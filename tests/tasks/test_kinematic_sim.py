@@ -8,6 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
+from helpers.resets import reset_envs
 from helpers.robots import arm, finger
 from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError
@@ -27,9 +28,7 @@ NEAR = 0.01
 
 def reset(sim, q, envs=None):
     """Put environments at rest, by default all of them."""
-    envs = torch.arange(len(sim.scenes)) if envs is None else torch.tensor(envs)
-    q = torch.as_tensor(q, dtype=torch.float32)
-    sim.reset(envs.to(sim.device), q.to(sim.device), torch.zeros(len(envs), 7, device=sim.device))
+    reset_envs(sim, range(len(sim.scenes)) if envs is None else envs, torch.as_tensor(q))
 
 
 def follow(sim, targets):
@@ -247,10 +246,10 @@ def test_number_of_operations_is_independent_of_the_number_of_environments():
     counts = []
     for n in (2, 200):
         sim = KinematicSimulation([reach_scene()] * n)
-        envs, q, block = torch.arange(n), sim.q.clone(), sim.block_pose.clone()
+        mask, q, block = torch.arange(n) > 0, sim.q.clone(), sim.block_pose.clone()
         with CountOperations() as counter:
             sim.step(q)
-            sim.reset(envs, q, block)
+            sim.reset(mask, q, block)
         counts.append(counter.count)
     assert counts[0] == counts[1] > 0
 
@@ -283,16 +282,16 @@ def test_invalid_arguments_are_rejected_and_change_nothing():
         sim.step(q[:1])
     with pytest.raises(ValueError, match=r"environment 1 .*not finite"):
         sim.step(torch.stack([q[0] + 1, q[1] * torch.nan]))
-    with pytest.raises(ValueError, match=r"expected \(1, "):
-        sim.reset(torch.tensor([0]), q, block)
-    with pytest.raises(ValueError, match="there are 2"):
-        sim.reset(torch.tensor([0, 2]), q, block)
-    with pytest.raises(ValueError, match=r"environment 0 .*reset to q"):
-        sim.reset(torch.tensor([1, 0]), torch.stack([q[0] + 1, q[1] * torch.inf]), block)
+    with pytest.raises(ValueError, match=r"expected \(2,\) and torch.bool"):
+        sim.reset(torch.tensor([0, 1]), q, block)
+    with pytest.raises(ValueError, match=r"expected \(2, "):
+        sim.reset(torch.ones(2, dtype=torch.bool), q[:1], block)
+    with pytest.raises(ValueError, match=r"environment 1 .*reset to q"):
+        reset_envs(sim, [0, 1], torch.stack([q[0] + 1, q[1] * torch.inf]))
     assert torch.equal(sim.q, q)
     sim.close()
     sim.close()
     with pytest.raises(SimulationError, match="closed"):
         sim.step(q)
     with pytest.raises(SimulationError, match="closed"):
-        sim.reset(torch.arange(2), q, block)
+        reset(sim, q)

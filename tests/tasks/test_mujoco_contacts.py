@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from helpers.joint_targets import held
+from helpers.resets import reset_envs
 from helpers.scenes import reach_scene, robot
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Pose
@@ -67,7 +68,7 @@ def test_block_without_mass_is_static():
     block = Block((0.1,) * 3, Pose((0.0, 0.0, 0.5)))
     sim = MujocoSimulation([block_scene(block)])
     pose = torch.tensor([[0.1, 0.2, 0.7, 0.0, 1.0, 0.0, 0.0]])
-    sim.reset(torch.tensor([0]), sim.q.clone(), pose)
+    reset_envs(sim, [0], sim.q.clone(), pose)
     held(sim, 5)
     assert torch.equal(sim.block_pose, pose)
     assert not sim.block_velocity.any()
@@ -96,7 +97,7 @@ def test_self_contacts_are_optional_and_respect_ignored_pairs():
         sim = MujocoSimulation([Scene(body, ground=None)], contacts)
         held(sim, 1)
         assert sim._data[0].ncon == 0
-        sim.reset(torch.tensor([0]), torch.from_numpy(q[None]).float(), torch.zeros(1, 7))
+        reset_envs(sim, [0], torch.from_numpy(q[None]))
         held(sim, 1)
         counts.append(sim._data[0].ncon)
     assert counts[0] > 0

@@ -1,6 +1,7 @@
 """MuJoCo simulation: control law, resets, divergence and reproducibility."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import pytest
 import torch
 
 from helpers.joint_targets import held
+from helpers.resets import reset_envs
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs
-from morphgen.errors import DivergedError, SimulationError
+from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits, movable_positions
@@ -48,7 +50,7 @@ def drive(sim, steps=25, seed=0):
 
 def put_back(sim, envs, home):
     q, pose = home
-    sim.reset(torch.tensor(envs), q[envs], pose[envs])
+    reset_envs(sim, envs, q[envs], pose[envs])
 
 
 def test_initial_state_is_home():
@@ -202,15 +204,16 @@ def test_diverged_environment_is_reported_and_can_be_reset(tmp_path, monkeypatch
     sim.step(home[0])
     sim._data[1].qvel[0] = math.nan
     name = sim.scenes[1].robot.name
-    with pytest.raises(DivergedError, match=rf"environment 1 \(robot '{name}', 2 steps"):
-        sim.step(home[0])
+    assert sim.step(home[0]).tolist() == [False, True, False]
+    assert re.match(rf"environment 1 \(robot '{name}', 2 steps", sim.faults()[1])
     assert sim.q[[0, 2]].isfinite().all()
     put_back(sim, [1], home)
-    sim.step(home[0])
+    assert not sim.step(home[0]).any()
+    assert sim.faults() == {}
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
-    with pytest.raises(DivergedError, match=r"environment 0 .*beyond 10000") as joint_names:
-        sim.step(home[0])
-    assert list(joint_names.value.reasons) == [0, 2]
+    assert sim.step(home[0]).tolist() == [True, False, True]
+    assert list(sim.faults()) == [0, 2]
+    assert re.match(r"environment 0 .*beyond 10000", sim.faults()[0])
     assert list(Path(tmp_path).iterdir()) == []
 
 
@@ -234,10 +237,10 @@ def test_contact_overflow_affects_only_its_environment(monkeypatch, memory, word
     inside = home[1].clone()
     inside[1, :3] = torch.tensor([0.5, 0.2, 0.02])  # in an obstacle and the ground
     put_back(sim, [0, 1], (home[0], inside))
-    with pytest.raises(DivergedError, match=rf"environment 1 \(robot 'prims'.*{words}") as info:
-        sim.step(home[0])
-    assert list(info.value.reasons) == [1]
-    assert "\n" not in str(info.value)
+    assert sim.step(home[0]).tolist() == [False, True]
+    (fault,) = sim.faults().values()
+    assert re.match(rf"environment 1 \(robot 'prims'.*{words}", fault)
+    assert "\n" not in fault
     put_back(sim, [0, 1], home)
     held(sim, 3)
     alone = held(MujocoSimulation([push_scene()]), 3)
@@ -255,20 +258,19 @@ def test_non_finite_targets_are_rejected_before_stepping():
 
 
 @pytest.mark.parametrize(
-    ("envs", "q", "pose", "words"),
+    ("mask", "q", "pose", "words"),
     [
-        ([0], (1, 5), torch.zeros(1, 7), "not a pose of a block"),
-        ([0], (1, 5), torch.full((1, 7), math.nan), "reset to"),
-        ([0], (1, 4), torch.zeros(1, 7), r"\(1, 5\)"),
-        ([0, 0], (1, 5), torch.zeros(1, 7), r"\(2, 5\)"),
-        ([1], (1, 5), torch.zeros(1, 7), "there are 1"),
-        ([-1], (1, 5), torch.zeros(1, 7), "there are 1"),
+        ([True], (1, 5), torch.zeros(1, 7), "not a pose of a block"),
+        ([True], (1, 5), torch.full((1, 7), math.nan), "reset to"),
+        ([True], (1, 4), torch.zeros(1, 7), r"\(1, 5\)"),
+        ([True, True], (1, 5), torch.zeros(1, 7), r"mask of shape \(2,\)"),
+        ([0], (1, 5), torch.zeros(1, 7), r"type torch.int64; expected \(1,\) and torch.bool"),
     ],
 )
-def test_invalid_resets_are_rejected(envs, q, pose, words):
+def test_invalid_resets_are_rejected(mask, q, pose, words):
     sim = MujocoSimulation([push_scene()])
     with pytest.raises(ValueError, match=words):
-        sim.reset(torch.tensor(envs), torch.zeros(q), pose)
+        sim.reset(torch.tensor(mask), torch.zeros(q), pose)
 
 
 def test_targets_with_a_wrong_shape_are_rejected():
@@ -316,7 +318,7 @@ def test_movable_joint_order_matches_the_robot():
     q = torch.from_numpy(
         np.random.default_rng(0).uniform(*joint_limits(scene.robot).T)[None]
     ).float()
-    sim.reset(torch.tensor([0]), q, torch.zeros(1, 7))
+    reset_envs(sim, [0], q)
     assert torch.equal(sim.q, q)
     expected = movable_positions(scene.robot, q[0].double().numpy())
     joint_positions = [

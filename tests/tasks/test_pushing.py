@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.resets import reset_envs
 from helpers.robots import finger
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
@@ -29,7 +30,7 @@ def pushed(simulator, block_mass, speed, way, finger_mass=2.0, height=0.3):
     try:
         q = torch.tensor([[-EDGE / 2 - 0.011, height * EDGE]])
         pose = torch.tensor([[0.0, 0.0, EDGE / 2, 1.0, 0.0, 0.0, 0.0]])
-        simulation.reset(torch.tensor([0]), q, pose)
+        reset_envs(simulation, [0], q, pose)
         rows = []
         for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
             q[:, 0] += speed * CONTROL_PERIOD

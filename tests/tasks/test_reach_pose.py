@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.resets import reset_envs
 from helpers.scenes import robot
 from morphgen.errors import TaskError
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
@@ -75,7 +76,7 @@ def test_at_its_goals_configuration_a_robot_succeeds_and_elsewhere_the_angle_is_
     batch = made(POSE)
     envs = batch.groups["reach"]
     goal_q = envs.goal_configuration.clone()
-    batch.simulation.reset(torch.arange(4), goal_q, torch.zeros(4, 7))
+    reset_envs(batch.simulation, torch.arange(4), goal_q)
     batch.targets = goal_q.clone()
     step = batch.step(torch.zeros(batch.action_mask.shape))
     assert step.success.all()

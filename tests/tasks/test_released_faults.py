@@ -12,6 +12,7 @@ import torch
 
 import morphgen
 from helpers.goal_sets import draw_spec
+from helpers.resets import reset_envs
 from helpers.simulators import PYBULLET
 from morphgen.model.dynamics import actuation
 from morphgen.rl.baselines.simple import Random
@@ -93,7 +94,7 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
         with closing(batch_from_specs([setting], 1, sim=sim)) as batch:
             batch.reset()
             start = torch.tensor(body.home)[None].float()
-            batch.simulation.reset(torch.tensor([0]), start, torch.zeros(1, 7))
+            reset_envs(batch.simulation, [0], start)
             for _ in range(15):
                 batch.simulation.step(start + 0.1)
             ends.append(batch.simulation.q.clone())

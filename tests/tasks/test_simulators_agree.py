@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from helpers.joint_targets import SECOND, smooth_walk
+from helpers.resets import reset_envs
 from helpers.scenes import PAPER_ROBOTS, push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
@@ -28,11 +29,7 @@ def begun(simulation, scene, q, contacts=None):
     """Return a simulation of one scene, reset to a state."""
     sim = simulation([scene], contacts)
     block = scene.block.pose if scene.block is not None else Pose()
-    sim.reset(
-        torch.tensor([0]),
-        torch.tensor([q], dtype=torch.float32),
-        torch.tensor([(*block.position, *block.quaternion)], dtype=torch.float32),
-    )
+    reset_envs(sim, [0], torch.tensor([q]), torch.tensor([(*block.position, *block.quaternion)]))
     return sim
 
 

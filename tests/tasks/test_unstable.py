@@ -19,6 +19,7 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from helpers.pybullet_states import client_of
+from helpers.resets import reset_envs
 
 REACH, PUSH = ReachConfig(num_goals=5), PushConfig(num_goals=5)
 CHANNELS = ObservationConfig(velocity=True, previous_action=True, tool=True)
@@ -145,7 +146,7 @@ def test_diverged_episode_is_never_a_success(build_batch):
             batch.field("line")[:, 0][1] + 0.05,
         )
         batch.targets[0] = batch.groups["reach"].goal_configuration[0]
-        batch.simulation.reset(torch.arange(2), q[:2], block[:2])
+        reset_envs(batch.simulation, [0, 1], q[:2], block[:2])
 
     batch.reset()
     put_at_goals()
