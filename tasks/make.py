@@ -20,6 +20,7 @@ from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.obstacles import LayoutSide
+from morphgen.tasks.random_numbers import require_seed
 from morphgen.tasks.registry import SIMULATORS, default_simulator, installed_simulators
 from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import Contacts, Simulator
@@ -192,8 +193,7 @@ def batch_from_specs(
             f"{num_envs} environments of {len(specs)} robots with {workers} workers: at least "
             "one of each"
         )
-    if seed < 0:
-        raise TaskError(f"seed {seed}: expected 0 or more")
+    require_seed(seed)
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
     simulator = SIMULATORS[sim or default_simulator()]

@@ -126,8 +126,7 @@ class EpisodeSequence:
         Raises:
             TaskError: If the seed is out of range.
         """
-        if not 0 <= seed <= MAX_SEED:
-            raise TaskError(f"seed {seed}: expected 0 to 2^64 - 1")
+        require_seed(seed)
         self.seed, self.env_number, self.next_episode = seed, env_number, next_episode
         self._uses_left = 0
         # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
@@ -165,6 +164,16 @@ class EpisodeSequence:
         counter[2] = torch.arange(STREAMS_AHEAD, device=device)
         words = philox(counter.flatten(1), self.seed)
         self._ahead = words.T.reshape(n * AHEAD, 4 * STREAMS_AHEAD)
+
+
+def require_seed(seed: int) -> None:
+    """Require a seed of episodes.
+
+    Raises:
+        TaskError: If it is out of range.
+    """
+    if not 0 <= seed <= MAX_SEED:
+        raise TaskError(f"seed {seed}: expected 0 to 2^64 - 1")
 
 
 def philox(counter: torch.Tensor, seed: int) -> torch.Tensor:
