@@ -1,4 +1,4 @@
-"""Values that are the same in all versions with the same first two numbers, such as 0.2.x.
+"""Values that are the same in all versions with the same first two numbers, such as 0.3.x.
 
 ``reference.json`` records them. The diagnosis compares those of an installation with it, and a test
 compares all of them: numbers of two versions are only comparable while they agree. A change of one

@@ -1,4 +1,4 @@
-"""Values that are the same in all versions 0.2.x; ``docs/versions.md`` promises them."""
+"""Values that are the same in all versions 0.3.x; ``docs/versions.md`` promises them."""
 
 import pytest
 
