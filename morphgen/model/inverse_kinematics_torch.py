@@ -36,7 +36,9 @@ def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tens
     Returns:
         Changes of the joint positions, shape (..., J).
     """
-    scaled: torch.Tensor = torch.linalg.solve(_regularized(J, damping), error[..., None])
+    # Not ``solve``, which reads whether a matrix is singular: these are positive definite.
+    scaled: torch.Tensor
+    scaled, _ = torch.linalg.solve_ex(_regularized(J, damping), error[..., None])
     return (J.transpose(-1, -2) @ scaled)[..., 0]
 
 
@@ -281,7 +283,8 @@ def _limit_rotation(
 
 
 def _damped_inverse(J: torch.Tensor, damping: float) -> torch.Tensor:
-    inverse: torch.Tensor = torch.linalg.inv(_regularized(J, damping))
+    inverse: torch.Tensor
+    inverse, _ = torch.linalg.inv_ex(_regularized(J, damping))
     return J.transpose(1, 2) @ inverse
 
 

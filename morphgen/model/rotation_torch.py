@@ -8,18 +8,21 @@ import torch
 def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:
     """Return unit quaternions (w, x, y, z), w >= 0, (..., 4) of rotation matrices (..., 3, 3).
 
-    Bar-Itzhack, New method for extracting the quaternion from a rotation matrix,
-    2000: the quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix.
+    Shepperd, Quaternion from rotation matrix, 1978: the products of a quaternion's components with
+    its largest one are sums of the matrix's elements.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(-2).unbind(-1)
     rows = (
-        (xx + yy + zz, zy - yz, xz - zx, yx - xy),
-        (zy - yz, xx - yy - zz, yx + xy, zx + xz),
-        (xz - zx, yx + xy, yy - xx - zz, zy + yz),
-        (yx - xy, zx + xz, zy + yz, zz - xx - yy),
+        (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+        (zy - yz, 1 + xx - yy - zz, yx + xy, zx + xz),
+        (xz - zx, yx + xy, 1 + yy - xx - zz, zy + yz),
+        (yx - xy, zx + xz, zy + yz, 1 + zz - xx - yy),
     )
-    K = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    q = torch.linalg.eigh(K).eigenvectors[..., -1]
+    products = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    row = torch.gather(products, -2, index).squeeze(-2)
+    q = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
     return torch.where(q[..., :1] < 0, -q, q)
 
 

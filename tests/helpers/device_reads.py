@@ -19,6 +19,9 @@ READS = (
     "aten::unique_consecutive",
     "aten::bincount",
     "aten::repeat_interleave.Tensor",
+    "aten::_linalg_check_errors",  # solve, inv; not solve_ex, inv_ex
+    "aten::_linalg_eigh",
+    "aten::_linalg_svd",
 )
 """Operators whose result, or its shape, the processor waits for."""
 COPIES = ("aten::lift_fresh", "aten::_pin_memory")
