@@ -41,7 +41,7 @@ class EvalProtocol:
         Raises:
             BenchmarkError: If the simulator is unknown or has no contacts, or a number is invalid.
         """
-        valid = [name for name in SIMULATORS.builtin if name != "kinematic"]
+        valid = [name for name in SIMULATORS.builtin if name not in ("kinematic", "warp")]
         if self.simulator not in valid:
             raise BenchmarkError(
                 f"simulator {self.simulator!r}: no simulator with contacts that comes with morphgen"

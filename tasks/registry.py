@@ -127,6 +127,7 @@ SIMULATORS: Registry[Simulator] = Registry(
     {
         "pybullet": "morphgen.tasks.sim.bullet:SIMULATOR",
         "mujoco": "morphgen.tasks.sim.mujoco_sim:SIMULATOR",
+        "warp": "morphgen.tasks.sim.warp_sim:SIMULATOR",
         "kinematic": "morphgen.tasks.sim.kinematic:SIMULATOR",
     },
 )
@@ -158,9 +159,10 @@ def installed_simulators(condition: Callable[[Simulator], bool] = lambda _: True
 def evaluation_simulator(name: str) -> str:
     """Return the simulator that judges policies trained in a simulator.
 
-    It is the same one, or MuJoCo if that one simulates no contacts.
+    It is the same one, or MuJoCo if that one simulates no contacts or needs a GPU.
     """
-    return name if SIMULATORS[name].simulates_contacts else "mujoco"
+    simulator = SIMULATORS[name]
+    return name if simulator.simulates_contacts and "cpu" in simulator.devices else "mujoco"
 
 
 def register_gym_envs() -> None:

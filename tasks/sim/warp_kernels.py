@@ -1,0 +1,324 @@
+"""Kernels of the Warp simulator: control law, resets, and the state that the batch reads."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from morphgen.model.dynamics import BANDWIDTH
+from morphgen.tasks.sim.motor_law import GAIN
+from morphgen.tasks.sim.mujoco_control import BY_ERROR, BY_VELOCITY
+from morphgen.tasks.sim.mujoco_model import PASSIVE
+from morphgen.tasks.sim.mujoco_state import MAX_SPEED
+
+_BY_ERROR = wp.constant(float(BY_ERROR))
+_BY_VELOCITY = wp.constant(float(BY_VELOCITY))
+_PASSIVE_LEAD = wp.constant(PASSIVE * 2.0 / BANDWIDTH)
+_PER_ACCELERATION = wp.constant(1.0 / (GAIN * BANDWIDTH**2))
+_MAX_SPEED = wp.constant(MAX_SPEED)
+
+
+@wp.struct
+class Joints:
+    """Joints of a group of worlds with one structure; R rows of numbers, world w has row w % R."""
+
+    env: wp.array[int]
+    """Environment of each world."""
+    q_at: wp.array[int]
+    """Index in ``qpos`` of each independent joint."""
+    qd_at: wp.array[int]
+    """Index in ``qvel`` of each independent joint."""
+    dof_leader: wp.array[int]
+    """Independent joint that each degree of freedom follows; -1 for those of the block."""
+    dof_gain: wp.array2d[float]
+    """Velocity of each degree of freedom per velocity of its leader, (R, nv)."""
+    dof_q_at: wp.array[int]
+    """Index in ``qpos`` of each degree of freedom that has a leader."""
+    dof_offset: wp.array2d[float]
+    """Position of each degree of freedom where its leader is at zero, (R, nv) [rad or m]."""
+    compliance: wp.array2d[float]
+    """Inverse gain of each actuator, (R, J) [rad/N m or m/N]."""
+    farthest: wp.array2d[float]
+    """Largest distance between a target and its joint, (R, J) [rad or m]."""
+
+
+@wp.struct
+class Things:
+    """Block and obstacles of a group of worlds."""
+
+    block_q_at: int
+    """Index in ``qpos`` of the pose of a block that moves, or -1."""
+    block_qd_at: int
+    """Index in ``qvel`` of the velocity of a block that moves."""
+    block_mocap: int
+    """Index in ``mocap_pos`` of a block that does not move, or -1."""
+    obstacles: wp.array[int]
+    """Indices in ``mocap_pos`` of the obstacles."""
+
+
+@wp.kernel
+def accelerations(
+    joints: Joints,
+    targets: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    damping: wp.array2d[float],
+    acceleration: wp.array2d[float],
+    applied: wp.array2d[float],
+) -> None:
+    """Compute the law's mean acceleration in a control step, and forces that cancel damping.
+
+    Threads: (worlds, nv). See ``PositionControl``.
+    """
+    world, dof = wp.tid()
+    joint = joints.dof_leader[dof]
+    value = float(0.0)
+    if joint >= 0:
+        row = world % joints.farthest.shape[0]
+        farthest = joints.farthest[row, joint]
+        error = targets[joints.env[world], joint] - qpos[world, joints.q_at[joint]]
+        velocity = qvel[world, joints.qd_at[joint]]
+        mean = _BY_ERROR * wp.clamp(error, -farthest, farthest) + _BY_VELOCITY * velocity
+        value = joints.dof_gain[world % joints.dof_gain.shape[0], dof] * mean
+    acceleration[world, dof] = value
+    applied[world, dof] = damping[world % damping.shape[0], dof] * qvel[world, dof]
+
+
+@wp.kernel
+def controls(
+    joints: Joints,
+    targets: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    force: wp.array2d[float],
+    bias: wp.array2d[float],
+    weight: wp.array2d[float],
+    control: wp.array2d[float],
+) -> None:
+    """Compute the targets of the actuators, with the missing force of inverse dynamics.
+
+    Threads: (worlds, J). See ``PositionControl``.
+
+    Args:
+        joints: Joints of the group.
+        targets: Targets of the independent joints, (n, J).
+        qpos: Positions.
+        qvel: Velocities.
+        force: Joint-space inertia times the accelerations of ``accelerations``.
+        bias: Coriolis and gravity forces.
+        weight: Forces of gravity compensation.
+        control: Receives the controls.
+    """
+    world, joint = wp.tid()
+    missing = float(0.0)
+    for dof in range(joints.dof_leader.shape[0]):
+        if joints.dof_leader[dof] == joint:
+            gain = joints.dof_gain[world % joints.dof_gain.shape[0], dof]
+            missing += gain * (force[world, dof] + bias[world, dof] - weight[world, dof])
+    row = world % joints.farthest.shape[0]
+    q = qpos[world, joints.q_at[joint]]
+    qd = qvel[world, joints.qd_at[joint]]
+    farthest = joints.farthest[row, joint]
+    error = wp.clamp(targets[joints.env[world], joint] - q, -farthest, farthest)
+    mean = _BY_ERROR * error + _BY_VELOCITY * qd
+    control[world, joint] = (
+        missing * joints.compliance[row, joint]
+        + q
+        + error
+        - _PASSIVE_LEAD * qd
+        - _PER_ACCELERATION * mean
+    )
+
+
+@wp.kernel
+def read_state(
+    joints: Joints,
+    things: Things,
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+    out_q: wp.array2d[float],
+    out_qd: wp.array2d[float],
+    out_pose: wp.array2d[float],
+    out_velocity: wp.array2d[float],
+) -> None:
+    """Write the state of a group's worlds into the rows of their environments.
+
+    Threads: (worlds,).
+
+    Args:
+        joints: Joints of the group.
+        things: Block and obstacles.
+        qpos: Positions.
+        qvel: Velocities.
+        mocap_pos: Positions of mocap bodies.
+        mocap_quat: Orientations of mocap bodies.
+        out_q: Receives positions of the independent joints, (n, J).
+        out_qd: Receives their velocities, (n, J).
+        out_pose: Receives poses of the blocks, (n, 7).
+        out_velocity: Receives velocities of the blocks in the world frame, (n, 6).
+    """
+    world = wp.tid()
+    env = joints.env[world]
+    for joint in range(joints.q_at.shape[0]):
+        out_q[env, joint] = qpos[world, joints.q_at[joint]]
+        out_qd[env, joint] = qvel[world, joints.qd_at[joint]]
+    if things.block_q_at >= 0:
+        at = things.block_q_at
+        rotation = wp.quat(
+            qpos[world, at + 4], qpos[world, at + 5], qpos[world, at + 6], qpos[world, at + 3]
+        )
+        _write_pose(
+            wp.vec3(qpos[world, at], qpos[world, at + 1], qpos[world, at + 2]),
+            rotation,
+            out_pose,
+            env,
+        )
+        at = things.block_qd_at
+        spin = wp.vec3(qvel[world, at + 3], qvel[world, at + 4], qvel[world, at + 5])
+        turned = wp.quat_rotate(wp.normalize(rotation), spin)  # from the axes of the block
+        for axis in range(3):
+            out_velocity[env, axis] = qvel[world, at + axis]
+            out_velocity[env, 3 + axis] = turned[axis]
+    if things.block_mocap >= 0:
+        # MuJoCo's quaternions are (w, x, y, z), also in arrays of Warp's quat (x, y, z, w).
+        stored = mocap_quat[world, things.block_mocap]
+        rotation = wp.quat(stored[1], stored[2], stored[3], stored[0])
+        _write_pose(mocap_pos[world, things.block_mocap], rotation, out_pose, env)
+
+
+@wp.kernel
+def find_diverged(
+    joints: Joints,
+    ignored_overflow: int,
+    group: int,
+    targets: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    overflow: wp.array[int],
+    out_overflow: wp.array[int],
+    out_diverged: wp.array[wp.uint8],
+    counts: wp.array2d[int],
+) -> None:
+    """Mark the environments of a group that diverged in a step.
+
+    Threads: (worlds,). A world diverged if a target, a position or a velocity is not finite, if a
+    velocity is beyond ``MAX_SPEED``, or if its contacts do not fit into the memory.
+
+    Args:
+        joints: Joints of the group.
+        ignored_overflow: Bits of ``overflow`` that lose no contact.
+        group: Number of the group.
+        targets: Targets of the independent joints, (n, J).
+        qpos: Positions.
+        qvel: Velocities.
+        overflow: Overflow bits of each world since its reset.
+        out_overflow: Receives the overflow bits, (n,).
+        out_diverged: Receives whether the world diverged, (n,).
+        counts: Numbers of control steps in which a world diverged, and in which contacts did not
+            fit, are added to row ``group``.
+    """
+    world = wp.tid()
+    env = joints.env[world]
+    bad = int(0)
+    for joint in range(joints.q_at.shape[0]):
+        if not wp.isfinite(targets[env, joint]):
+            bad = 1
+    for at in range(qpos.shape[1]):
+        if not wp.isfinite(qpos[world, at]):
+            bad = 1
+    for dof in range(qvel.shape[1]):
+        if not wp.abs(qvel[world, dof]) <= _MAX_SPEED:
+            bad = 1
+    bits = overflow[world] & (~ignored_overflow)
+    out_overflow[env] = bits
+    if bad != 0:
+        wp.atomic_add(counts, group, 0, 1)
+    if bits != 0:
+        wp.atomic_add(counts, group, 1, 1)
+    out_diverged[env] = wp.uint8(wp.where(bad != 0 or bits != 0, 1, 0))
+
+
+@wp.func
+def _write_pose(
+    position: wp.vec3,
+    rotation: wp.quat,
+    out_pose: wp.array2d[float],
+    env: int,
+) -> None:
+    """Write a pose as x, y, z, qw, qx, qy, qz with qw >= 0."""
+    sign = wp.where(rotation[3] < 0.0, -1.0, 1.0)
+    for axis in range(3):
+        out_pose[env, axis] = position[axis]
+        out_pose[env, 4 + axis] = sign * rotation[axis]
+    out_pose[env, 3] = sign * rotation[3]
+
+
+@wp.kernel
+def reset_worlds(
+    joints: Joints,
+    things: Things,
+    mask: wp.array[wp.uint8],
+    q: wp.array2d[float],
+    block_pose: wp.array2d[float],
+    obstacle_poses: wp.array3d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    warmstart: wp.array2d[float],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+    overflow: wp.array[int],
+) -> None:
+    """Put the worlds of masked environments at rest, and forget their past.
+
+    Threads: (worlds,). Besides state and warm start, a step of MuJoCo Warp reads only what it
+    computed itself.
+
+    Args:
+        joints: Joints of the group.
+        things: Block and obstacles.
+        mask: Whether to reset each environment, (n,).
+        q: Positions of the independent joints, (n, J).
+        block_pose: Poses of the blocks, (n, 7).
+        obstacle_poses: Poses of the obstacles, (n, O, 7); O is 0 to leave them where they are.
+        qpos: Receives positions.
+        qvel: Receives zeros.
+        warmstart: Receives zeros.
+        mocap_pos: Receives positions of obstacles and of a block that does not move.
+        mocap_quat: Receives their orientations.
+        overflow: Receives zeros.
+    """
+    world = wp.tid()
+    env = joints.env[world]
+    if mask[env] == wp.uint8(0):
+        return
+    for dof in range(qvel.shape[1]):
+        qvel[world, dof] = 0.0
+        warmstart[world, dof] = 0.0
+        leader = joints.dof_leader[dof]
+        if leader >= 0:
+            gain = joints.dof_gain[world % joints.dof_gain.shape[0], dof]
+            offset = joints.dof_offset[world % joints.dof_offset.shape[0], dof]
+            qpos[world, joints.dof_q_at[dof]] = gain * q[env, leader] + offset
+    overflow[world] = 0
+    if things.block_q_at >= 0:
+        for k in range(7):
+            qpos[world, things.block_q_at + k] = block_pose[env, k]
+    if things.block_mocap >= 0:
+        _put_mocap(block_pose[env], mocap_pos, mocap_quat, world, things.block_mocap)
+    if obstacle_poses.shape[1] > 0:
+        for k in range(things.obstacles.shape[0]):
+            _put_mocap(obstacle_poses[env, k], mocap_pos, mocap_quat, world, things.obstacles[k])
+
+
+@wp.func
+def _put_mocap(
+    pose: wp.array[float],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+    world: int,
+    at: int,
+) -> None:
+    """Write a pose x, y, z, qw, qx, qy, qz into arrays of MuJoCo Warp."""
+    mocap_pos[world, at] = wp.vec3(pose[0], pose[1], pose[2])
+    mocap_quat[world, at] = wp.quat(pose[3], pose[4], pose[5], pose[6])

@@ -1,0 +1,240 @@
+"""MuJoCo Warp on the CPU: agreement with MuJoCo, structures, resets, divergence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.joint_targets import SECOND, smooth_walk
+from helpers.scenes import ball, push_scene, robot
+from morphgen.errors import SimulationError
+from morphgen.model.geometry import Box, Pose, Shape
+from morphgen.model.robot import sorted_pair
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
+from morphgen.tasks.sim.mujoco_model import worlds
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+
+pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
+from morphgen.tasks.sim import warp_sim
+from morphgen.tasks.sim.warp_model import structures
+from morphgen.tasks.sim.warp_sim import WarpSimulation
+
+IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
+DIFFERENT = ("arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims", "chain beads=2")
+
+
+def simulation(scenes, contacts=None):
+    return WarpSimulation(scenes, contacts, device="cpu")
+
+
+def walks(scenes, joints, seed=0):
+    """Return targets of all environments, shape (steps, n, joints)."""
+    targets = np.zeros((SECOND, len(scenes), joints), np.float32)
+    for i, scene in enumerate(scenes):
+        targets[:, i, : scene.robot.dof] = smooth_walk(scene.robot, seed + i)
+    return torch.from_numpy(targets)
+
+
+def block_poses(scenes):
+    """Return the poses of the blocks of scenes, shape (n, 7)."""
+    poses = [scene.block.pose if scene.block else Pose() for scene in scenes]
+    return torch.tensor([(*pose.position, *pose.quaternion) for pose in poses])
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """Three robots of one structure with other numbers."""
+    return [
+        Scene(robot(f"arm=arm3 arm.length={length} ee=stick"), ground=None)
+        for length in (0.25, 0.3, 0.35)
+    ]
+
+
+def test_joints_are_within_a_milliradian_of_mujoco_after_a_second_without_contact():
+    scenes = [Scene(robot(words), ground=None) for words in DIFFERENT]
+    ours, mujoco = simulation(scenes, IN_FREE_SPACE), MujocoSimulation(scenes, IN_FREE_SPACE)
+    assert torch.equal(ours.q, mujoco.q)
+    home = ours.q.clone()
+    for targets in walks(scenes, ours.q.shape[1]):
+        assert not ours.step(targets).any()
+        mujoco.step(targets)
+    assert (ours.q - mujoco.q).abs().max() < 1e-3
+    assert (ours.q - home).abs().amax(dim=1).min() > 0.05
+    assert ours.counts.tolist() == [[0, 0]] * len(DIFFERENT)
+    ours.close()
+    with pytest.raises(SimulationError, match="closed"):
+        ours.step(home)
+
+
+def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(arms):
+    scenes = [arms[i % 3] for i in range(7)]
+    together = simulation(scenes)
+    compiled = worlds(scenes, Contacts())
+    (structure,) = structures(scenes, compiled)
+    assert len(structure.worlds) == 3
+    assert structure.envs.tolist() == list(range(7))
+    assert {"body_pos", "body_mass", "geom_size", "geom_pos"} <= structure.batched.keys()
+    targets = walks(scenes, together.q.shape[1])
+    targets[:, 3:] = targets[:, [0, 1, 2, 0]]
+    for row in targets:
+        together.step(row)
+    assert torch.equal(together.q[:3], together.q[3:6])
+    for i in range(3):
+        alone = simulation([arms[i]])
+        for row in targets:
+            alone.step(row[i : i + 1])
+        assert torch.allclose(together.q[i], alone.q[0], atol=1e-5)
+
+
+def test_environments_that_do_not_repeat_in_order_have_a_row_each(arms):
+    order = (0, 0, 2, 1, 2)
+    scenes = [arms[i] for i in order]
+    (structure,) = structures(scenes, worlds(scenes, Contacts()))
+    assert len(structure.worlds) == 5
+    sim, cyclic = simulation(scenes), simulation(arms)
+    targets = walks(arms, sim.q.shape[1])
+    for row in targets:
+        sim.step(row[list(order)])
+        cyclic.step(row)
+    assert torch.equal(sim.q, cyclic.q[list(order)])
+
+
+def test_structures_differ_where_the_library_has_one_value_for_all_worlds():
+    """Other joints, types of shapes and ignored pairs make another structure."""
+    base = robot("arm=arm3 ee=stick")
+    first, *_, last = (link.name for link in base.links if link.collisions)
+    other_pairs = replace(base, ignore_pairs=(*base.ignore_pairs, sorted_pair(first, last)))
+    scenes = [Scene(base), Scene(other_pairs), Scene(robot("arm=arm3 ee=plane")), Scene(base)]
+    groups = structures(scenes, worlds(scenes, Contacts()))
+    assert [each.envs.tolist() for each in groups] == [[0, 3], [1], [2]]
+
+
+def test_a_reset_changes_only_its_environments_and_forgets_their_past(arms):
+    sim = simulation(arms)
+    home = sim.q.clone()
+    targets = walks(arms, sim.q.shape[1])
+    path = []
+    for row in targets[:20]:
+        sim.step(row)
+        path.append(sim.q[1].clone())
+    before = sim.q.clone()
+    q = home.clone()
+    q[[0, 2]] = torch.nan  # rows outside the mask are ignored
+    sim.reset(torch.tensor([False, True, False]), q, torch.full((3, 7), torch.nan))
+    assert torch.equal(sim.q[1], home[1])
+    assert not sim.qd[1].any()
+    assert torch.equal(sim.q[[0, 2]], before[[0, 2]])
+    for row, q_after in zip(targets[:20], path, strict=True):
+        sim.step(row)
+        assert torch.allclose(sim.q[1], q_after, atol=1e-6)
+
+
+def test_targets_that_are_not_finite_are_reported_and_a_reset_repairs(arms):
+    sim = simulation(arms)
+    home = sim.q.clone()
+    targets = home.clone()
+    targets[1, 0] = torch.nan
+    assert sim.step(targets).tolist() == [False, True, False]
+    assert list(sim.faults()) == [1]
+    assert "diverged" in sim.faults()[1]
+    assert sim.counts.tolist() == [[1, 0]]
+    sim.reset(torch.tensor([False, True, False]), home, torch.zeros(3, 7))
+    assert torch.equal(sim.q[1], home[1])
+    for _ in range(5):
+        assert not sim.step(home).any()
+    assert torch.isfinite(sim.q).all()
+    assert (sim.q[1] - home[1]).abs().max() < 1e-3
+
+
+def test_contacts_that_do_not_fit_are_reported(monkeypatch):
+    monkeypatch.setattr(warp_sim, "CONTACT_ROWS", 0)
+    scenes = [push_scene()]
+    sim = simulation(scenes)
+    sim.reset(torch.tensor([True]), sim.q.clone(), block_poses(scenes))
+    assert sim.step(sim.q).tolist() == [True]
+    assert "do not fit" in sim.faults()[0]
+    assert sim.counts[0, 1] == 1
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.05])
+def test_blocks_are_pushed_as_in_mujoco(aside):
+    """The gantry's vertical plate pushes the block at 0.2 m/s without touching the ground."""
+    scenes = [push_scene()]
+    ends = []
+    for sim, first in (
+        (simulation(scenes), torch.tensor([True])),
+        (MujocoSimulation(scenes), torch.tensor([0])),
+    ):
+        q = torch.tensor([[aside, -0.2, 0.62, np.pi / 2, 0.0]])
+        sim.reset(first, q, block_poses(scenes))
+        target = sim.q.clone()
+        for _ in range(2 * SECOND):
+            target[0, 1] += 0.2 * CONTROL_PERIOD
+            sim.step(target)
+        ends.append(sim.block_pose[0].clone())
+    assert ends[1][1] > 0.2
+    assert (ends[0][:3] - ends[1][:3]).norm() < 0.02
+    assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
+
+
+def test_dropped_blocks_spin_and_come_to_rest_as_in_mujoco():
+    pose = Pose.from_xyz_rpy((0.3, -0.4, 0.2), (0.2, 0.1, 0.4))
+    scenes = [Scene(robot("prims"), Pose((5, 0, 0)), Block((0.15,) * 3, pose, 0.1))]
+    ours, mujoco = simulation(scenes), MujocoSimulation(scenes)
+    for _ in range(15):
+        ours.step(ours.q)
+        mujoco.step(mujoco.q)
+        assert torch.allclose(ours.block_velocity, mujoco.block_velocity, atol=0.02)
+    for _ in range(2 * SECOND):
+        ours.step(ours.q)
+        mujoco.step(mujoco.q)
+    assert torch.allclose(ours.block_pose, mujoco.block_pose, atol=2e-3)
+    assert ours.block_velocity.abs().max() < 0.01
+
+
+def table(height):
+    """A robot whose root has a table top at a height, and a ball that slides far from it."""
+    body = ball(0.3)
+    top = Shape(Box((0.6, 0.6, 0.1)), Pose((0.0, 0.0, height - 0.05)))
+    joints = (replace(body.joints[0], T_parent_joint=Pose((5.0, 0.0, 0.3))), *body.joints[1:])
+    root = replace(body.root, collisions=(top,))
+    return replace(body, links=(root, *body.links[1:]), joints=joints)
+
+
+def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
+    """Blocks come to rest on the tops of tables of different heights."""
+    heights = (0.2, 0.6, 0.4)
+    scenes = [
+        Scene(table(height), block=Block((0.1,) * 3, Pose((0.0, 0.0, height + 0.1)), 0.1))
+        for height in heights
+    ]
+    assert len(structures(scenes, worlds(scenes, Contacts()))) == 1
+    sim = simulation(scenes)
+    for _ in range(SECOND):
+        sim.step(sim.q)
+    tops = torch.tensor([height + 0.05 for height in heights])
+    assert torch.allclose(sim.block_pose[:, 2], tops, atol=1e-3)
+
+
+def test_a_reset_moves_obstacles_and_blocks_without_mass():
+    scene = push_scene()
+    fixed = replace(scene, block=replace(scene.block, mass=0.0))
+    sim = simulation([scene, fixed])
+    assert torch.allclose(sim.block_pose, block_poses([scene, fixed]))
+    poses = torch.tensor([[[-2.0, 0.0, 0.3, 1, 0, 0, 0], [2.0, 0.2, 0.1, 1, 0, 0, 0]]] * 2)
+    block = torch.tensor([[2.0, 0.2, 0.4, 1.0, 0, 0, 0], [0.1, 0.2, 0.3, 0.0, 0, 0, -1.0]])
+    sim.reset(torch.tensor([True, True]), sim.q.clone(), block, poses)
+    assert torch.allclose(sim.block_pose[1], torch.tensor([0.1, 0.2, 0.3, 0, 0, 0, -1.0]))
+    for _ in range(3 * SECOND):
+        sim.step(sim.q)
+    assert not sim.block_velocity[1].any()
+    assert sim.block_pose[0, 2] == pytest.approx(0.2 + 0.075, abs=0.002)  # on the obstacle
+
+
+def test_arguments_of_the_wrong_shape_are_refused(arms):
+    sim = simulation(arms)
+    with pytest.raises(ValueError, match="targets have shape"):
+        sim.step(torch.zeros(2, 2))
+    with pytest.raises(ValueError, match="no scenes"):
+        simulation([])
