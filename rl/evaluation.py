@@ -306,7 +306,8 @@ def _run_all(
     """Return episodes by robot, from as many batches as the simulator's limit makes necessary."""
     rounds = -(-config.episodes // MAX_ENVS_PER_ROBOT)
     envs_per_robot = -(-config.episodes // rounds)
-    batch_envs = max(SIMULATORS[config.sim].max_envs // len(specs), 1)  # per robot
+    simulator = SIMULATORS[config.sim]
+    batch_envs = max(simulator.max_envs // len(specs), 1)  # per robot
     seed = int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0])
     episodes: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
@@ -323,6 +324,7 @@ def _run_all(
             workers=config.workers,
             max_links=interface.max_links,
             layouts="eval",
+            device=simulator.devices[0],
             library=library,
         )
 

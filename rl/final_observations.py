@@ -23,13 +23,14 @@ class FinalObservations:
         """Add a step.
 
         Args:
-            observation: Observation after the action, tensors (n, ...) that nothing changes later.
+            observation: Observation after the action, tensors (n, ...), which are copied.
             truncated: Whether the episode was truncated, shape (n,), bool.
         """
-        if is_host(truncated.device):
-            observation = {name: value[truncated] for name, value in observation.items()}
-        self._observations.append(observation)
-        self._truncated.append(truncated)
+        reads = is_host(truncated.device)
+        self._observations.append(
+            {n: value[truncated] if reads else value.clone() for n, value in observation.items()}
+        )
+        self._truncated.append(truncated.clone())
 
     def gather(self) -> Observation:
         """Return the rows of the k truncated episodes, tensors (k, ...) in the order of steps."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+import torch
 from torch import nn
 
 from morphgen.errors import TaskError
@@ -25,10 +26,17 @@ def state_of(learner: Learner) -> dict[str, Any]:
     """
     states = {name: net.state_dict() for name, net in _networks(learner).items()}
     states["optimiser"] = learner.optimiser.state_dict()
+    batch: Any = in_main_memory(learner.batch.state_dict())
     return {
         **{name: in_main_memory(state) for name, state in states.items()},
-        "generators": {name: each.get_state() for name, each in learner.generators.items()},
-        "batch": learner.batch.state_dict(),
+        "generators": {
+            name: learner.processes.joined(each.get_state()[None])
+            for name, each in learner.generators.items()
+        },
+        "batch": {
+            name: learner.processes.joined(value) if isinstance(value, torch.Tensor) else value
+            for name, value in batch.items()
+        },
         "actor_lr_scale": learner.actor_lr_scale,
         "update": learner.update,
         "updates": learner.num_updates,
@@ -52,17 +60,34 @@ def resume(learner: Learner, state: Mapping[str, Any]) -> None:
         **asdict(learner.config),
         "updates": learner.num_updates,
         "device": learner.device.type,
+        "processes": learner.processes.size,
     }
     stored = asdict(PPOConfig(**state["config"]))
-    _require_same({**stored, **{k: state[k] for k in ("updates", "device")}}, ours)
-    learner.batch.load_state_dict(state["batch"])
+    processes = len(_states(state["generators"]["actions"]))
+    run = {"updates": state["updates"], "device": state["device"], "processes": processes}
+    _require_same({**stored, **run}, ours)
+    _resume_batch(learner, state["batch"])
     for name, network in _networks(learner).items():
         network.load_state_dict(state[name])
     learner.optimiser.load_state_dict(state["optimiser"])
     for name, generator in learner.generators.items():
-        generator.set_state(state["generators"][name].cpu())
+        generator.set_state(_states(state["generators"][name])[learner.processes.rank].cpu())
     learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
     learner.restart_episodes()
+
+
+def _states(generators: torch.Tensor) -> torch.Tensor:
+    """Return the state of a generator in each process, a row each; older files have one."""
+    return generators if generators.ndim > 1 else generators[None]
+
+
+def _resume_batch(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Restore the part of the state of all environments that belongs to this process."""
+    n, processes = learner.batch.num_envs, learner.processes
+    own = slice(processes.rank * n, (processes.rank + 1) * n)
+    if processes.size > 1:
+        state = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in state.items()}
+    learner.batch.load_state_dict(state)
 
 
 def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
@@ -93,10 +118,7 @@ def use_batch(learner: Learner, batch: TaskBatch) -> None:
         raise TaskError(
             f"a robot has {links} links; the learner has room for {learner.num_link_rows}"
         )
-    learner.batch = batch
-    learner.env_robot_index = batch.env_robot_index.to(learner.device)
-    learner.num_robots = int(batch.env_robot_index.max()) + 1
-    learner.restart_episodes()
+    learner.use(batch)
 
 
 def _networks(learner: Learner) -> dict[str, nn.Module]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from morphgen.rl.distributed import ALONE, ProcessGroup
 from morphgen.rl.observation_layout import Layout
 from morphgen.tasks.observation import Observation
 
@@ -46,21 +47,33 @@ class RunningNormalizer(nn.Module):
         return normalized
 
     @torch.no_grad()
-    def update(self, observation: Observation) -> None:
+    def update(self, observation: Observation, processes: ProcessGroup = ALONE) -> None:
         """Include observations, tensors (m, ...), in the statistics.
 
         Chan, Golub and LeVeque, Algorithms for computing the sample variance, 1983: means and
         variances of two sets are merged without their elements.
+
+        Args:
+            observation: Observations of this process.
+            processes: Processes whose observations are all included.
         """
         if not self.vectors:
             return
-        links = observation["links"]
-        values = torch.cat([observation[name] for name, _ in self.vectors], dim=-1)[links]
-        count = torch.tensor(float(len(values)), device=values.device)
-        mean, variance = values.mean(dim=0), values.var(dim=0, unbiased=False)
-        total, difference = self.count + count, mean - self.mean
-        between = difference.square() * self.count * count / total
-        merged = (self.variance * self.count + variance * count + between) / total
-        self.variance.copy_(merged)
-        self.mean.add_(difference * count / total)
-        self.count.copy_(total)
+        is_link = observation["links"][..., None].float()
+        own_count = is_link.sum()
+        means, variances = [], []
+        for name, _ in self.vectors:  # one by one, to need less memory
+            values, rows = observation[name], (0, 1)
+            mean = (values * is_link).sum(dim=rows) / own_count
+            means.append(mean)
+            variances.append(((values - mean).square() * is_link).sum(dim=rows) / own_count)
+        own = torch.cat([own_count[None], *means, *variances])
+        size = len(self.mean)
+        for statistics in processes.collect(own):
+            count, mean, variance = torch.split(statistics, [1, size, size])
+            total, difference = self.count + count, mean - self.mean
+            between = difference.square() * self.count * count / total
+            merged = (self.variance * self.count + variance * count + between) / total
+            self.variance.copy_(merged)
+            self.mean.add_(difference * count / total)
+            self.count.copy_(total[0])

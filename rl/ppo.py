@@ -23,6 +23,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.advantages import gae, normalized_advantages
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.distributed import ALONE, ProcessGroup, merged_metrics
 from morphgen.rl.final_observations import FinalObservations
 from morphgen.rl.heads import joint_entropy
 from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
@@ -31,6 +32,7 @@ from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.step_graph import StepGraph, can_record
 
 LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
@@ -53,6 +55,7 @@ class Learner:
         seed: int = 0,
         device: torch.device | str = "cpu",
         least_links: int = 0,
+        processes: ProcessGroup = ALONE,
     ) -> None:
         """Build networks, optimiser and buffers, and begin episodes in the batch.
 
@@ -63,6 +66,7 @@ class Learner:
             seed: Seed of weights, actions, minibatches and random weights of robots.
             device: Device of networks and rollouts; the batch may be on another.
             least_links: Links of the largest robot of later batches; see ``use_batch``.
+            processes: Processes that train together; each has its own environments.
 
         Raises:
             TaskError: If the batch takes other actions, or minibatches would differ in size.
@@ -71,18 +75,19 @@ class Learner:
             raise TaskError(
                 f"the policy's actions are {policy.kind}, the batch's {batch.action_kind}"
             )
-        self.batch, self.policy, self.config = batch, policy, config
-        self.device = torch.device(device)
-        self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
+        self.policy, self.config, self.device = policy, config, torch.device(device)
+        self.processes = processes
+        self.update, self.num_updates = 0, config.num_updates(batch.num_envs * processes.size)
         self.minibatch_size = config.minibatch_size(batch.num_envs)
-        self.env_robot_index = batch.env_robot_index.to(self.device)
-        self.num_robots = int(batch.env_robot_index.max()) + 1
-        self._observation: Observation | None = None
+        self.use(batch)
         observation = self._current_observation()
         self.layout = layout_of(observation)
         self.num_link_rows = max(rows_needed(policy, observation), least_links)
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
+        if processes.rank:  # the same networks, but other actions and minibatches
+            own = np.random.SeedSequence(seed, spawn_key=(processes.rank,))
+            streams[:2] = own.generate_state(2).tolist()
         actor, critic = make_networks(policy, self.layout, network_seed)
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
@@ -142,7 +147,7 @@ class Learner:
         if lost:
             raise TaskError(f"update {self.update}: {', '.join(lost)} is not finite any more")
         ended = time.perf_counter()
-        timesteps = self.config.num_steps * self.batch.num_envs
+        timesteps = self.config.num_steps * self.batch.num_envs * self.processes.size
         return UpdateMetrics(
             update=self.update,
             transitions=self.update * timesteps,
@@ -153,9 +158,17 @@ class Learner:
             **learn_metrics,
         )
 
+    def use(self, batch: TaskBatch) -> None:
+        """Continue in the environments of a batch, where all begin new episodes."""
+        self.batch = batch
+        self.env_robot_index = batch.env_robot_index.to(self.device)
+        self.num_robots = int(batch.env_robot_index.max()) + 1
+        self._step = StepGraph(batch) if can_record(batch) else batch.step
+        self.restart_episodes()
+
     def restart_episodes(self) -> None:
         """Begin new episodes in all environments at the next ``iterate``."""
-        self._observation = None
+        self._observation: Observation | None = None
 
     def _current_observation(self) -> Observation:
         """Advance the curriculum, begin episodes if none are under way; return the observation."""
@@ -188,23 +201,24 @@ class Learner:
             self.actions[step] = action
             self.log_probs[step] = head.log_prob(action)
 
-            result = self.batch.step(pad_links(action, self.layout.links).to(self.batch.device))
+            result = self._step(pad_links(action, self.layout.links).to(self.batch.device))
             self.rewards[step], self.scores[step] = result.reward, result.score
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated
             reward_terms.append({name: term.mean() for name, term in result.terms.items()})
-            final_observations.add(result.final_observation, result.truncated)
+            final = self._network_input(result.final_observation)
+            final_observations.add(final, result.truncated.to(self.device))
             self._observation = result.observation
             obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
         self.next_observation = {name: value.clone() for name, value in obs.items()}
-        self.final_observations = self._network_input(final_observations.gather())
+        self.final_observations = final_observations.gather()
         metrics = self._rollout_metrics()
         metrics["terms"] = {
             name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
             for name in reward_terms[0]
         }
-        return metrics
+        return merged_metrics(self.processes.gather(metrics))
 
     def _rollout_metrics(self) -> Metrics:
         """Return rewards and scores of the rollout, and counts of the episodes that ended in it."""
@@ -282,6 +296,9 @@ class Learner:
                 self.optimiser.zero_grad(set_to_none=True)
                 loss, loss_metrics = self._run_loss(obs, minibatch, self._robot_weights())
                 loss.backward()  # type: ignore[no-untyped-call]
+                self.processes.average_gradients(
+                    [*self.actor.parameters(), *self.critic.parameters()]
+                )
                 # Apart: a large gradient of the critic shall not shrink the actor's.
                 norms = [
                     nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
@@ -292,13 +309,14 @@ class Learner:
                 metrics.append(torch.stack([*loss_metrics, *norms]))
 
         if self.actor.normalizer is not None:
-            self.actor.normalizer.update(observations)
+            self.actor.normalizer.update(observations, self.processes)
             for network in (self.critic, self.target_critic):
                 assert network.normalizer is not None
                 network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
-        means = dict(zip(LEARN_METRICS, torch.stack(metrics).mean(dim=0).tolist(), strict=True))
+        mean_metrics = self.processes.mean(torch.stack(metrics).mean(dim=0))
+        means = dict(zip(LEARN_METRICS, mean_metrics.tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
-        explained = float(explained_variance(values, returns))
+        explained = float(self.processes.mean(explained_variance(values, returns)))
         return {**means, "explained_variance": explained, "learning_rate": actor_group["lr"]}
 
     def _loss(

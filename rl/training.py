@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +13,13 @@ from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
 from morphgen.processes import Progress, no_progress
 from morphgen.rl.agents import AGENTS
+from morphgen.rl.distributed import ProcessGroup, process_group
 from morphgen.rl.drawn_robots import num_drawn, write_drawn
 from morphgen.rl.learner_state import load_networks, state_of, use_batch
 from morphgen.rl.learner_state import resume as resume_learner
 from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.ppo import Learner
-from morphgen.rl.recorders import recording, require_wandb
+from morphgen.rl.recorders import Recorder, recording, require_wandb
 from morphgen.rl.robot_source import members, require_links, single_members
 from morphgen.rl.runs import (
     CHECKPOINT,
@@ -126,7 +127,8 @@ def train(
         hold: Context manager that locks the folder against other runs.
 
     Returns:
-        The trained parts.
+        The trained parts; none in processes of ``torchrun`` other than the first, which alone
+        writes files.
 
     Raises:
         TaskError: If the folder has another run, or a metric is not finite.
@@ -139,14 +141,25 @@ def train(
     require_device(config.device)
     require_open(folder, config, resume=resume)
     with ExitStack() as held:
+        processes, device = held.enter_context(process_group(config.device))
         holds = False
         for part in parts:
             if is_done(part):
                 continue
             if not holds:
                 require_links(config.source, config.max_links)
-            batches = TrainingBatches(part.config, workers=execution.workers, progress=prepare)
-            with _learner(part, batches) as learner:
+            envs = processes.share(part.config.num_envs, "--envs")
+            batches = TrainingBatches(
+                part.config,
+                envs=envs,
+                device=device,
+                workers=execution.workers,
+                progress=prepare if processes.is_first else no_progress,
+            )
+            with _learner(part, batches, processes, device) as learner:
+                if not processes.is_first:
+                    _learn(learner, batches, part, None, None)
+                    continue
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)
                     held.enter_context(hold(folder))
@@ -156,7 +169,7 @@ def train(
                 if batches.drawn is not None:
                     write_drawn(part.folder, part.config.source, batches.drawn)
                 _learn(learner, batches, part, execution, show(part) if show else None)
-    return parts
+    return parts if processes.is_first else []
 
 
 def require_runnable(config: RunConfig) -> None:
@@ -237,7 +250,9 @@ def updates_between(config: RunConfig) -> int:
 
 
 @contextmanager
-def _learner(part: Subrun, batches: TrainingBatches) -> Iterator[Learner]:
+def _learner(
+    part: Subrun, batches: TrainingBatches, processes: ProcessGroup, device: str
+) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
     config, state = part.config, None
     if (part.folder / CHECKPOINT).is_file():
@@ -248,8 +263,9 @@ def _learner(part: Subrun, batches: TrainingBatches) -> Iterator[Learner]:
             config.policy,
             config.ppo,
             seed=config.seed,
-            device=config.device,
+            device=device,
             least_links=batches.most_links,
+            processes=processes,
         )
         if state:
             resume_learner(learner, state)
@@ -262,18 +278,31 @@ def _learn(
     learner: Learner,
     batches: TrainingBatches,
     part: Subrun,
-    execution: ExecutionConfig,
+    execution: ExecutionConfig | None,
     show: ShowMetrics | None,
 ) -> None:
-    """Make the remaining updates of a part; record their metrics and write its checkpoints."""
+    """Make the remaining updates of a part; record their metrics and write its checkpoints.
+
+    Args:
+        learner: The learner.
+        batches: Its batches.
+        part: The part.
+        execution: How the run is executed; None in a process that writes no files.
+        show: Called after every update.
+    """
     interval = updates_between(part.config)
-    with recording(
-        part.folder,
-        part.config,
-        learner.update,
-        tensorboard=execution.tensorboard,
-        wandb=execution.wandb,
-    ) as recorders:
+    with ExitStack() as stack:
+        recorders: Sequence[Recorder] = ()
+        if execution is not None:
+            recorders = stack.enter_context(
+                recording(
+                    part.folder,
+                    part.config,
+                    learner.update,
+                    tensorboard=execution.tensorboard,
+                    wandb=execution.wandb,
+                )
+            )
         while not learner.done:
             metrics = learner.iterate()
             scores = batches.recorded_scores(metrics.scores, learner.update)
@@ -285,7 +314,9 @@ def _learn(
             # A checkpoint has the state of the batch that the run continues with.
             left = learner.num_updates - learner.update
             if not left or (learner.update % interval == 0 and left >= interval):
-                write_checkpoint(part.folder, part.config, state_of(learner))
+                state = state_of(learner)  # of all processes
+                if execution is not None:
+                    write_checkpoint(part.folder, part.config, state)
                 # A resumed run begins new episodes here, and must end with the same weights.
                 learner.restart_episodes()
             if show:

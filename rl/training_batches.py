@@ -82,12 +82,20 @@ class TrainingBatches:
     """
 
     def __init__(
-        self, config: RunConfig, *, workers: int = 1, progress: Progress = no_progress
+        self,
+        config: RunConfig,
+        *,
+        envs: range | None = None,
+        device: str | None = None,
+        workers: int = 1,
+        progress: Progress = no_progress,
     ) -> None:
         """Build the robots and their goal sets.
 
         Args:
             config: Config of the run.
+            envs: Numbers of the environments of this process; by default all.
+            device: Device of this process; by default that of the config.
             workers: Number of processes of PyBullet, or of threads of MuJoCo.
             progress: Called with the number of robots whose goal set is ready, and their total.
 
@@ -96,6 +104,8 @@ class TrainingBatches:
             MorphgenError: If a robot cannot be built or cannot do its task.
         """
         self._config, self._workers = config, workers
+        self._envs = range(config.num_envs) if envs is None else envs
+        self._device = batch_device(config.sim, device or config.device)
         goals = GoalConfig(tasks=config.tasks)
         self._batch: TaskBatch | None = None
         self.drawn: DrawnRobots | None = None
@@ -128,14 +138,15 @@ class TrainingBatches:
             seed = int(seeds.generate_state(1)[0])
         self._batch = batch_from_specs(
             [self._specs[i] for i in robots],
-            config.num_envs,
+            len(self._envs),
+            first=self._envs.start,
             sim=config.sim,
             seed=seed,
             kind=interface.kind,
             observe=self._channels,
             workers=self._workers,
             max_links=config.max_links,
-            device=batch_device(config.sim, config.device),
+            device=self._device,
             library=map(Path, config.source.library),
         )
         return self._batch

@@ -62,6 +62,18 @@ class Step:
     no orientation, None if no task wants one."""
 
 
+@dataclass(frozen=True, eq=False)
+class BeforePhysics:
+    """Targets of a control step, and the state of the robots and blocks before it."""
+
+    targets: torch.Tensor
+    """Targets of the joints of the simulation, shape (n, J) [rad or m]."""
+    q: torch.Tensor
+    """Positions of the independent joints, shape (n, J) [rad or m]."""
+    block_pose: torch.Tensor
+    """Poses of the blocks, shape (n, 7)."""
+
+
 class TaskBatch:
     """Environments; each has a robot at a task, and its own random numbers.
 
@@ -160,6 +172,11 @@ class TaskBatch:
         return len(self.env_robot_index)
 
     @property
+    def seed(self) -> int:
+        """Seed of the episodes."""
+        return self._episodes.seed
+
+    @property
     def q(self) -> torch.Tensor:
         """Positions of the independent joints, shape (n, J) [rad or m]; a copy."""
         return self._padded(self.simulation.q).clone()
@@ -185,8 +202,7 @@ class TaskBatch:
             TaskError: If the seed is out of range.
         """
         if seed is not None:
-            env_number = self._episodes.env_number
-            self._episodes = EpisodeSequence(seed, env_number, torch.zeros_like(env_number))
+            self._episodes.restart(seed, torch.zeros_like(self._episodes.next_episode))
         random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool))
         if spread:
             self.episode_step.copy_(random.integers(Stream.SPREAD, self.max_episode_steps))
@@ -202,8 +218,34 @@ class TaskBatch:
             TaskError: If the actions are invalid.
             SimulationError: If the simulator failed.
         """
-        self._act(actions)
-        state, diverged = self._simulate()
+        before = self.act(actions)
+        diverged = self.simulation.step(before.targets)
+        return self.finish(before, diverged)
+
+    def act(self, actions: torch.Tensor) -> BeforePhysics:
+        """Advance the joint targets by the actions: the part of ``step`` before the physics.
+
+        Args:
+            actions: As of ``step``.
+
+        Raises:
+            TaskError: If the actions are invalid.
+        """
+        shape = (self.num_envs, self.robot_tables.max_links)
+        normalized = decode_actions(actions, self.action_kind, shape, self.device)
+        self.previous_action.copy_(torch.where(self.action_mask, normalized, 0.0))
+        self.targets.copy_(self._joint_targets(self.targets, self.previous_action))
+        targets = self.targets[:, : self._num_sim_joints].contiguous()
+        return BeforePhysics(targets, self.q, self.simulation.block_pose.clone())
+
+    def finish(self, before: BeforePhysics, diverged: torch.Tensor) -> Step:
+        """Evaluate a step and begin new episodes: the part of ``step`` after the physics.
+
+        Args:
+            before: Result of ``act``.
+            diverged: Where the simulation diverged, shape (n,), bool.
+        """
+        state = self._undone(before, diverged)
         self.episode_step += 1
         result = self._evaluate(state, diverged)
         timed_out = self.episode_step >= self.max_episode_steps
@@ -221,7 +263,7 @@ class TaskBatch:
             reward=result.reward,
             terminated=result.terminated,
             truncated=truncated,
-            diverged=diverged,
+            diverged=diverged.clone(),
             final_observation=final_observation,
             success=result.success,
             distance=result.distance,
@@ -232,29 +274,18 @@ class TaskBatch:
             angle=result.angle,
         )
 
-    def _simulate(self) -> tuple[PhysicsState, torch.Tensor]:
-        """Step the simulation towards the targets.
-
-        Returns:
-            The state after the step, which is undone where the simulation diverged; and where it
-            did, shape (n,), bool.
-
-        Raises:
-            SimulationError: If the simulator failed.
-        """
-        q, block_pose = self.q, self.simulation.block_pose.clone()
-        diverged = self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
+    def _undone(self, before: BeforePhysics, diverged: torch.Tensor) -> PhysicsState:
+        """Return the state after the physics, or before it where the simulation diverged."""
         state = self._state
         if is_host(self.device) and not diverged.any():
-            return state, diverged.clone()
+            return state
         rows = diverged[:, None]
         self.previous_qd.masked_fill_(rows, 0)
-        undone = PhysicsState(
-            q=torch.where(rows, q, state.q),
+        return PhysicsState(
+            q=torch.where(rows, before.q, state.q),
             qd=state.qd.masked_fill(rows, 0),
-            block_pose=torch.where(rows, block_pose, state.block_pose),
+            block_pose=torch.where(rows, before.block_pose, state.block_pose),
         )
-        return undone, diverged.clone()
 
     def observe(self) -> Observation:
         """Return the current observation, in tensors that the caller owns."""
@@ -278,8 +309,8 @@ class TaskBatch:
 
         It is the seed, the number of each environment's next episode, and the tasks' states.
         """
-        episodes = {"seed": self._episodes.seed, "next_episode": self._episodes.next_episode}
-        return {**episodes, **self.groups.state_dict()}
+        next_episode = self._episodes.next_episode.clone()
+        return {"seed": self.seed, "next_episode": next_episode, **self.groups.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what ``state_dict`` returned; ``reset`` must follow.
@@ -297,20 +328,12 @@ class TaskBatch:
             raise TaskError(
                 f"the state is of {len(next_episode)} environments; expected {self.num_envs}"
             )
-        env_number = self._episodes.env_number
-        self._episodes = EpisodeSequence(state["seed"], env_number, next_episode.to(self.device))
+        self._episodes.restart(state["seed"], next_episode)
         self.groups.load_state_dict(state)
 
     def close(self) -> None:
         """Free the simulation."""
         self.simulation.close()
-
-    def _act(self, actions: torch.Tensor) -> None:
-        """Advance the joint targets by the decoded actions."""
-        shape = (self.num_envs, self.robot_tables.max_links)
-        normalized = decode_actions(actions, self.action_kind, shape, self.device)
-        self.previous_action.copy_(torch.where(self.action_mask, normalized, 0.0))
-        self.targets.copy_(self._joint_targets(self.targets, self.previous_action))
 
     def _evaluate(self, state: PhysicsState, diverged: torch.Tensor) -> BatchResult:
         """Let the tasks evaluate the step that was simulated."""

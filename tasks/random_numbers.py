@@ -14,6 +14,7 @@ from enum import IntEnum
 import torch
 
 from morphgen.errors import TaskError
+from morphgen.tasks.host import is_host
 
 MAX_SEED = 2**64 - 1
 """Largest seed."""
@@ -126,11 +127,20 @@ class EpisodeSequence:
         Raises:
             TaskError: If the seed is out of range.
         """
-        require_seed(seed)
-        self.seed, self.env_number, self.next_episode = seed, env_number, next_episode
-        self._uses_left = 0
+        self.env_number, self.next_episode = env_number, next_episode.clone()
+        self.restart(seed, next_episode)
         # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
         self._first_row = AHEAD * torch.arange(len(env_number), device=env_number.device)
+
+    def restart(self, seed: int, next_episode: torch.Tensor) -> None:
+        """Go on with another seed and other episodes; see the attributes.
+
+        Raises:
+            TaskError: If the seed is out of range.
+        """
+        require_seed(seed)
+        self.seed, self._uses_left = seed, 0
+        self.next_episode.copy_(next_episode)
 
     def begin(self, mask: torch.Tensor) -> EpisodeRandom:
         """Begin episodes in some environments.
@@ -142,6 +152,10 @@ class EpisodeSequence:
             Random numbers of the next episode of every environment, of those outside of the mask,
             too.
         """
+        if not is_host(mask.device):  # in place and without counting, as a CUDA graph has to
+            random = EpisodeRandom(self.seed, self.env_number, self.next_episode.clone())
+            self.next_episode += mask
+            return random
         if not self._uses_left:
             self._look_ahead()
         self._uses_left -= 1

@@ -190,7 +190,8 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
         )
     for subrun in subruns:
         print(subrun.folder / CHECKPOINT)
-    print(_next_command(folder, config), file=sys.stderr)
+    if subruns:  # of the processes of torchrun, the first one says it
+        print(_next_command(folder, config), file=sys.stderr)
 
 
 def _next_command(folder: Path, config: RunConfig) -> str:

@@ -16,7 +16,7 @@ from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
-from morphgen.tasks.sim import warp_sim
+from morphgen.tasks.sim import warp_group
 from morphgen.tasks.sim.warp_model import structures
 from morphgen.tasks.sim.warp_sim import WarpSimulation
 
@@ -148,7 +148,7 @@ def test_targets_that_are_not_finite_are_reported_and_a_reset_repairs(arms):
 
 
 def test_contacts_that_do_not_fit_are_reported(monkeypatch):
-    monkeypatch.setattr(warp_sim, "CONTACT_ROWS", 0)
+    monkeypatch.setattr(warp_group, "CONTACT_ROWS", 0)
     scenes = [push_scene()]
     sim = simulation(scenes)
     sim.reset(torch.tensor([True]), sim.q.clone(), block_poses(scenes))
@@ -162,12 +162,9 @@ def test_blocks_are_pushed_as_in_mujoco(aside):
     """The gantry's vertical plate pushes the block at 0.2 m/s without touching the ground."""
     scenes = [push_scene()]
     ends = []
-    for sim, first in (
-        (simulation(scenes), torch.tensor([True])),
-        (MujocoSimulation(scenes), torch.tensor([0])),
-    ):
+    for sim in (simulation(scenes), MujocoSimulation(scenes)):
         q = torch.tensor([[aside, -0.2, 0.62, np.pi / 2, 0.0]])
-        sim.reset(first, q, block_poses(scenes))
+        sim.reset(torch.tensor([True]), q, block_poses(scenes))
         target = sim.q.clone()
         for _ in range(2 * SECOND):
             target[0, 1] += 0.2 * CONTROL_PERIOD

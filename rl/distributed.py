@@ -1,0 +1,167 @@
+"""Training by several processes of one machine, each with a GPU and its share of environments.
+
+``torchrun`` starts the processes. Each collects rollouts in its own environments. Gradients are
+averaged before every step of the optimiser, so that all processes keep the same weights; process 0
+alone writes files.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torch import distributed
+
+from morphgen.errors import TaskError
+from morphgen.rl.metrics import Metrics
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """The processes of a training run; one process alone is a group, too."""
+
+    rank: int = 0
+    """Number of this process."""
+    size: int = 1
+    """Number of processes."""
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process writes the files."""
+        return self.rank == 0
+
+    def share(self, count: int, what: str) -> range:
+        """Return the part of ``count`` things that belongs to this process.
+
+        Args:
+            count: Number of things of all processes.
+            what: Their name in the message.
+
+        Raises:
+            TaskError: If they cannot be divided equally.
+        """
+        if count % self.size:
+            raise TaskError(f"{what} {count}: expected a multiple of the {self.size} processes")
+        part = count // self.size
+        return range(self.rank * part, (self.rank + 1) * part)
+
+    def mean(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the mean over the processes of a tensor that has one shape in all of them."""
+        if self.size == 1:
+            return values
+        values = values.clone()
+        distributed.all_reduce(values)
+        return values / self.size
+
+    def average_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
+        """Set gradients to their means over the processes."""
+        if self.size == 1:
+            return
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        flat = torch.cat([gradient.flatten() for gradient in gradients])
+        distributed.all_reduce(flat)
+        flat /= self.size
+        sizes = [gradient.numel() for gradient in gradients]
+        for gradient, part in zip(gradients, torch.split(flat, sizes), strict=True):
+            gradient.copy_(part.view_as(gradient))
+
+    def collect(self, values: torch.Tensor) -> list[torch.Tensor]:
+        """Return the tensors of all processes, which have one shape, in the processes' order."""
+        if self.size == 1:
+            return [values]
+        collected = [torch.empty_like(values) for _ in range(self.size)]
+        distributed.all_gather(collected, values)
+        return collected
+
+    def joined(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the tensors of all processes, in main memory, joined along their first axis."""
+        return values if self.size == 1 else torch.cat(self.gather(values.cpu()))
+
+    def gather(self, value: T) -> list[T]:
+        """Return the values of all processes, in their order.
+
+        The values are pickled between the processes of this run.
+        """
+        if self.size == 1:
+            return [value]
+        values: list[T | None] = [None] * self.size
+        distributed.all_gather_object(values, value)
+        return values  # type: ignore[return-value]  # every process has put its value
+
+    def wait(self) -> None:
+        """Wait until all processes are here."""
+        if self.size > 1:
+            distributed.barrier()
+
+
+ALONE = ProcessGroup()
+
+
+@contextmanager
+def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
+    """Join the processes that ``torchrun`` started, and leave them at the end.
+
+    Args:
+        device: Device of the run, such as ``cuda``.
+
+    Yields:
+        The group, and the device of this process: ``cuda:1`` for the second one on a machine.
+
+    Raises:
+        TaskError: If there are more processes than GPUs, or a device has a number.
+    """
+    size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
+    if size == 1:
+        yield ALONE, device
+        return
+    kind, _, number = device.partition(":")
+    if number:
+        raise TaskError(f"--device {device} with {size} processes: expected --device {kind}")
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    if kind == "cuda":
+        if local >= torch.cuda.device_count():
+            raise TaskError(
+                f"process {local} of this machine, which has {torch.cuda.device_count()} CUDA "
+                "devices; start at most one process for each"
+            )
+        device = f"cuda:{local}"
+        torch.cuda.set_device(local)
+    distributed.init_process_group("nccl" if kind == "cuda" else "gloo")
+    try:
+        yield ProcessGroup(rank, size), device
+    finally:
+        distributed.destroy_process_group()
+
+
+def merged_metrics(metrics: Sequence[Metrics]) -> Metrics:
+    """Return the metrics of a rollout from those of the processes, which have equal sizes."""
+    if len(metrics) == 1:
+        return metrics[0]
+    episodes = [each["episodes"] for each in metrics]
+    successes = sum(e["success"] * n for e, n in zip(metrics, episodes, strict=True) if n)
+
+    def mean(name: str) -> float:
+        return float(sum(each[name] for each in metrics)) / len(metrics)
+
+    return {
+        "reward": mean("reward"),
+        "score": mean("score"),
+        "scores": tuple(
+            sum(scores) / len(metrics)
+            for scores in zip(*(each["scores"] for each in metrics), strict=True)
+        ),
+        "success": successes / sum(episodes) if sum(episodes) else math.nan,
+        "episodes": sum(episodes),
+        "unstable": sum(each["unstable"] for each in metrics),
+        "terms": {
+            name: sum(each["terms"][name] for each in metrics) / len(metrics)
+            for name in metrics[0]["terms"]
+        },
+    }
