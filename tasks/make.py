@@ -168,8 +168,8 @@ def batch_from_specs(
     Args:
         specs: Specifications; environment i has specification i modulo their number.
         num_envs: Number of environments, n.
-        sim: Name of a simulator: ``pybullet``, ``mujoco``, ``kinematic`` (which has no contacts)
-            or another of ``SIMULATORS``; by default ``default_simulator()``.
+        sim: Name of a simulator: ``pybullet``, ``mujoco``, ``warp`` (on a GPU), ``kinematic``
+            (no contacts) or another of ``SIMULATORS``; by default ``default_simulator()``.
         seed: Seed of the episodes.
         kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
         workers: Number of processes of PyBullet, or of threads of MuJoCo.

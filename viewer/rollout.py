@@ -161,7 +161,8 @@ class Rollout:
 
 def simulators() -> list[str]:
     """Return the names of the installed simulators, MuJoCo first."""
-    return sorted(installed_simulators(), key=lambda name: name != "mujoco")
+    usable = installed_simulators(lambda simulator: "cpu" in simulator.devices)
+    return sorted(usable, key=lambda name: name != "mujoco")
 
 
 def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpec:

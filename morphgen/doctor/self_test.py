@@ -129,7 +129,10 @@ def _simulator(name: str, simulator: str, robot: Robot) -> Entry:
 
     from morphgen.tasks.sim.base import Scene
 
-    simulation = SIMULATORS[simulator].load([Scene(robot)], None, 1, torch.device("cpu"))
+    device = SIMULATORS[simulator].devices[0]
+    if device == "cuda" and not torch.cuda.is_available():
+        return Entry(name, "absent", "it needs a CUDA device, and this machine has none")
+    simulation = SIMULATORS[simulator].load([Scene(robot)], None, 1, torch.device(device))
     try:
         home = simulation.q.clone()
         simulation.step(home + STEP)

@@ -222,7 +222,9 @@ def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
         simulation.step = lambda targets: None
         return simulation
 
-    monkeypatch.setitem(SIMULATORS._loaded, "kinematic", SimpleNamespace(load=load))
+    monkeypatch.setitem(
+        SIMULATORS._loaded, "kinematic", SimpleNamespace(load=load, devices=("cpu",))
+    )
     entry = self_test._simulator("it", "kinematic", ur5_plane)
     assert (entry.status, entry.data) == ("error", {"moved": 0.0})
 

@@ -122,7 +122,9 @@ def test_devices_of_batches(specs, monkeypatch):
             make_kinematic(specs, 3, device="cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(TaskError, match="device 'cuda'; expected device cpu, or simulator kinem"):
+    with pytest.raises(
+        TaskError, match="device 'cuda'; expected device cpu, or simulator warp or k"
+    ):
         batch_from_specs(specs, 3, sim="mujoco", device="cuda")
 
 

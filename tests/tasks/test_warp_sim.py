@@ -8,9 +8,12 @@ import torch
 
 from helpers.joint_targets import SECOND, smooth_walk
 from helpers.scenes import ball, push_scene, robot
-from morphgen.errors import SimulationError
+from morphgen.errors import SimulationError, TaskError
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import sorted_pair
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.registry import evaluation_simulator
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
@@ -19,6 +22,7 @@ pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphge
 from morphgen.tasks.sim import warp_group
 from morphgen.tasks.sim.warp_model import structures
 from morphgen.tasks.sim.warp_sim import WarpSimulation
+from morphgen.tasks.step_graph import StepGraph
 
 IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
 DIFFERENT = ("arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims", "chain beads=2")
@@ -235,3 +239,71 @@ def test_arguments_of_the_wrong_shape_are_refused(arms):
         sim.step(torch.zeros(2, 2))
     with pytest.raises(ValueError, match="no scenes"):
         simulation([])
+
+
+def test_without_a_gpu_the_simulator_is_refused_by_name():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(TaskError, match=r"simulator 'warp' on device 'cpu'; expected device cuda"):
+        make_batch("reach", ["arm3"], 1, sim="warp")
+    with pytest.raises(TaskError, match="device 'cuda': this machine has no CUDA device"):
+        make_batch("reach", ["arm3"], 1, sim="warp", device="cuda")
+
+
+def test_policies_of_the_simulator_are_judged_in_mujoco():
+    assert evaluation_simulator("warp") == "mujoco"
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_a_batch_has_the_episodes_and_nearly_the_steps_of_mujoco(task):
+    """The same seed gives the same starts and goals, and the same actions the same rewards."""
+    robots = ["arm=ur5 ee=stick", "arm=xarm7 ee=stick"]
+    mujoco = make_batch(task, robots, 4, sim="mujoco", seed=3)
+    scenes = [mujoco.specs[i].scene for i in mujoco.env_robot_index.tolist()]
+    ours = TaskBatch(
+        mujoco.robot_tables,
+        mujoco.specs,
+        mujoco.env_robot_index.tolist(),
+        simulation(scenes),
+        seed=3,
+    )
+    first, other = ours.reset(), mujoco.reset()
+    assert all(torch.equal(first[name], other[name]) for name in first)
+    actions = torch.zeros(4, mujoco.robot_tables.max_links)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(SECOND):
+        if step % 10 == 0:
+            actions = 0.3 * torch.randn(actions.shape, generator=generator)
+        one, two = ours.step(actions), mujoco.step(actions)
+        assert torch.allclose(one.reward, two.reward, atol=0.02)
+        assert torch.equal(one.terminated, two.terminated)
+    assert (one.q - two.q).abs().max() < 5e-3
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_recorded_steps_on_a_gpu_are_those_of_the_batch():
+    """Graphs of a step give what the same calls give without them, also where episodes end."""
+    batches = [
+        make_batch("reach", ["arm3", "chain beads=2"], 64, sim="warp", device="cuda", seed=1)
+        for _ in range(2)
+    ]
+    recorded = StepGraph(batches[0])
+    first, other = (batch.reset(spread=True) for batch in batches)
+    assert all(torch.equal(first[name], other[name]) for name in first)
+    actions = torch.zeros(64, batches[0].robot_tables.max_links, device="cuda")
+    for _ in range(120):
+        one, two = recorded(actions), batches[1].step(actions)
+        assert torch.equal(one.truncated, two.truncated)
+        assert torch.allclose(one.observation["tokens"], two.observation["tokens"], atol=1e-3)
+        assert torch.equal(one.observation["goal"], two.observation["goal"])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_moves_joints_as_the_cpu_does():
+    scenes = [Scene(robot(words), ground=None) for words in DIFFERENT]
+    on_gpu = WarpSimulation(scenes, IN_FREE_SPACE, device="cuda")
+    on_cpu = simulation(scenes, IN_FREE_SPACE)
+    for targets in walks(scenes, on_cpu.q.shape[1]):
+        on_gpu.step(targets.cuda())
+        on_cpu.step(targets)
+    assert (on_gpu.q.cpu() - on_cpu.q).abs().max() < 1e-3
