@@ -21,6 +21,15 @@ DOCS = [
     re.split(r"\s*\|\s*", line) for line in (ROOT / "docs/training.md").read_text().splitlines()
 ]
 
+RUNS = (
+    ("`me-graph` with MuJoCo", r"me-graph|graph-", "mujoco"),
+    ("`me-graph` without contacts", r"me-graph|graph-", "kinematic"),
+    ("`me-mlp` and `me-tf`", r"me-mlp|me-tf", "kinematic"),
+)
+"""Runs that the docs name, a pattern of their agents, and their simulator."""
+CONSTANTS = ("gamma", "num_steps", "learning_rate", "num_envs")
+"""Constants of a run, in the order of the docs."""
+
 
 def run_here(command, monkeypatch):
     program, *arguments = shlex.split(command)
@@ -57,3 +66,28 @@ def test_the_docs_have_the_table_of_the_number_of_robots():
     rows = [re.split(r"\s*\|\s*", line) for line in printed.splitlines()[2:]]
     assert len(rows) == 5
     assert all(row in DOCS for row in rows)
+
+
+@pytest.mark.parametrize("page", ["differences.md", "training.md"])
+def test_the_docs_have_the_constants_of_the_stored_runs(page):
+    stored = {}
+    for path in (ROOT / "results").rglob("config.json"):
+        config = json.loads(path.read_text("utf-8"))
+        agent, constants = config["policy"]["agent"], config | config["ppo"]
+        (name,) = [
+            name for name, agents, sim in RUNS if re.match(agents, agent) and sim == config["sim"]
+        ]
+        values = tuple(float(constants[key]) for key in CONSTANTS)
+        stored.setdefault(name, set()).add(values)
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    number = r"([\d.,e-]*\d)"
+    documented = {
+        name: {
+            tuple(float(each.replace(",", "")) for each in values)
+            for values in re.findall(
+                rf"{name}(?:: | \| ){'(?:, | [|] )'.join([number] * len(CONSTANTS))}", text
+            )
+        }
+        for name, _, _ in RUNS
+    }
+    assert documented == stored
