@@ -8,23 +8,30 @@ from contextlib import contextmanager
 from morphgen.errors import MissingDependencyError
 
 EXTRAS = {
-    "embreex": "fit",
-    "fast_simplification": "fit",
-    "gymnasium": "tasks",
-    "imageio": "tasks",
-    "tensorboard": "rl",
-    "torch": "rl",
-    "viser": "viewer",
-    "websockets": "viewer",
+    "embreex": ("fit",),
+    "fast_simplification": ("fit",),
+    "gymnasium": ("tasks", "rl"),
+    "imageio": ("tasks", "rl"),
+    "tensorboard": ("rl",),
+    "torch": ("tasks", "rl", "fit"),
+    "viser": ("viewer",),
+    "websockets": ("viewer",),
 }
-"""Optional packages by import name, and the extra of morphgen that installs each."""
+"""Optional packages by import name, and the extras of morphgen that install each, the smallest
+first."""
 
 
-def missing_extra(error: Exception) -> str | None:
-    """Return how to install the optional package that an import lacks; None for other errors."""
+def missing_extra(error: Exception, wanted: str = "") -> str | None:
+    """Return how to install the optional package that an import lacks; None for other errors.
+
+    Args:
+        error: The error of the import.
+        wanted: The extra to name if it installs the package; else the smallest that does is named.
+    """
     if not (isinstance(error, ModuleNotFoundError) and error.name in EXTRAS):
         return None
-    hint = f"pip install 'morphgen[{EXTRAS[error.name]}]'"
+    extras = EXTRAS[error.name]
+    hint = f"pip install 'morphgen[{wanted if wanted in extras else extras[0]}]'"
     if error.name == "torch":
         hint += "; a small build without CUDA: https://pytorch.org/get-started/locally"
     return f"the package {error.name} is not installed: {hint}"

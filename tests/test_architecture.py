@@ -234,7 +234,9 @@ def test_core_works_without_optional_extras(words, tmp_path):
     [
         (("fit", "ur5"), "fit"),
         (("train", "interpolation/arm3/reach"), "rl"),
-        (("play", "reach", "prims"), "rl"),
+        (("finetune", "zero-shot"), "rl"),
+        (("play", "reach", "prims"), "tasks"),
+        (("speed", "reach", "prims"), "tasks"),
         (("view",), "viewer"),
     ],
 )

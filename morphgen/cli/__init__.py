@@ -82,7 +82,7 @@ def _run(argv: Sequence[str] | None) -> int:
                 raise KeyboardInterrupt from error
             if isinstance(error, MorphgenError):
                 return _refuse(error, str(error), args)
-            if (text := missing_extra(error)) is not None:
+            if (text := missing_extra(error, args.extra)) is not None:
                 return _refuse(error, text, args)
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise

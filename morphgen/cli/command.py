@@ -118,6 +118,8 @@ class Command:
     """Command lines that the help shows."""
     commands: Sequence[Command] = ()
     """Commands of the group."""
+    extra: str = ""
+    """Extra of morphgen that the command needs, which errors name if a package is missing."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
     """Further attributes of the parsed arguments."""
 
@@ -136,7 +138,7 @@ class Command:
             group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
             for argument in alternatives:
                 group.add_argument(*argument.names, **argument.settings)
-        parser.set_defaults(run=self.run, parser=parser, **self.defaults)
+        parser.set_defaults(run=self.run, parser=parser, extra=self.extra, **self.defaults)
 
     def _texts(self) -> dict[str, Any]:
         width = shutil.get_terminal_size().columns - 2
@@ -155,9 +157,10 @@ def command(
     *options: Option | tuple[Option, ...],
     details: str = "",
     examples: Sequence[str] = (),
+    extra: str = "",
 ) -> Callable[[Run], Command]:
     """Return a decorator that makes a command of the function that runs it."""
-    return lambda run: Command(name, summary, options, run, details, examples)
+    return lambda run: Command(name, summary, options, run, details, examples, extra=extra)
 
 
 class Parser(argparse.ArgumentParser):

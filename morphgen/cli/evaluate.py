@@ -81,6 +81,7 @@ if TYPE_CHECKING:
         "eval zero-shot --split extrapolation/arms/reach --on test",
         "eval ik --split interpolation/arm3/reach --submission ik.json",
     ),
+    extra="rl",
 )
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate and print the scores."""

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     details="The run begins with the networks of the checkpoint, and with a new optimiser and "
     "schedule. Agent and hyperparameters are the checkpoint's unless given.",
     examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 30000",),
+    extra="rl",
 )
 def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""

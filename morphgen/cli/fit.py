@@ -90,6 +90,7 @@ class Target:
         "fit robots/ur5-plane --max-primitives 4 --out robots/ur5-plane-prims",
         "fit link.stl --max-primitives 3",
     ),
+    extra="fit",
 )
 def fit(args: argparse.Namespace) -> None:
     """Fit, print the table and write bundles."""

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         "study interpolation/arm3/reach --agents se,me-mlp,me-tf --seeds 0..2 --out study",
         "study interpolation/arm3/reach --agents ablation",
     ),
+    extra="rl",
 )
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""

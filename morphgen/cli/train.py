@@ -150,6 +150,7 @@ RESUME = flag("--resume", "continue the run in the output folder")
         "train arm=ur5 ee=stick task=reach --agent se",
         "train task=reach --robots arm3:300,chain:300 --agent me-tf --workers 4",
     ),
+    extra="rl",
 )
 def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""

@@ -41,6 +41,7 @@ FILM_EPISODES = 3
     "learn: jacobian (each joint along its own Jacobian column), ik (inverse kinematics with a "
     "planned path) and random actions, in episodes with the same starts and goals.",
     examples=("zeroshot arm=ur5 ee=stick", "zeroshot my_robot.urdf --out reach.mp4"),
+    extra="rl",
 )
 def zeroshot(args: argparse.Namespace) -> None:
     """Run the episodes, print the table, and write the video."""

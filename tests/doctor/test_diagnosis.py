@@ -81,7 +81,7 @@ def test_a_section_that_cannot_be_imported_is_an_error(monkeypatch):
 @pytest.mark.parametrize(
     ("error", "status", "text"),
     [
-        (ModuleNotFoundError(name="torch"), "absent", "pip install 'morphgen[rl]'"),
+        (ModuleNotFoundError(name="torch"), "absent", "pip install 'morphgen[tasks]'"),
         (MissingDependencyError("no PyBullet"), "absent", "no PyBullet"),
         (ModuleNotFoundError(name="lxml"), "error", "lxml is not installed; install morphgen"),
         (PartError("unknown part"), "error", "unknown part"),
