@@ -33,7 +33,12 @@ from morphgen.rl.submission import (
     submission_from,
     submission_text,
 )
-from morphgen.rl.submission_checks import check_submission, require_rules, require_series
+from morphgen.rl.submission_checks import (
+    check_submission,
+    require_rules,
+    require_same_random,
+    require_series,
+)
 from morphgen.tasks.env_specs import GoalConfig, task_configs
 from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
 from morphgen.tasks.registry import TASKS
@@ -123,6 +128,8 @@ def reference_files(
     files = {name: submission_text(each).encode() for name, each in submissions.items()}
     rows = sorted(_rows(cells), key=lambda row: (row.method, row.mode))
     references = References(tuple(rows), tuple(submissions.values()))
+    if references.random is None:
+        require_same_random([*submissions.items()])
     data = {
         "format": FORMAT,
         "rows": msgspec.to_builtins(rows),

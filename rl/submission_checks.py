@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from morphgen.benchmark.split import Split, split_id
 from morphgen.errors import BenchmarkError
@@ -20,6 +23,11 @@ MAX_DISTANCE = 1e3
 ROUNDING = 1e-4
 """Relative error of a sum of an episode's scores in single precision, which a valid score may
 exceed its range by."""
+RANDOM_TOLERANCE = 1.0
+"""Largest difference of the mean scores of the same episodes of the random policy: processors
+differ in the last bits, as for ``doctor.reference.SCORE_TOLERANCE``."""
+RANDOM_ERRORS = 4.0
+"""Largest difference of the mean scores of different episodes of it [standard errors]."""
 
 
 def check_submission(
@@ -61,6 +69,46 @@ def check_submission(
             raise BenchmarkError(
                 f"{where}: {side} robot {name}: is missing; expected all robots of the side"
             )
+
+
+def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:
+    """Require that submissions agree about the random policy, whose scores follow from the split.
+
+    Episodes of a test robot are the same if there are as many. Those of a train robot may be
+    others: policies of single robots are evaluated robot by robot, and so is the random policy.
+
+    Args:
+        submissions: File and content of submissions that were checked.
+
+    Raises:
+        BenchmarkError: If two disagree about a robot whose score is relative to the random policy.
+    """
+    first: dict[tuple[str, str], tuple[str, RobotOutcomes]] = {}
+    for where, submission in submissions:
+        for outcomes in submission.robots:
+            if not TASKS[outcomes.task].relative_to_random:
+                continue
+            key = (outcomes.side, outcomes.robot)
+            earlier, other = first.setdefault(key, (where, outcomes))
+            found, expected = np.array(outcomes.random_score), np.array(other.random_score)
+            if abs(found.mean() - expected.mean()) > _random_tolerance(outcomes, other):
+                raise BenchmarkError(
+                    f"{where}: {outcomes.side} robot {outcomes.robot}: random_score: mean "
+                    f"{found.mean():.2f}; expected {expected.mean():.2f}, as in {earlier}: the "
+                    "random policy has the same episodes in all submissions; evaluate again, or "
+                    "rank them in a release with a submission of random"
+                )
+
+
+def _random_tolerance(outcomes: RobotOutcomes, other: RobotOutcomes) -> float:
+    """Return the largest valid difference of two mean scores of the random policy."""
+    counts = len(outcomes.random_score), len(other.random_score)
+    if outcomes.side == "test" and counts[0] == counts[1]:
+        return RANDOM_TOLERANCE
+    # The smaller deviation: edited scores cannot widen their own tolerance.
+    deviation = min(float(np.std(each.random_score)) for each in (outcomes, other))
+    error = deviation * math.sqrt(1 / counts[0] + 1 / counts[1])
+    return max(RANDOM_TOLERANCE, RANDOM_ERRORS * error)
 
 
 def require_rules(found: Mapping[str, Any], rules: Mapping[str, Any], where: str) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
+
+if TYPE_CHECKING:
+    from morphgen.benchmark.split import Split
 
 
 @command(
@@ -23,7 +28,12 @@ from morphgen.errors import BenchmarkError
         help="version of the release",
     ),
     path_option("--out", "DIR", "folder of the archive", default=Path("releases")),
-    option("--date", metavar="YYYY-MM-DD", default="", help="date of publication"),
+    option(
+        "--date",
+        metavar="YYYY-MM-DD",
+        default="",
+        help="date of publication, which dataset tools recommend",
+    ),
     repeated("--creator", "who publishes the release", metavar="NAME"),
     option("--url", default="", help="address where the release will be"),
     repeated(
@@ -107,6 +117,7 @@ def release(args: argparse.Namespace) -> None:
             args.secret_file.unlink(missing_ok=True)
         raise
     private = report.release.private_test
+    notes = _notes(args, split, extra)
     data = {
         "archive": str(report.archive),
         "sha256": report.sha256,
@@ -114,6 +125,7 @@ def release(args: argparse.Namespace) -> None:
         "files": report.files,
         "bytes": report.size,
         "commitment": private.commitment if private else None,
+        "notes": notes,
     }
     lines = [
         f"{report.archive}: {report.files} files, {report.size / 1e6:.2f} MB",
@@ -125,8 +137,30 @@ def release(args: argparse.Namespace) -> None:
             f"  private test side: {private.robots} robots, commitment {private.commitment}",
             f"  keep {args.secret_file} secret until you reveal them; without it they are lost",
         ]
+    lines += [f"  note: {note}" for note in notes]
     lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
     opt.print_result(args, data, lambda: "\n".join(lines))
+
+
+def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
+    """Return what the release lacks that its users may expect."""
+    from morphgen.benchmark.release_file import SUBMISSIONS_DIR
+    from morphgen.tasks.eval_protocol import tasks_of_split
+    from morphgen.tasks.registry import TASKS
+
+    notes = []
+    is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
+    if is_relative and f"{SUBMISSIONS_DIR}/random.json" not in extra:
+        missing = "submission of random among --scores" if extra else "reference scores"
+        notes.append(
+            f"no {missing}: split score cannot check the random_score of submissions; add one of "
+            "morphgen eval random --submission with --scores"
+        )
+    elif not extra:
+        notes.append("no reference scores: add submissions or studies with --scores")
+    if not args.date:
+        notes.append("no --date: dataset tools recommend a date of publication")
+    return notes
 
 
 @command(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option
 from morphgen.cli.progress import bar
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Split
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
     details="Every episode of every test robot must be there, with the goals, simulator and "
     "constants of the release. Scores and 95% bootstrap intervals are computed from the episodes, "
     "and ranked beside the reference scores of the release. A submission with a fault is refused "
-    "with one line, and nothing is ranked.",
+    "with one line, and nothing is ranked; so are submissions that disagree about the random "
+    "policy, if the release has no submission of it.",
     examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
 )
 def score(args: argparse.Namespace) -> None:
@@ -47,7 +49,7 @@ def score(args: argparse.Namespace) -> None:
 
     from morphgen.rl.leaderboard import random_scores, ranked, ranking_table, score_submission
     from morphgen.rl.submission import read_submission
-    from morphgen.rl.submission_checks import check_submission
+    from morphgen.rl.submission_checks import check_submission, require_same_random
     from morphgen.tasks.eval_protocol import expected_robots
 
     submissions = [read_submission(path) for path in args.submissions]
@@ -57,23 +59,38 @@ def score(args: argparse.Namespace) -> None:
         split, protocol, references, version = _open(name, stack)
     with bar(args, "composing robots") as update:
         expected = expected_robots(split, protocol, library, jobs=args.jobs, progress=update)
-    for where, submission in [
+    named = [
         *((f"{name}: reference {each.method}", each) for each in references.submissions),
         *zip(map(str, args.submissions), submissions, strict=True),
-    ]:
+    ]
+    for where, submission in named:
         check_submission(submission, where, split, protocol, expected, version)
     random = random_scores(references.random) if references.random else None
+    tasks = sorted({each.member.task for each in expected})
+    relative = [task for task in tasks if TASKS[task].relative_to_random]
+    warnings = []
+    if relative and random is None:
+        require_same_random(named)
+        warnings.append(
+            "random_score was not checked: there is no reference submission of random, so that an "
+            f"edited random_score changes a score of {' and '.join(relative)}; rank submissions in "
+            "a release that has one (split release --scores)"
+        )
     rows = [score_submission(each, random) for each in submissions] + references.all_rows()
     data = {
         "split": split.name,
         "random": "release" if random else "submission",
+        "warnings": warnings,
         "rows": [msgspec.to_builtins(row) for row in ranked(rows)],
     }
-    relative = "the release" if random else "each submission"
-    notes = [
-        "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of every robot",
-        f"scores of reach are relative to the random policy, by the episodes of {relative}",
-    ]
+    notes = ["MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of every robot"]
+    if relative:
+        whose = "the release" if random else "each submission"
+        notes.append(
+            f"scores of {' and '.join(relative)} are relative to the random policy, by the "
+            f"episodes of {whose}"
+        )
+    notes += [f"warning: {text}" for text in warnings]
     style = "github" if args.markdown else "simple"
     opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
 

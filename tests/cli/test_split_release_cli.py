@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from helpers.splits import TEST, TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.split_file import read_split, split_text
+from morphgen.grammar.library import default_library
+from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
 
 STICKS = ("split", "new", "interpolation", "--grammar", "stick", "--train", "4", "--name")
 RELEASE = ("split", "release", "--light", "--no-goals")
@@ -26,7 +29,7 @@ def small():
 def test_release_prints_archive_and_hashes_and_passes_verify(run, small):
     code, out, err = run(*RELEASE, small, "--version", "2.0.0")
     assert (code, err) == (0, "")
-    first, sha256, content, last = out.splitlines()
+    first, sha256, content, *notes, last = out.splitlines()
     archive = "releases/mine-small-2.0.0.zip"
     assert first.startswith(f"{archive}: ")
     assert last == f"verify it anywhere: morphgen split verify {archive}"
@@ -34,6 +37,12 @@ def test_release_prints_archive_and_hashes_and_passes_verify(run, small):
     data = json.loads(out)
     assert (f"  sha256: {data['sha256']}", f"  content: {data['content']}") == (sha256, content)
     assert data["commitment"] is None
+    assert [f"  note: {note}" for note in data["notes"]] == notes
+    assert [note.partition(":")[0] for note in data["notes"]] == [
+        "no reference scores",
+        "no --date",
+    ]
+    assert run(*RELEASE, small, "--date", "2027-01-31", "--out", "dated")[1].count("note: ") == 1
     code, out, err = run("split", "verify", archive)
     assert (code, err) == (0, "")
     assert out.splitlines()[1] == content
@@ -182,6 +191,33 @@ def test_score_refuses_other_files(refused, small):
     assert "c.json: split.name: mine/small is not" in refused("split", "score", "c.json")
     Path("c.json").write_text(json.dumps(values | {"split": values["split"] | {"name": small}}))
     assert "c.json: split.name: small.yaml is not" in refused("split", "score", "c.json")
+
+
+def test_edited_random_scores_do_not_pass_unnoticed(run, refused, small):
+    split, protocol = read_split(small), EvalProtocol()
+    expected = expected_robots(split, protocol, default_library())
+    values = data(split=split, expected=expected, protocol=protocol, episodes=protocol.episodes)
+    values["morphgen"] = version("morphgen")
+    Path("a.json").write_text(json.dumps(values))
+    baseline = {"method": "random", "mode": "", "training_seed": None}
+    Path("random.json").write_text(json.dumps(values | baseline))
+    values["robots"][-1]["random_score"] = [-200.0] * protocol.episodes
+    Path("b.json").write_text(json.dumps(values))
+    score = ("split", "score", "--split", small)
+    for file in ("a.json", "b.json"):
+        code, out, err = run(*score, file)
+        assert (code, err) == (0, "")
+        (warning,) = json.loads(run(*score, file, "--json")[1])["warnings"]
+        assert out.splitlines()[-1] == f"warning: {warning}"
+        assert warning.startswith("random_score was not checked: there is no reference submission")
+    assert "b.json: test robot planar-plane: random_score: " in refused(*score, "a.json", "b.json")
+    out = run(*RELEASE, small, "--scores", "a.json")[1]
+    assert "  note: no submission of random among --scores: " in out
+    out = run(*RELEASE, small, "--scores", "random.json", "--version", "1.1.0")[1]
+    assert out.count("note: ") == 1
+    words = ("split", "score", "b.json", "--split", "releases/mine-small-1.1.0.zip", "--json")
+    ranking = json.loads(run(*words)[1])
+    assert (ranking["random"], ranking["warnings"]) == ("release", [])
 
 
 @pytest.mark.slow
