@@ -47,8 +47,8 @@ test it on {test} that it has not seen. Made with morphgen {morphgen}; the split
 
 ```
 morphgen split verify {folder}
-morphgen train {folder}
-morphgen eval runs/{name}/me-graph/seed0 --split {folder} --submission mine.json
+morphgen train {folder} --sim {simulator}
+morphgen eval runs/{name}/me-graph/seed0 --split {folder} --sim {simulator} --submission mine.json
 morphgen split score mine.json --split {folder}
 ```
 
@@ -96,6 +96,7 @@ def card_text(
         id=release.id,
         files=_file_table(names),
         folder=release.stem,
+        simulator=release.evaluation["simulator"],
         robots=ROBOTS_FILE,
         croissant=CROISSANT_FILE,
         tokens=TOKENS_FILE,

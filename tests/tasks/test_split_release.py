@@ -1,6 +1,7 @@
 """Releases: contents, determinism, verification, and archives of strangers."""
 
 import json
+import re
 import zipfile
 from dataclasses import replace
 
@@ -85,6 +86,16 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
     assert {each["part"] for each in json.loads((folder / LICENCES_FILE).read_text())} == {
         *("gantry", "planar", "plane", "cube", "cylinder")
     }
+
+
+@pytest.mark.parametrize("simulator", ["mujoco", "pybullet"])
+def test_the_commands_of_the_card_name_the_simulator_of_the_evaluation(tmp_path, simulator):
+    request = replace(LIGHT, protocol=EvalProtocol(simulator))
+    report = release_split(combined(), tmp_path, LIBRARY, request)
+    unpack_zip(report.archive, tmp_path, LIMITS)
+    text = (tmp_path / "mine-some-1.2.0" / "README.md").read_text()
+    for command in ("train", "eval"):
+        assert re.search(rf"^morphgen {command} .*--sim {simulator}\b", text, re.MULTILINE)
 
 
 def test_the_archive_and_its_folder_pass_verify(report, folder):
