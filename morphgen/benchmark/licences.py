@@ -13,6 +13,7 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 
 NON_COMMERCIAL, NO_DERIVATIVES, UNKNOWN = "non-commercial", "no derivatives", "unknown"
+SHARE_ALIKE = "share-alike"
 _SPDX = "https://spdx.org/licenses/{}.html"
 
 
@@ -50,7 +51,8 @@ LICENCES: Mapping[str, Licence] = {
         *map(Licence, (*_PERMISSIVE, *_SHARED)),
         Licence("LicenseRef-BSD", is_spdx=False),  # BSD; the source does not say which version
         Licence("CC-BY-NC-4.0", (NON_COMMERCIAL,)),
-        Licence("CC-BY-NC-SA-4.0", (NON_COMMERCIAL,)),
+        # A release may hold parts that are share-alike only: it keeps each part's licence.
+        Licence("CC-BY-NC-SA-4.0", (NON_COMMERCIAL, SHARE_ALIKE)),
         Licence("CC-BY-ND-4.0", (NO_DERIVATIVES,)),
         Licence("CC-BY-NC-ND-4.0", (NON_COMMERCIAL, NO_DERIVATIVES)),
         Licence("LicenseRef-unknown", (UNKNOWN,), is_spdx=False),
@@ -132,6 +134,20 @@ def restriction_text(part: LicencedPart) -> str:
     names = ", ".join(dict.fromkeys(name for _, name in part.robots))
     return (
         f"{part.part} ({part.licence.id}: {', '.join(part.licence.restrictions)}) in robots {names}"
+    )
+
+
+def restriction_line(parts: Iterable[LicencedPart]) -> str:
+    """Return a line with all parts whose licence restricts use, and what a release of them needs.
+
+    It is empty if there is no such part.
+    """
+    limited = restricted(parts)
+    if not limited:
+        return ""
+    return (
+        f"restricted: {'; '.join(map(restriction_text, limited))}; split release needs "
+        f"--licence-allow {','.join(licence_ids(limited))}"
     )
 
 

@@ -12,7 +12,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option
 from morphgen.cli.goals import make_goals
 from morphgen.cli.progress import bar
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, GrammarError, PartError
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit, NearThresholds
@@ -51,6 +51,7 @@ def _goal_seed(help: str) -> Option:
 def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
     from morphgen.benchmark.audit import audit
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
     from morphgen.benchmark.split_source import read_split_or_folder
 
     near = _near(args.near)
@@ -61,8 +62,14 @@ def audit(args: argparse.Namespace) -> int:
     result, goals = _audit_goals(args, result, split, folder)
     passed = result.passed(strict=args.strict)
     sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
-    data = {**result.as_dict(), "goals": sets, "passed": passed}
-    opt.print_result(args, data, lambda: _audit_text(result, passed, goals))
+    try:
+        parts = licenced_parts(split, library)
+    except (GrammarError, PartError):  # the audit has a finding about it
+        parts = ()
+    limited = [part.as_dict() for part in restricted(parts)]
+    data = {**result.as_dict(), "goals": sets, "restricted": limited, "passed": passed}
+    line = restriction_line(parts)
+    opt.print_result(args, data, lambda: _audit_text(result, passed, goals, line))
     return int(not passed)
 
 
@@ -100,7 +107,7 @@ def _audit_goals(
     return with_goal_findings(result, split, findings), goals
 
 
-def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None) -> str:
+def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
     from tabulate import tabulate
 
     from morphgen.benchmark.similarity import MEASURES
@@ -122,6 +129,8 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None) -> str:
         lines += _listed(findings)
     if goals:
         lines.append(f"{len(goals.sets)} goal sets were audited, seed {goals.config.seed}")
+    if limits:
+        lines.append(limits)
     counts = ", ".join(
         f"{sum(finding.severity == severity for finding in result.findings)} {severity}"
         for severity in ("error", "warning")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 def new_split(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
     from morphgen.benchmark.new_split import choose_robots
     from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import require_split_name
@@ -48,11 +49,14 @@ def new_split(args: argparse.Namespace) -> None:
             "id": split_id(split),
             "train": len(split.train),
             "test": len(split.test),
+            "restricted": [part.as_dict() for part in restricted(licenced_parts(split, library))],
         }
         for split, path in zip(splits, paths, strict=True)
     ]
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
     lines += _hold_out_notes(splits[-1], library)
+    if limits := restriction_line(licenced_parts(splits[-1], library)):  # of the largest split
+        lines.append(f"  {limits}")
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 

@@ -118,6 +118,7 @@ def test_every_regime_can_be_created(run, argv, name, counts):
             "id": split_id(split),
             "train": counts[0],
             "test": counts[1],
+            "restricted": [],
         }
     ]
     assert (len(split.train), len(split.test)) == counts
@@ -145,6 +146,25 @@ def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(run):
         "my/no-kinova: passed: 0 error, 0 warning, 0 accepted",
     )
     assert run("split", "verify", "my/no-kinova.yaml")[0] == 0
+
+
+def test_a_new_split_names_what_a_release_of_it_must_allow(run):
+    words = ("split", "new", "--hold-out", "ee=sake_ez", "--name", "my/sake", "--train", "2")
+    words += ("--from", "arm={ur5,fetch_arm} ee={sake_ez,plane}")
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    (line,) = [line.strip() for line in out.splitlines() if "restricted" in line]
+    assert "fetch_arm (CC-BY-NC-SA-4.0: non-commercial, share-alike) in robots fetch_arm+" in line
+    assert line.endswith("; split release needs --licence-allow CC-BY-NC-ND-4.0,CC-BY-NC-SA-4.0")
+    assert line in run("split", "audit", "my/sake.yaml")[1].splitlines()
+    audited = json.loads(run("split", "audit", "my/sake.yaml", "--json")[1])
+    assert [part["part"] for part in audited["restricted"]] == ["sake_ez", "fetch_arm"]
+    (made,) = json.loads(run(*words, "--out", "again.yaml", "--json")[1])
+    assert made["restricted"] == audited["restricted"]
+    allowed = line.rpartition(" ")[2]
+    release = ("split", "release", "my/sake.yaml", "--light", "--no-goals")
+    assert run(*release)[0] == 2
+    assert run(*release, "--licence-allow", allowed)[0] == 0
 
 
 def test_a_hold_out_split_can_be_built(run):
