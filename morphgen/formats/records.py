@@ -39,9 +39,11 @@ T = TypeVar("T")
 KeyPath = tuple[str | int, ...]
 """Keys and list indices from the top of the data to a value."""
 
-FiniteNumber = Annotated[float, Meta(ge=-1e12, le=1e12)]
+_LARGEST = 1e12
+"""Largest size of a number: more than a robot can hold in SI units."""
+FiniteNumber = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
 """A number that is neither NaN nor infinite, nor beyond what a robot can hold in SI units."""
-PositiveNumber = Annotated[float, Meta(gt=0, le=1e12)]
+PositiveNumber = Annotated[float, Meta(gt=0, le=_LARGEST)]
 
 _SHOWN_VALUE = 80
 """Longest value that an error shows [characters]."""
@@ -55,6 +57,11 @@ _WORDS = {
     "str": "text",
 }
 """Words for the type names in msgspec's messages."""
+_BOUNDS = {
+    f"`float` >= {-_LARGEST}": "a finite number from -1e12 to 1e12",
+    f"`float` <= {_LARGEST}": "a finite number up to 1e12",
+}
+"""Words for the bounds of ``FiniteNumber`` and ``PositiveNumber`` in msgspec's messages."""
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,6 +134,8 @@ def _error(data: object, hint: Any) -> str:  # noqa: ANN401
         reason = re.sub(r", got `\w+`$", "", str(error).partition(" - at ")[0])
         reason = re.sub("^Object missing required field", "missing key", reason)
         reason = re.sub("^Number out of range", "expected a smaller number", reason)
+        for bound, words in _BOUNDS.items():
+            reason = reason.replace(bound, words)
         return re.sub(
             r"`([^`]*)`",
             lambda match: " or ".join(_WORDS.get(w, repr(w)) for w in match[1].split(" | ")),

@@ -58,6 +58,26 @@ def test_nested_data_becomes_dataclasses():
     )
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("low", math.nan, "a number > 0.0"),
+        ("low", math.inf, "a finite number up to 1e12"),
+        ("high", math.nan, "a finite number from -1e12 to 1e12"),
+        ("high", -math.inf, "a finite number from -1e12 to 1e12"),
+        ("high", 1e13, "a finite number up to 1e12"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_called_so(key, value, expected):
+    class Numbers(Record, frozen=True):
+        low: PositiveNumber = 1.0
+        high: FiniteNumber = 1.0
+
+    with pytest.raises(FormatError) as caught:
+        read_record({key: value}, Numbers, "x")
+    assert str(caught.value) == f"x: {key}: invalid value {value}; expected {expected}"
+
+
 def test_whole_numbers_become_floats():
     record = read_record({"low": 1, "high": 2}, Range, "x")
     assert type(record.low) is float
