@@ -177,6 +177,7 @@ def test_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path
     commands = build_parser()._subparsers._group_actions[0].choices
     assert all(f'id="{name}"' in pages["cli"] for name in commands)
     assert 'id="morphgen.compose"' in pages["api"]
+    assert "In this repository" not in pages["cli"]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 
 COMMANDS = "<!-- commands -->"
 """Mark in ``cli.md`` that the commands replace."""
+REPOSITORY_ONLY = re.compile(r"<!-- repository -->\n.*?<!-- /repository -->\n", re.DOTALL)
+"""Text for readers of the repository, which the site leaves out."""
 USAGE_WIDTH = 90
 """Longest line of a synopsis [characters]."""
 
@@ -18,6 +20,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
         from morphgen.cli import build_parser  # only for the one page
 
         markdown = markdown.replace(COMMANDS, "\n".join(command_lines(build_parser())))
+    markdown = REPOSITORY_ONLY.sub("", markdown)
     # Source files beside docs/ are no pages: their names stay, without a link.
     markdown = re.sub(r"\[([^]]+)\]\(\.\./[^)]*\)", r"\1", markdown)
     # GitHub needs the backslash in a table's code; Python-Markdown prints it.

@@ -42,7 +42,7 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
     ),
     LIBRARY,
     details="The server runs until it is interrupted. Without a target, it shows the library, the "
-    "splits and the robots of this folder.",
+    "splits and grammars that come with morphgen, and the robots of this folder.",
     examples=(
         "view",
         "view robots/arm3",
