@@ -163,7 +163,7 @@ class Learner:
         self.batch = batch
         self.env_robot_index = batch.env_robot_index.to(self.device)
         self.num_robots = int(batch.env_robot_index.max()) + 1
-        self._step = StepGraph(batch) if can_record(batch) else batch.step
+        self._step_graph = StepGraph(batch) if can_record(batch) else None
         self.restart_episodes()
 
     def restart_episodes(self) -> None:
@@ -201,7 +201,8 @@ class Learner:
             self.actions[step] = action
             self.log_probs[step] = head.log_prob(action)
 
-            result = self._step(pad_links(action, self.layout.links).to(self.batch.device))
+            padded = pad_links(action, self.layout.links).to(self.batch.device)
+            result = (self._step_graph or self.batch.step)(padded)
             self.rewards[step], self.scores[step] = result.reward, result.score
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated

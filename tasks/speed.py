@@ -68,7 +68,7 @@ def measure_speed(
     """
     spent: dict[str, float] = {}
     parts: dict[str, list[tuple[Any, str]]] = {
-        "actions": [(batch, "_act")],
+        "actions": [(batch, "act")],
         "rewards": [(batch, "_evaluate")],
         "observation": [(batch, "_observe")],
         "new episodes": [(batch, "_begin")],
