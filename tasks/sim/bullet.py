@@ -82,6 +82,7 @@ class BulletSimulation:
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
         self._view = TensorView()
         self._faults: dict[int, str] = {}
+        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
         self._workers: list[Worker] = []
         self._local_batches: list[BulletBatch] = []
         self._free = weakref.finalize(self, _free, self._workers, self._local_batches, folder)
@@ -154,8 +155,11 @@ class BulletSimulation:
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
         messages = [(worker, STEP) for worker in self._workers]
-        self._faults = self._run(messages, lambda batch: batch.step(self._targets))
-        return torch.from_numpy(mask_of(self._faults, len(self.scenes)))
+        faults = self._run(messages, lambda batch: batch.step(self._targets))
+        if faults or self._faults:
+            self._faults = faults
+            self._diverged = torch.from_numpy(mask_of(faults, len(self.scenes)))
+        return self._diverged
 
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""

@@ -93,6 +93,7 @@ class MujocoSimulation:
         self._state.read()
         self._view = TensorView()
         self._faults: dict[int, str] = {}
+        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
@@ -151,9 +152,11 @@ class MujocoSimulation:
             )
             refused = self._advance()
             self._state.read()
-        faults = dict(sorted((self._state.faults() | refused).items()))
-        self._faults = {env: f"{self._label(env)}: {why}" for env, why in faults.items()}
-        return torch.from_numpy(mask_of(self._faults, len(self.scenes)))
+        faults = self._state.faults() | refused
+        if faults or self._faults:
+            self._faults = {env: f"{self._label(env)}: {faults[env]}" for env in sorted(faults)}
+            self._diverged = torch.from_numpy(mask_of(faults, len(self.scenes)))
+        return self._diverged
 
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
