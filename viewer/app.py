@@ -32,8 +32,9 @@ from morphgen.viewer.robot_uri import (
     UriError,
     resolve_words,
 )
+from morphgen.viewer.scene_stage import BRAND, set_stage
 from morphgen.viewer.server import start_server, stop_server
-from morphgen.viewer.session import BUG, Session, read_query
+from morphgen.viewer.session import BUG, Session, read_location
 from morphgen.viewer.workers import Workers
 
 NOTHING = "There is nothing to see here"
@@ -109,7 +110,7 @@ def serve(
     viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
 
     async def connect(client: viser.ClientHandle) -> None:
-        session = Session(client, files, viewer.workers, start, viewer.cache)
+        session = Session(client, files, viewer.workers, start, cache=viewer.cache)
         viewer.sessions[client.client_id] = session
         MessageFilter(client, session.report_error)
         session.enqueue(lambda: open_page(session))
@@ -173,11 +174,15 @@ def _path_address(text: str, files: FileAccess) -> Address:
 
 def open_page(session: Session) -> None:
     """Build the page that a browser's URL names, or a page that says why it cannot be shown."""
-    client = session.client
-    client.gui.configure_theme(show_logo=False, show_share_button=False)
-    redact = session.files.redact
+    client, redact = session.client, session.files.redact
     try:
-        session.address = parse_address(read_query(client)) or session.address
+        location = read_location(client)
+        session.dark = location.dark
+        client.gui.configure_theme(
+            show_logo=False, show_share_button=False, dark_mode=session.dark, brand_color=BRAND
+        )
+        set_stage(client.scene, dark=session.dark)
+        session.address = parse_address(location.query) or session.address
         load_page(session.address.page)(session)
     except UnsoundError as error:
         _show_fault(session, redact(error.origin), markup.findings_table(error.findings, redact))
@@ -189,6 +194,9 @@ def open_page(session: Session) -> None:
         if not session.closed.is_set():
             _show_fault(session, NOTHING, BUG)
             raise
+    finally:
+        if not session.closed.is_set():
+            session.reveal()
 
 
 def _show_fault(session: Session, title: str, html: str) -> None:

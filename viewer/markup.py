@@ -22,6 +22,7 @@ border-radius:3px}
 .mg code{padding:0 3px}.mg pre{padding:6px 8px;overflow-x:auto;white-space:pre-wrap;margin:.3em 0;
 user-select:all}
 .mg .crumbs{color:#868e96;font-size:12.5px;padding-top:.5em}
+.mg.theme{float:right;padding-top:.6em;font-size:12px}
 .mg .tag{display:inline-block;border-radius:3px;padding:0 5px;font-size:11px;background:#8882;
 margin-right:3px}
 .mg .train{background:#d0ebff;color:#1864ab}.mg .test{background:#ffe8cc;color:#d9480f}
@@ -39,6 +40,8 @@ font-size:11px}
 .mg .card .text{padding:5px 8px 7px 8px}.mg .card .name{font-weight:600;overflow-wrap:anywhere}
 .mg .dim{color:#868e96;font-size:11.5px}.mg .bar{height:3px;background:#8882;margin-top:3px}
 .mg .bar div{height:3px;background:#339af0}
+[data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}
+[data-mantine-color-scheme="dark"] .mg a.card{background:#2c3036;color:inherit}
 </style>"""
 
 

@@ -22,6 +22,7 @@ from morphgen.errors import MorphgenError
 from morphgen.viewer.viser_internals import (
     ACCEPTED_MESSAGES,
     GuiUpdate,
+    ScenePointer,
     UploadPart,
     UploadStart,
     discard_upload,
@@ -72,10 +73,20 @@ def message_fault(data: object) -> str:
         msgspec.convert(content, message_type)
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
         return f"malformed message: {error}"
+    if message_type is ScenePointer and not _is_gesture(content):
+        return "a click needs a ray and a point, a rectangle needs two points"
     norm = math.hypot(*content.get("wxyz", (1.0,)))
     if not _all_finite(content.values()) or norm < MIN_QUATERNION_NORM:
         return "a number of the message is not finite, or a quaternion is zero"
     return ""
+
+
+def _is_gesture(content: dict[str, Any]) -> bool:
+    """Return whether the fields of a pointer message, which have valid types, fit its gesture."""
+    points = content["screen_pos"]
+    if content["event_type"] != "click":
+        return len(points) == 2
+    return len(points) == 1 and None not in (content["ray_origin"], content["ray_direction"])
 
 
 class MessageFilter:

@@ -13,7 +13,7 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
-from morphgen.viewer import comparison, markup, scene_robot
+from morphgen.viewer import comparison, markup, scene_robot, scene_stage
 from morphgen.viewer.address import Address
 from morphgen.viewer.figures import tokens_png
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
@@ -25,6 +25,8 @@ PANEL_WIDTH = 520.0
 """Width of the panel [pixels]."""
 GAP = 0.35
 """Distance between the bounding boxes of two robots [m]."""
+_CAMERA_DIRECTION = (0.74, 0.09, 0.28)
+"""Direction to the camera, so that robots along y stand from left to right."""
 
 
 @dataclass(eq=False)
@@ -93,8 +95,8 @@ def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.R
         scene.add_label(f"/label{i}", robot.name, position=above, anchor="bottom-center")
         corners += [corner + np.array([0.0, y, 0.0]) for corner in (low, high)]
     lowest, highest = np.min(corners, axis=0), np.max(corners, axis=0)
-    scene_robot.add_floor(scene, float(np.linalg.norm(highest - lowest)))
-    scene_robot.look_at(session.client, lowest, highest, (0.74, 0.09, 0.28))
+    scene_stage.add_ground(scene, float(np.linalg.norm(highest - lowest)))
+    scene_stage.look_at(session.client, lowest, highest, _CAMERA_DIRECTION)
     return views
 
 

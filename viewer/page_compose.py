@@ -22,7 +22,8 @@ from morphgen.viewer.page_robot import PANEL_WIDTH, summary
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import WORDS, resolve_grammar, resolve_words
-from morphgen.viewer.scene_robot import RobotView, add_floor, add_robot, look_at, robot_bounds
+from morphgen.viewer.scene_robot import RobotView, add_robot, robot_bounds
+from morphgen.viewer.scene_stage import add_ground, look_at
 from morphgen.viewer.session import Session
 
 ROBOTS = "robots"
@@ -70,7 +71,7 @@ def show(session: Session) -> None:
     session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
     gui = session.client.gui
     page = ComposePage(session, gui.add_html(""))
-    add_floor(session.client.scene, 2.0)
+    add_ground(session.client.scene, 2.0)
     tabs = gui.add_tab_group()
     show_in_page = functools.partial(show_robot, page)
     if is_grammar:  # the tab that the address asks for comes first

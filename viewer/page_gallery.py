@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import viser
 
-from morphgen.benchmark.split import Member
 from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
@@ -18,7 +17,7 @@ from morphgen.viewer.gallery_grid import (
 )
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
-from morphgen.viewer.splits import SAVED_REGIMES, make_member, save_split
+from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
 
 
 def show(session: Session) -> None:
@@ -73,22 +72,19 @@ def _add_split_form(gallery: Gallery) -> None:
         """Compose the robots in the worker processes, and write the split."""
         passing = passing_rows(gallery)
         sides = choose_sides(gallery.rows, passing, num_train.value, num_test.value)
-        train, test = (_make_members(session, rows, task.value, obstacles.value) for rows in sides)
+        train, test = (
+            make_members(
+                rows,
+                task.value,
+                obstacles.value,
+                session.files,
+                session.workers,
+                lambda done, total: session.set_status(f"composing {total} robots", done / total),
+            )
+            for rows in sides
+        )
         session.set_status("")
         path = save_split(name.value, regime.value, train, test, session.files)
         show_saved(session, path, text)
 
     session.on_change(button, lambda: session.run_in_background(save))
-
-
-def _make_members(session: Session, rows: list[Row], task: str, obstacles: bool) -> list[Member]:
-    """Compose the robots of rows in the worker processes; return them as members of a split."""
-    futures = [
-        session.workers.submit(make_member, row.uri, row.category, task, obstacles, session.files)
-        for row in rows
-    ]
-    members = []
-    for i, future in enumerate(futures):
-        session.set_status(f"composing {len(futures)} robots", i / len(futures))
-        members.append(session.workers.result(future))
-    return members

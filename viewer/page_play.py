@@ -25,8 +25,8 @@ from morphgen.viewer.page_play_controls import (
 from morphgen.viewer.player import SPEEDS, Player
 from morphgen.viewer.robot_uri import EPISODE_SUFFIX, uri_name
 from morphgen.viewer.rollout import EpisodeSource, RecordedEpisode, Rollout, RolloutConfig
-from morphgen.viewer.scene_robot import look_at
 from morphgen.viewer.scene_rollout import RolloutScene, add_episode, show_step
+from morphgen.viewer.scene_stage import look_at
 from morphgen.viewer.session import Session, set_value
 
 PANEL_WIDTH = 400.0

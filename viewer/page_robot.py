@@ -20,7 +20,7 @@ from morphgen.model.kinematics import joint_limits, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, robot_tables, scene_robot
+from morphgen.viewer import markup, robot_tables, scene_robot, scene_stage
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_robot_show import (
     RobotPage,
@@ -67,8 +67,9 @@ def show(session: Session) -> None:
     session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")
     robot = split_colours(read_robot_uri(uri, session.files))
     low, high = scene_robot.robot_bounds(robot)
-    scene_robot.add_floor(session.client.scene, float(np.linalg.norm(high - low)))
-    scene_robot.look_at(session.client, low, high)
+    scene_stage.add_ground(session.client.scene, float(np.linalg.norm(high - low)))
+    scene_stage.add_scale_bar(session.client.scene, low, high, scene_stage.CAMERA_DIRECTION)
+    scene_stage.look_at(session.client, low, high)
     view = scene_robot.add_robot(session.client.scene, robot, "/robot")
     page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
     rollouts = ""

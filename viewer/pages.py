@@ -9,6 +9,7 @@ from typing import Any
 PAGES: Mapping[str, str] = {
     "library": "morphgen.viewer.page_library:show",
     "gallery": "morphgen.viewer.page_gallery:show",
+    "population": "morphgen.viewer.page_population:show",
     "robot": "morphgen.viewer.page_robot:show",
     "compose": "morphgen.viewer.page_compose:show",
     "compare": "morphgen.viewer.page_compare:show",

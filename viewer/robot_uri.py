@@ -17,6 +17,7 @@ machine.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import tempfile
 from collections.abc import Iterable
@@ -37,6 +38,7 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
+from morphgen.grammar.robot_set import INDEX, SETTINGS
 from morphgen.grammar.robot_source import RobotSource, light_derivation, read_source
 from morphgen.model.robot import Robot
 
@@ -99,6 +101,22 @@ class FileAccess:
             text = re.sub(rf"{re.escape(str(root))}/(?=\w)", "", text)
             text = re.sub(rf"{re.escape(str(root))}(?![\w.-])", ".", text)
         return shorten(text, MAX_ERROR)
+
+
+def owned_set(text: str, files: FileAccess) -> Path:
+    """Return the folder of a robot set whose robots the viewer may delete.
+
+    Raises:
+        UriError: If it is not a set below the allowed folders, or belongs to somebody else.
+    """
+    folder = Path() if ":" in text else files.path(text)
+    if not (folder / INDEX).is_file() or not (folder / SETTINGS).is_file():
+        raise UriError(
+            f"{shorten(text)}: robots are deleted from sets only, which morphgen sample makes"
+        )
+    if folder.stat().st_uid != os.geteuid() or not os.access(folder, os.W_OK):
+        raise UriError(f"{shorten(text)}: the set belongs to somebody else, or is read-only")
+    return folder.resolve()
 
 
 def shorten(text: str, limit: int = 100) -> str:

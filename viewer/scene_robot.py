@@ -35,7 +35,7 @@ _COLOURS: Mapping[Layer, Rgb] = {
     "inertia": (151, 117, 250),
 }
 _OPACITY: Mapping[Layer, float] = {"collision": 0.45, "primitives": 0.6, "inertia": 0.5}
-_SHARP_ANGLE = np.radians(35.0)
+SHARP_ANGLE = np.radians(35.0)
 """Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
 _MAX_SMOOTHED_FACES = 150_000
 """Largest mesh whose sharp edges are searched; larger ones would take seconds [faces]."""
@@ -88,7 +88,7 @@ class RobotView:
                     triangles(shape.geometry),
                     shape.T_link_shape,
                     layer,
-                    _shape_colour(layer, shape),
+                    _COLOURS.get(layer) or shape_colour(shape),
                 )
                 for j, shape in enumerate(link_shapes)
             ]
@@ -189,12 +189,6 @@ def add_robot(
     return view
 
 
-def add_floor(scene: viser.SceneApi, size: float) -> None:
-    """Draw a square grid on the ground, twice as wide as a size: cells 10 cm, sections 1 m."""
-    side = max(2.0, 2.0 * round(2 * size) / 2)
-    scene.add_grid("/floor", width=side, height=side, cell_size=0.1, section_size=1.0)
-
-
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
     """Return the lowest and highest corner of a robot in its root frame [m].
 
@@ -219,20 +213,6 @@ def robot_extent(robot: Robot) -> float:
     return max(float((high - low).max()), _MIN_EXTENT)
 
 
-def look_at(
-    client: viser.ClientHandle,
-    low: Array,
-    high: Array,
-    direction: tuple[float, float, float] = (0.82, 0.52, 0.42),
-) -> None:
-    """Point a browser's camera at a box, from a direction and so far away that all is in view."""
-    centre, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
-    distance = max(0.66 * diagonal, 0.12)  # tuned by eye for viser's default field of view
-    client.camera.position = centre + 1.35 * distance * np.array(direction)
-    client.camera.look_at = centre
-    client.camera.near = min(0.01, distance / 50)
-
-
 def inertia_ellipsoid(inertial: Inertial) -> tuple[Array, Array] | None:
     """Return the solid ellipsoid with a link's mass and inertia.
 
@@ -254,6 +234,14 @@ def inertia_ellipsoid(inertial: Inertial) -> tuple[Array, Array] | None:
     return np.sqrt(np.maximum(squares, 1e-8)), axes
 
 
+def shape_colour(shape: Shape) -> Rgb:
+    """Return the colour of a shape, grey if it has none."""
+    if shape.rgba is None:
+        return GREY
+    red, green, blue = (round(255 * channel) for channel in shape.rgba[:3])
+    return (red, green, blue)
+
+
 def triangles(geometry: Geometry) -> Triangles:
     """Return the surface of a geometry in its own frame.
 
@@ -272,7 +260,7 @@ def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
     """Cached by the loaded mesh, too, which is another object once the file has changed."""
     del mesh
     if len(loaded.faces) <= _MAX_SMOOTHED_FACES:
-        loaded = trimesh.graph.smooth_shade(loaded, angle=_SHARP_ANGLE)
+        loaded = trimesh.graph.smooth_shade(loaded, angle=SHARP_ANGLE)
     return _triangles(loaded.vertices, loaded.faces)
 
 
@@ -292,7 +280,7 @@ def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangl
             mesh = trimesh.creation.capsule(radius=radius, height=length)
             mesh.apply_translation(-mesh.bounds.mean(axis=0))  # trimesh's starts at the origin
     if isinstance(geometry, Box | Cylinder):
-        mesh = trimesh.graph.smooth_shade(mesh, angle=_SHARP_ANGLE)
+        mesh = trimesh.graph.smooth_shade(mesh, angle=SHARP_ANGLE)
     return _triangles(mesh.vertices, mesh.faces)
 
 
@@ -316,12 +304,3 @@ def _add_mesh(
         cast_shadow=opacity is None,
     )
     return DrawnShape(handle, colour)
-
-
-def _shape_colour(layer: Layer, shape: Shape) -> Rgb:
-    if layer in _COLOURS:
-        return _COLOURS[layer]
-    if shape.rgba is None:
-        return GREY
-    red, green, blue = (round(255 * channel) for channel in shape.rgba[:3])
-    return (red, green, blue)

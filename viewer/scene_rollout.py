@@ -15,6 +15,7 @@ from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 from morphgen.viewer.episode import Episode, Track
 from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, robot_bounds
+from morphgen.viewer.scene_stage import add_ground
 
 Position = tuple[float, float, float]
 
@@ -64,18 +65,9 @@ def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
     ]
     corners = np.array(areas) + np.array(positions)[:, None]
     low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-    # A grid at the lowest ground, about 1 m wider than the robots on each side.
     heights = [track.ground for track in episode.tracks if track.ground is not None]
     ground = min(heights, default=0.0)
-    x, y, _ = ((low + high) / 2).tolist()
-    scene.add_grid(
-        f"{NODE}/ground",
-        width=2.0 * math.ceil(float(high[0] - low[0]) / 2 + 1),
-        height=2.0 * math.ceil(float(high[1] - low[1]) / 2 + 1),
-        cell_size=0.1,
-        section_size=1.0,
-        position=(x, y, ground),
-    )
+    add_ground(scene, float(np.linalg.norm(high - low)), ground)
     rollout_scene = RolloutScene(root, tracks, low, high)
     show_step(rollout_scene, 0)
     return rollout_scene

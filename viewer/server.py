@@ -22,6 +22,7 @@ from websockets.http11 import Request, Response
 
 from morphgen.viewer.access import AccessPolicy, content_security_policy, refusal_reason
 from morphgen.viewer.messages import message_fault
+from morphgen.viewer.page_cover import cover_page
 from morphgen.viewer.viser_internals import disable_share_links
 
 MAX_REQUEST_LINE = 65_536
@@ -124,6 +125,8 @@ def _answer(
     except (OSError, ValueError):  # the path is not a valid file name
         return _text_response(http.HTTPStatus.NOT_FOUND, "there is no such file.")
     if response is not None:
+        if request.path.partition("?")[0] in ("/", "/index.html"):
+            cover_page(response)
         csp = content_security_policy(policy, request.headers["Host"])
         response.headers["Content-Security-Policy"] = csp
         response.headers["X-Content-Type-Options"] = "nosniff"

@@ -12,11 +12,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
+import msgspec
 import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import Address, AddressError
+from morphgen.viewer.page_cover import REVEAL
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.viser_internals import run_javascript
 from morphgen.viewer.workers import Workers
@@ -25,6 +27,15 @@ BUG = "this is a bug of morphgen; its traceback is in the terminal where the vie
 """Text that a page shows for an unexpected error."""
 URL_TIMEOUT = 20.0
 """Time in which a browser has to report its URL [s]."""
+
+_READ_LOCATION = """
+const name = Object.keys(localStorage).find((key) => key.endsWith(%s));
+const asked = new URLSearchParams(window.location.search).get("theme");
+if (asked === "dark" || asked === "light") localStorage.setItem("morphgen-theme", asked);
+const theme = localStorage.getItem("morphgen-theme");
+const dark = theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+if (name) localStorage.setItem(name, JSON.stringify({query: window.location.search, dark}));
+"""
 
 Work = Callable[[], object]
 T = TypeVar("T")
@@ -46,6 +57,8 @@ class Session:
     """Processes for slow work, shared by all browsers."""
     address: Address
     """Address of the current page with its state, as the URL shows it."""
+    dark: bool = False
+    """Whether the page is dark."""
     cache: dict[str, object] = field(default_factory=dict)
     """Results of slow work, shared by all browsers."""
     closed: threading.Event = field(default_factory=threading.Event)
@@ -141,8 +154,16 @@ class Session:
         gui.set_panel_label("morphgen")
         (gui.main_panel.dock_left if left else gui.main_panel.dock_right)()
         gui.main_panel.set_width(width)
-        gui.add_html(markup.STYLE + header)
+        theme = "light" if self.dark else "dark"
+        switch = markup.link(self.address.with_state(theme=theme), theme)
+        gui.add_html(f'{markup.STYLE}<div class="mg theme">{switch}</div>{header}')
         self.status = gui.add_html(markup.status(status))
+        if status:  # the page says what it does, so there is something to see
+            self.reveal()
+
+    def reveal(self) -> None:
+        """Remove the cover that hides the page until its content is there."""
+        run_javascript(self.client, REVEAL)
 
     def set_status(self, text: str, fraction: float | None = None) -> None:
         """Show the current activity and its progress in [0, 1]; an empty text clears the line."""
@@ -219,24 +240,36 @@ def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
     handle.value = value
 
 
-def read_query(client: viser.ClientHandle) -> str:
-    """Return the query of the browser's URL with its question mark; empty if there is none.
+@dataclass(frozen=True)
+class Location:
+    """What a browser says about itself."""
+
+    query: str = ""
+    """Query of its URL with the question mark; empty if there is none."""
+    dark: bool = False
+    """Whether pages are dark: as the address says (``theme=dark``) or said before, else as the
+    browser prefers."""
+
+
+def read_location(client: viser.ClientHandle) -> Location:
+    """Return the URL and the theme of a browser.
 
     viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
     local storage, under a key that no other tab uses, and viser reads it from there.
 
     Raises:
+        AddressError: If the browser sends something else.
         RuntimeError: If the browser has disconnected, or has no local storage.
         TimeoutError: If it does not answer.
     """
     key = f"morphgen-{uuid.uuid4().hex}"
     client.local_storage.set_item(key, "")
-    run_javascript(
-        client,
-        f"""const name = Object.keys(localStorage).find((k) => k.endsWith({json.dumps(key)}));
-        if (name) localStorage.setItem(name, window.location.search);""",
-    )
+    run_javascript(client, _READ_LOCATION % json.dumps(key))
     try:
-        return client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
+        text = client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
     finally:
         client.local_storage.remove_item(key)
+    try:
+        return msgspec.json.decode(text, type=Location) if text else Location()
+    except msgspec.MsgspecError as error:
+        raise AddressError(f"the browser sent no valid location: {error}") from error

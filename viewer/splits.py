@@ -35,6 +35,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.typing import Array
+from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import (
     MEMBER,
     FileAccess,
@@ -84,6 +85,37 @@ def make_member(uri: str, category: str, task: str, obstacles: bool, files: File
     composed = compose(parse_derivation(derivation), files.library, robot.name)
     hash_ = robot_hash(composed)
     return Member(robot.name, category or COMPOSED, derivation, task, obstacles, hash_)
+
+
+def make_members(
+    rows: Sequence[Row],
+    task: str,
+    obstacles: bool,
+    files: FileAccess,
+    workers: Workers,
+    progress: Callable[[int, int], None],
+) -> list[Member]:
+    """Compose the robots of rows in the worker processes; return them as members of a split.
+
+    Args:
+        rows: Robots of a gallery.
+        task: Name of their task.
+        obstacles: Whether the task has obstacles.
+        files: Files that may be read.
+        workers: The processes.
+        progress: Called with the number of composed robots and of all robots.
+
+    Raises:
+        MorphgenError: If a robot has no derivation or cannot be composed.
+    """
+    futures = [
+        workers.submit(make_member, row.uri, row.category, task, obstacles, files) for row in rows
+    ]
+    members = []
+    for i, future in enumerate(futures, 1):
+        members.append(workers.result(future))
+        progress(i, len(futures))
+    return members
 
 
 def save_split(

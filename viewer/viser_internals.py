@@ -21,6 +21,7 @@ from viser import _messages
 GuiUpdate = _messages.GuiUpdateMessage
 UploadStart = _messages.FileTransferStartUpload
 UploadPart = _messages.FileTransferPart
+ScenePointer = _messages.ScenePointerMessage
 
 ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
     message_type.__name__: message_type
@@ -28,6 +29,7 @@ ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
         GuiUpdate,
         UploadStart,
         UploadPart,
+        ScenePointer,
         _messages.ViewerCameraMessage,
         _messages.TransformControlsUpdateMessage,
         _messages.TransformControlsDragStartMessage,

@@ -1,6 +1,7 @@
 """A client of a viewer without a browser: it speaks viser's protocol over a real websocket."""
 
 import contextlib
+import json
 import socket
 import time
 import uuid
@@ -142,7 +143,7 @@ class PlainClient:
                 self.send(
                     {
                         "type": "LocalStorageGetItemResponseMessage",
-                        "value": self.query,
+                        "value": json.dumps({"query": self.query, "dark": False}),
                         **answer,
                     }
                 )

@@ -1,0 +1,158 @@
+"""What can be done with the selected robots of a population."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from morphgen.benchmark.split import SIDES
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.robot_set import remove_robots
+from morphgen.tasks.registry import TASKS
+from morphgen.viewer.address import Address
+from morphgen.viewer.gallery_grid import show_saved
+from morphgen.viewer.page_compare import MAX_ROBOTS
+from morphgen.viewer.page_population_show import PopulationPage, selected_rows, show_selection
+from morphgen.viewer.robot_files import bundle_files, zip_files
+from morphgen.viewer.robot_rows import Row
+from morphgen.viewer.robot_uri import UriError, owned_set
+from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
+
+MAX_EXPORT = 200 * 2**20
+"""Largest export before compression [bytes]."""
+_SELECT = ("all", "none", "invert")
+
+
+def add_actions(page: PopulationPage) -> None:
+    """Add the text of the selection and the controls of what can be done with it."""
+    gui, session = page.session.client.gui, page.session
+    with gui.add_folder("Selection"):
+        page.texts["selection"] = gui.add_html("")
+        select = gui.add_button_group("Select", _SELECT)
+        compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_LEFT_RIGHT)
+        export = gui.add_button("Export bundles (.zip)", icon=viser.Icon.DOWNLOAD)
+        _add_split_form(page)
+        delete = gui.add_button("Delete from the set", icon=viser.Icon.TRASH, color="red")
+    session.on_change(select, lambda: _select(page, select.value))
+    session.on_change(compare, lambda: _compare(page))
+    session.on_change(export, lambda: session.run_in_background(lambda: _export(page)))
+    session.on_change(delete, lambda: _confirm_delete(page))
+
+
+def _select(page: PopulationPage, choice: str) -> None:
+    if choice == "invert":
+        page.selected = ~page.selected
+    else:
+        page.selected = np.full(len(page.population), choice == "all")
+    show_selection(page)
+
+
+def _require_selection(page: PopulationPage) -> list[Row]:
+    """Return the selected robots.
+
+    Raises:
+        UriError: If there are none.
+    """
+    if rows := selected_rows(page):
+        return rows
+    raise UriError("no robot is selected: drag a rectangle with the shift key held")
+
+
+def _compare(page: PopulationPage) -> None:
+    rows = _require_selection(page)
+    if not 2 <= len(rows) <= MAX_ROBOTS:
+        raise UriError(f"{len(rows)} selected robots to compare; expected 2 to {MAX_ROBOTS}")
+    page.session.open_address(Address("compare", tuple(row.uri for row in rows)))
+
+
+def _export(page: PopulationPage) -> None:
+    """Send a zip with the bundles of the selected robots, each in a folder of its name."""
+    session, rows = page.session, _require_selection(page)
+    futures = [session.workers.submit(bundle_files, row.uri, session.files) for row in rows]
+    files: dict[str, bytes] = {}
+    size = 0
+    for i, (row, future) in enumerate(zip(rows, futures, strict=True)):
+        session.set_status(f"packing {len(rows)} robots", i / len(rows))
+        bundle = session.workers.result(future)
+        files |= {f"{i:04d}-{row.name}/{path}": data for path, data in bundle.items()}
+        size += sum(map(len, bundle.values()))
+        if size > MAX_EXPORT:
+            for waiting in futures:
+                waiting.cancel()
+            raise UriError(
+                f"the first {i + 1} of {len(rows)} robots have {size / 2**20:.0f} MB; at most "
+                f"{MAX_EXPORT // 2**20} MB are exported: select fewer, or copy their folders"
+            )
+    content = zip_files("robots", files)
+    session.client.send_file_download("robots.zip", content, save_immediately=True)
+    session.set_status("")
+
+
+def _add_split_form(page: PopulationPage) -> None:
+    """Add controls that save a split with the selected robots on one side."""
+    gui, session = page.session.client.gui, page.session
+    with gui.add_folder("New split", expand_by_default=False):
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", SAVED_REGIMES)
+        task = gui.add_dropdown("task", tuple(TASKS))
+        obstacles = gui.add_checkbox("obstacles", False)
+        side = gui.add_dropdown(
+            "selected robots", SIDES, initial_value="test", hint="the others are on the other side"
+        )
+        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+        text = gui.add_html("")
+
+    def save() -> None:
+        chosen = _require_selection(page)
+        if len(chosen) == len(page.population):
+            raise BenchmarkError("all robots are selected: none is left for the other side")
+        rows = page.population.rows
+
+        def members(is_selected: bool) -> list[Row]:
+            return [
+                row for row, flag in zip(rows, page.selected, strict=True) if flag == is_selected
+            ]
+
+        sides = {
+            part: make_members(
+                members(part == side.value),
+                task.value,
+                obstacles.value,
+                session.files,
+                session.workers,
+                lambda done, total: session.set_status("composing", done / total),
+            )
+            for part in SIDES
+        }
+        session.set_status("")
+        path = save_split(name.value, regime.value, sides["train"], sides["test"], session.files)
+        show_saved(session, path, text)
+
+    session.on_change(button, lambda: session.run_in_background(save))
+
+
+def _confirm_delete(page: PopulationPage) -> None:
+    """Ask before the selected robots are deleted."""
+    rows, subject = _require_selection(page), page.session.address.subject
+    owned_set(subject, page.session.files)  # refuses before it asks
+    gui = page.session.client.gui
+    with gui.add_modal(f"Delete {len(rows)} robots?") as modal:
+        names = ", ".join(row.name for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+        gui.add_markdown(f"Their folders in `{subject}` are removed for good: {names}")
+        delete = gui.add_button(f"Delete {len(rows)} robots", color="red")
+        keep = gui.add_button("Keep them")
+
+    def answer(action: Callable[[], object]) -> None:
+        modal.close()
+        action()
+
+    page.session.on_change(keep, lambda: answer(lambda: None))
+    page.session.on_change(delete, lambda: answer(lambda: _delete(page, rows)))
+
+
+def _delete(page: PopulationPage, rows: list[Row]) -> None:
+    session = page.session
+    remove_robots(owned_set(session.address.subject, session.files), [row.name for row in rows])
+    session.open_address(session.address.with_state(select=""))

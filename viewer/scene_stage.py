@@ -1,0 +1,152 @@
+"""The stage on which robots stand: light, background, ground, a scale bar, and the camera."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+import viser
+
+from morphgen.model.geometry import Box
+from morphgen.typing import Array
+from morphgen.viewer.scene_robot import Rgb, triangles
+
+BRAND: Rgb = (24, 100, 171)
+"""Colour of links, buttons and sliders."""
+CAMERA_DIRECTION = (0.72, -0.60, 0.34)
+"""Direction from a robot to the camera, that of the thumbnails (``formats.picture``)."""
+_BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
+    False: ((246, 248, 250), (206, 212, 219)),
+    True: ((52, 57, 64), (24, 26, 30)),
+}
+"""Colours at the top and bottom of the background, for light and dark pages. The light one is grey
+enough for white robots."""
+_GRADIENT_ROWS = 128
+_LIGHT: Literal["studio"] = "studio"
+"""Environment map that is installed with viser: soft boxes in a grey room."""
+_LIGHT_INTENSITY, _KEY_INTENSITY = 0.35, 0.75
+"""Factor on the environment map, and intensity of the light that casts shadows; tuned by eye, so
+that white robots keep their edges."""
+_KEY_POSITION = (0.9, -1.0, 2.4)
+"""Direction to the light that casts shadows: above the camera's shoulder."""
+_GRID: Rgb = (150, 157, 166)
+"""Colour of the lines on the ground, visible on light and on dark backgrounds."""
+_SHADOW_OPACITY = 0.3
+_FADE = 5.0
+"""Distance at which the ground has faded, in sizes of what stands on it."""
+_FOV = math.radians(35.0)
+"""Vertical field of view [rad], that of the thumbnails."""
+_MARGIN = 0.92
+"""Share of the picture that what the camera looks at may fill."""
+_MAX_ASPECT = 1.2
+"""Largest aspect of the picture that is used: panels may still open beside it."""
+_BAR_COLOURS: tuple[Rgb, Rgb] = ((33, 37, 41), (248, 249, 250))
+_BAR_PARTS = 10
+
+
+def set_stage(scene: viser.SceneApi, *, dark: bool) -> None:
+    """Set the light and the background."""
+    scene.configure_environment_map(_LIGHT, environment_intensity=_LIGHT_INTENSITY)
+    scene.configure_default_lights(enabled=False)
+    scene.add_light_directional(
+        "/light", intensity=_KEY_INTENSITY, cast_shadow=True, position=_KEY_POSITION
+    )
+    top, bottom = np.array(_BACKGROUNDS[dark], dtype=np.float64)
+    share = np.linspace(0, 1, _GRADIENT_ROWS)[:, None, None]
+    image = (1 - share) * top + share * bottom
+    scene.set_background_image(np.repeat(image, 2, axis=1).astype(np.uint8), format="png")
+
+
+def background_colour(*, dark: bool) -> Rgb:
+    """Return the colour behind the middle of the scene."""
+    top, bottom = _BACKGROUNDS[dark]
+    red, green, blue = ((a + b) // 2 for a, b in zip(top, bottom, strict=True))
+    return (red, green, blue)
+
+
+def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
+    """Draw an endless grid that fades with the distance, cells of 10 cm or, if large, of 1 m.
+
+    Args:
+        scene: The scene.
+        size: Size of what stands on it [m].
+        height: Height of the ground [m].
+    """
+    cell = 0.1 if size < 8 else 1.0
+    scene.add_grid(
+        "/ground",
+        cell_size=cell,
+        section_size=10 * cell,
+        cell_color=_GRID,
+        section_color=_GRID,
+        cell_thickness=0.6,
+        section_thickness=1.1,
+        infinite_grid=True,
+        fade_distance=_FADE * max(size, 1.0),
+        fade_strength=2.0,
+        shadow_opacity=_SHADOW_OPACITY,
+        position=(0.0, 0.0, height),
+    )
+
+
+def add_scale_bar(
+    scene: viser.SceneApi, low: Array, high: Array, direction: tuple[float, float, float]
+) -> None:
+    """Draw a bar on the ground in front of a box, of a length that fits: 0.1, 0.2, 0.5, 1, ... m.
+
+    Args:
+        scene: The scene.
+        low: Lowest corner of the box, shape (3,) [m].
+        high: Highest corner of the box, shape (3,) [m].
+        direction: From the box to the camera; decides which side is the front.
+    """
+    extent = float((high - low).max())
+    length = bar_length(0.3 * extent)
+    width, gap = 0.02 * length + 0.004 * extent, 0.08 * extent
+    y = float(low[1]) - gap if direction[1] < 0 else float(high[1]) + gap
+    x = float(low[0] + high[0] - length) / 2
+    part = length / _BAR_PARTS
+    centres = np.arange(_BAR_PARTS) * part + x + part / 2
+    scene.add_batched_meshes_simple(
+        "/scale",
+        *triangles(Box((part, width, width / 4))),
+        batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (_BAR_PARTS, 1)),
+        batched_positions=np.stack([centres, np.full(10, y), np.full(10, width / 8)], axis=1),
+        batched_colors=np.array([_BAR_COLOURS[i % 2] for i in range(_BAR_PARTS)], dtype=np.uint8),
+        lod="off",
+        cast_shadow=False,
+    )
+    text = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    scene.add_label("/scale/label", text, position=(x + length + 0.4 * part, y, 0.0))
+
+
+def bar_length(longest: float) -> float:
+    """Return the largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ... m that is not above a length [m]."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return power * max(factor for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9))
+
+
+def look_at(
+    client: viser.ClientHandle,
+    low: Array,
+    high: Array,
+    direction: tuple[float, float, float] = CAMERA_DIRECTION,
+) -> None:
+    """Point a browser's camera at a box, from a direction and so near that it just is in view."""
+    forward = -np.array(direction) / np.linalg.norm(direction)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    across, ahead, up = (corners @ np.stack([right, forward, np.cross(right, forward)]).T).T
+    middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
+    tangent = _MARGIN * math.tan(_FOV / 2)
+    aspect = min(client.camera.aspect, _MAX_ASPECT)
+    distances = np.maximum(
+        np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
+    )
+    distance = max(float((distances - (ahead - middle[1])).max()), 0.15)
+    target = middle @ np.stack([right, forward, np.cross(right, forward)])
+    client.camera.fov = _FOV
+    client.camera.position, client.camera.look_at = target - distance * forward, target
+    client.camera.near = min(0.01, distance / 50)
