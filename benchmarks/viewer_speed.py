@@ -1,6 +1,7 @@
 """Load times of the viewer's pages, and the memory of its server.
 
     python benchmarks/viewer_speed.py [--robots 100] [--many 500] [--moves 200]
+    python benchmarks/viewer_speed.py --only population
 
 Samples sets of arm3 into a temporary folder, as bundles without pictures and with an empty cache of
 thumbnails. `morphgen view` serves them in a process of its own, and a headless browser on the same
@@ -16,12 +17,18 @@ Prints the server's time for one slider move of that page with collision tests [
 percentile, for a slider that the browser moves every 30 ms. Prints the memory of the server without
 its workers at its first page and with a gallery of many robots, 96 per page (Linux).
 
+For the population page with 100 and with 1000 arm3, all moved by the slider of one joint role: the
+server's time of a move (kinematics of all robots, and the messages), the bytes that the browser
+gets for it, the draw calls of a frame, and the time between frames while the camera turns, in
+headless chromium with software GL. A browser with a GPU draws the same calls in a fraction.
+
 Needs `pip install morphgen[test]` and chromium.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
@@ -31,7 +38,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -49,6 +56,28 @@ FIRST = 5
 """Moves that are not counted: loading the page causes some, and first calls are slow."""
 PANDA = "?robot=words:arm=panda ee=panda_hand"
 CARD = ".card img"
+POPULATIONS = (100, 1000)
+"""Sizes of the populations [robots]."""
+TURNS = 40
+"""Moves of the pointer that turns the camera."""
+COUNT_DRAWS = """
+const draws = window.draws = { calls: 0, frames: [] };
+for (const name of ["drawArrays", "drawArraysInstanced", "drawElements", "drawElementsInstanced",
+                    "drawRangeElements", "multiDrawElementsWEBGL"]) {
+  const original = WebGL2RenderingContext.prototype[name];
+  if (original) WebGL2RenderingContext.prototype[name] = function (...values) {
+    draws.calls += 1;
+    return original.apply(this, values);
+  };
+}
+const tick = (time) => {
+  if (draws.calls) draws.frames.push([time, draws.calls]);
+  draws.calls = 0;
+  requestAnimationFrame(tick);
+};
+requestAnimationFrame(tick);
+"""
+"""Script of a page that stores the time [ms] and the draw calls of every frame that draws."""
 MORPHGEN = (sys.executable, "-m", "morphgen")
 Row = tuple[str, str]
 
@@ -59,6 +88,7 @@ def main() -> int:
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--many", type=int, default=500)
     parser.add_argument("--moves", type=int, default=200)
+    parser.add_argument("--only", choices=("population",), help="measure nothing else")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.serve is not None:
@@ -67,11 +97,16 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch, _browser() as browser:
         folder = Path(scratch)
         os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
-        _sample(folder, "arm3", args.robots, "--no-picture")
-        _sample(folder, "many", args.many, "--light")
-        rows = _pages(browser, folder, args.robots)
-        rows += _memory(browser, folder, args.many)
-        rows += _moves(browser, folder, args.moves)
+        rows = []
+        if args.only is None:
+            _sample(folder, "arm3", args.robots, "--no-picture")
+            _sample(folder, "many", args.many, "--light")
+            rows += _pages(browser, folder, args.robots)
+            rows += _memory(browser, folder, args.many)
+            rows += _moves(browser, folder, args.moves)
+        for robots in POPULATIONS:
+            _sample(folder, f"population{robots}", robots, "--light")
+            rows += _population(browser, folder, robots, args.moves)
     print(tabulate(rows, ["what", "figure"], disable_numparse=True))
     return 0
 
@@ -171,32 +206,87 @@ def _moves(browser: Any, folder: Path, moves: int) -> list[Row]:  # noqa: ANN401
             slider.fill(f"{(i % 40) / 20 - 1:.2f}")
             page.wait_for_timeout(PAUSE)
         page.wait_for_timeout(1000)
-    times = json.loads(told.read_text())
+    times = json.loads(told.read_text())["robot"]
+    return [(f"a move of a slider, of {len(times)}", _spread(times))]
+
+
+def _spread(times: Sequence[float]) -> str:
     late = statistics.quantiles(times, n=20)[-1]
-    text = f"{statistics.median(times):.1f} ms, 95 % below {late:.1f} ms"
-    return [(f"a move of a slider, of {len(times)}", text)]
+    return f"{statistics.median(times):.1f} ms, 95 % below {late:.1f} ms"
+
+
+def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row]:  # noqa: ANN401
+    """Return what a population's moves and frames cost."""
+    told = folder / "moves.json"
+    command = [sys.executable, str(Path(__file__).resolve()), "--serve", str(told)]
+    received = [0]
+
+    def count(payload: bytes | str) -> None:
+        received[0] += len(payload)
+
+    with _started(command, folder) as (address, _, _), _page(browser) as page:
+        page.add_init_script(COUNT_DRAWS)
+        page.on("websocket", lambda socket: socket.on("framereceived", count))
+        begun = time.perf_counter()
+        page.goto(f"{address}/?population=robots/population{robots}")
+        page.get_by_text("no robot is selected").wait_for()
+        shown = time.perf_counter() - begun
+        page.wait_for_timeout(5000)  # until the light has faded in
+        box = page.locator("canvas").first.bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.evaluate("window.draws.frames = []")
+        for i in range(TURNS):
+            page.mouse.move(x + 4 * i, y)
+        frames = page.evaluate("window.draws.frames")
+        page.mouse.up()
+        page.wait_for_timeout(3000)
+        slider, before = page.locator(".mantine-NumberInput-input").first, received[0]
+        for i in range(moves):
+            slider.fill(f"{(i % 40) / 40:.2f}")
+            page.wait_for_timeout(PAUSE)
+        page.wait_for_timeout(3000)
+        size = received[0] - before
+    times = json.loads(told.read_text())["population"]
+    gaps = [b[0] - a[0] for a, b in itertools.pairwise(frames)]
+    name = f"population of {robots}"
+    return [
+        (f"{name}: until it is shown", f"{shown:.1f} s"),
+        (f"{name}: a move on the server", _spread(times)),
+        (f"{name}: bytes of a move", f"{size / (len(times) + FIRST) / 1000:.0f} kB"),
+        (f"{name}: draw calls of a frame", f"{statistics.median(n for _, n in frames):.0f}"),
+        (f"{name}: time between frames, software GL", _spread(gaps)),
+    ]
 
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
-    from morphgen.viewer import page_robot_show
+    from morphgen.viewer import page_robot_show, scene_population
     from morphgen.viewer.app import serve
-    from morphgen.viewer.page_robot_show import RobotPage, update_scene
 
-    times: list[float] = []
+    times: dict[str, list[float]] = {"robot": [], "population": []}
 
-    def timed(moved: RobotPage) -> None:
-        begun = time.perf_counter()
-        update_scene(moved)
-        times.append(1e3 * (time.perf_counter() - begun))
+    def timed(work: Callable[..., None], into: list[float]) -> Callable[..., None]:
+        def call(*arguments: object) -> None:
+            begun = time.perf_counter()
+            work(*arguments)
+            into.append(1e3 * (time.perf_counter() - begun))
 
-    with patch.object(page_robot_show, "update_scene", timed):
+        return call
+
+    update_scene = timed(page_robot_show.update_scene, times["robot"])
+    move = timed(scene_population.move, times["population"])
+    with (
+        patch.object(page_robot_show, "update_scene", update_scene),
+        patch.object(scene_population, "move", move),
+    ):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)
         with suppress(KeyboardInterrupt):
             viewer.server.sleep_forever()
         viewer.stop()
-    told.write_text(json.dumps(times[FIRST:]))
+    told.write_text(json.dumps({name: values[FIRST:] for name, values in times.items()}))
 
 
 def _wait_until_tested(page: Any) -> None:  # noqa: ANN401

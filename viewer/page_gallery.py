@@ -31,7 +31,9 @@ def show(session: Session) -> None:
     names = robot_subfolders(session.files.path(folder))
     below = [f"{folder.rstrip('/')}/{name}" for name in names]
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
-    open_panels(gallery, markup.breadcrumbs((folder, None)), links)
+    population = markup.link(Address("population", (folder,)), "see all on one ground")
+    header = population + (f"<br>{links}" if links else "")
+    open_panels(gallery, markup.breadcrumbs((folder, None)), header)
     add_controls(gallery)
     _add_split_form(gallery)
 

@@ -108,8 +108,6 @@ def _show_population(
     connect_pointer(page)
     run_javascript(client, install_script([card(row) for row in population.rows]))
     session.set_status("")
-    if page.pose:
-        go_to(page, POSES[1], number=page.pose)
     arrange_robots(page)
     show_selection(page)
 

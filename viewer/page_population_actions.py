@@ -34,11 +34,20 @@ def add_actions(page: PopulationPage) -> None:
         compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_LEFT_RIGHT)
         export = gui.add_button("Export bundles (.zip)", icon=viser.Icon.DOWNLOAD)
         _add_split_form(page)
-        delete = gui.add_button("Delete from the set", icon=viser.Icon.TRASH, color="red")
+        if _is_owned_set(page):
+            delete = gui.add_button("Delete from the set", icon=viser.Icon.TRASH, color="red")
+            session.on_change(delete, lambda: _confirm_delete(page))
     session.on_change(select, lambda: _select(page, select.value))
     session.on_change(compare, lambda: _compare(page))
     session.on_change(export, lambda: session.run_in_background(lambda: _export(page)))
-    session.on_change(delete, lambda: _confirm_delete(page))
+
+
+def _is_owned_set(page: PopulationPage) -> bool:
+    try:
+        owned_set(page.session.address.subject, page.session.files)
+    except UriError:
+        return False
+    return True
 
 
 def _select(page: PopulationPage, choice: str) -> None:

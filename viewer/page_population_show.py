@@ -147,13 +147,13 @@ def arrange_robots(page: PopulationPage) -> None:
     _update_hover_later(page)
 
 
-def go_to(page: PopulationPage, target: str, number: int | None = None) -> None:
+def go_to(page: PopulationPage, target: str) -> None:
     """Move all robots home, or to the next of their configurations without collision."""
     page.moved = {}
     if target == POSES[0]:
         page.pose = 0
     else:
-        page.pose = page.pose % NUM_POSES + 1 if number is None else number
+        page.pose = page.pose % NUM_POSES + 1
         found = _free_configurations(page)[1]
         if not found.all():
             text = f"no free configuration of {int((~found).sum())} robots was found"

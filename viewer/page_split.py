@@ -125,7 +125,8 @@ def _rollout_link(name: str, split: Split) -> str:
     )
     state = {"obstacles": "yes"} if first.obstacles else {}
     address = Address("play", (first.task,), state, robots)
-    return markup.dim(markup.link(address, "see robots to test on at work"))
+    population = markup.link(Address("population", (name,)), "see all on one ground")
+    return markup.dim(f"{markup.link(address, 'see robots to test on at work')} · {population}")
 
 
 def _format(value: object) -> str:

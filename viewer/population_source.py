@@ -26,7 +26,7 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.sampling import robot_name, sample_robot
-from morphgen.model.kinematics import random_configurations, reach
+from morphgen.model.kinematics import forward_kinematics, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.population import Population, make_population
@@ -54,6 +54,8 @@ NUM_POSES = 8
 """Configurations without self-collision of each robot."""
 _MAX_TRIES = 256
 """Random configurations that are tested to find them; a robot without any stays at home."""
+_GROUND_TOLERANCE = 1e-3
+"""Height below the ground at which the origin of a link still counts as above it [m]."""
 _CHUNK = 20
 """Robots of one call of a worker."""
 
@@ -191,17 +193,19 @@ def load_free_configurations(
 def free_configurations(robots: Sequence[tuple[int, Robot]]) -> list[Array]:
     """Return up to ``NUM_POSES`` free configurations of each robot, (k, dof). Runs in a worker.
 
-    A robot whose collision meshes cannot be read has none.
+    Those with every link above the ground come first, because the page shows a ground. A robot
+    whose collision meshes cannot be read has none.
     """
     results = []
     for number, robot in robots:
-        # The number of the robot, so that equal robots move differently.
+        # The number of the robot is the seed, so that equal robots move differently.
         q = random_configurations(robot, _MAX_TRIES, np.random.default_rng(number))
+        heights = forward_kinematics(robot, q)[..., 2, 3].min(axis=1)
+        q = q[np.argsort(heights < -_GROUND_TOLERANCE, kind="stable")]
         free: list[Array] = []
         try:
             checker = SelfCollisionChecker(robot)
-            for start in range(0, _MAX_TRIES, 4 * NUM_POSES):
-                rows = q[start : start + 4 * NUM_POSES]
+            for rows in np.split(q, range(2 * NUM_POSES, _MAX_TRIES, 2 * NUM_POSES)):
                 free += list(rows[checker.free(rows)])
                 if len(free) >= NUM_POSES:
                     break

