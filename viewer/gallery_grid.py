@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -15,7 +16,12 @@ import viser
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.address import Address, parse_count
-from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
+from morphgen.viewer.robot_files import (
+    Thumbnail,
+    make_thumbnail,
+    measure_picture,
+    thumbnail_of_picture,
+)
 from morphgen.viewer.session import Session
 from morphgen.viewer.workers import WorkerDied
 
@@ -25,6 +31,8 @@ CONTROLS_WIDTH = 330.0
 """Width of the controls [pixels]."""
 CANVAS_WIDTH = 120.0
 """Width that viser keeps free for its scene between the panels [pixels]."""
+SCALES = ("common", "own")
+"""Scales of pictures: the same for all robots, or for each one that fills its picture."""
 _ALL = "all"
 _PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
     "first": lambda number: 1,
@@ -51,6 +59,8 @@ class Gallery:
     """All robots, shown or not."""
     columns: tuple[str, ...] = ()
     """Roles that are shown in a column each; without any, all robots are in one grid."""
+    scale: str = SCALES[1]
+    """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
     thumbnails: dict[str, str] = field(default_factory=dict)
     """Thumbnails drawn so far, by URI."""
     faults: dict[str, str] = field(default_factory=dict)
@@ -96,6 +106,8 @@ def add_controls(gallery: Gallery) -> None:
         controls[key] = gui.add_dropdown(label, tuple(options), initial_value=initial)
 
     controls["search"] = gui.add_text("Search", state.get("search", ""))
+    scales = (gallery.scale, *(name for name in SCALES if name != gallery.scale))
+    add_dropdown("scale", "Scale", scales, state.get("scale", ""))
     labels = {key: label for label, key in _SORT_KEYS.items()}
     add_dropdown("sort", "Sort by", list(_SORT_KEYS), labels.get(state.get("sort", ""), ""))
     is_filtered = not state.keys().isdisjoint(
@@ -129,6 +141,12 @@ def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
     return robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
 
 
+def shown_rows(gallery: Gallery) -> list[robot_rows.Row]:
+    """Return the robots that pass the filter, on all pages, in the order that is shown."""
+    sort = _SORT_KEYS[gallery.controls["sort"].value]
+    return robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), sort)
+
+
 def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
     """Show that a split was written, and the command that audits it."""
     name = str(path.relative_to(session.files.roots[0]))
@@ -136,9 +154,17 @@ def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
     session.notify("Saved", name)
 
 
-def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
-    """Return a robot's card in the grid, a link to its page."""
-    image = f'<img alt="" src="{thumbnail}">'
+def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) -> str:
+    """Return a robot's card in the grid, a link to its page.
+
+    Args:
+        row: The robot.
+        thumbnail: Its picture as a ``data:`` URL; empty while there is none.
+        fault: Why it cannot be read; else empty.
+        share: Size of the picture within the card, at most 1.
+    """
+    shrunk = f' style="transform:scale({share:.3f})"' if share < 1 else ""
+    image = f'<div class="picture"><img alt="" src="{thumbnail}"{shrunk}></div>'
     if not thumbnail:
         image = f'<div class="empty">{"broken" if fault else "…"}</div>'
     tags = markup.tag(row.role, row.role) if row.role else ""
@@ -155,24 +181,43 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
     )
 
 
+def shares(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> tuple[list[float], float]:
+    """Return the size of each picture, and the height that a whole card shows [m].
+
+    Args:
+        gallery: The gallery; at its own scale every size is 1, and the height NaN.
+        rows: Robots of the gallery; those of unknown size get 1.
+    """
+    heights = [row.picture_height or math.nan for row in rows]
+    known = [row.picture_height for row in gallery.rows if row.picture_height]
+    if gallery.controls["scale"].value == "own" or not known:
+        return [1.0] * len(heights), math.nan
+    tallest = max(known)
+    return [1.0 if math.isnan(height) else height / tallest for height in heights], tallest
+
+
 def _show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
-    session, controls = gallery.session, gallery.controls
+    session, controls, rows = gallery.session, gallery.controls, shown_rows(gallery)
     sort = _SORT_KEYS[controls["sort"].value]
-    rows = robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), sort)
     size = int(controls["size"].value)
     gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
     state = {key: str(control.value) for key, control in controls.items()}
     state |= {fact: _range_text(gallery, fact) for fact in robot_rows.NUMBERS if fact in controls}
     state |= {"sort": sort, "n": str(gallery.page_number)}
-    defaults = {"sort": "order", "n": "1", "size": str(robot_rows.PAGE_SIZES[0])}
+    defaults = {
+        "sort": "order",
+        "n": "1",
+        "size": str(robot_rows.PAGE_SIZES[0]),
+        "scale": gallery.scale,
+    }
     for key, value in state.items():
         if value == defaults.get(key, _ALL) and key != "search":
             state[key] = ""
     session.update_address(gallery.title, **state)
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     gallery.summary = f"{len(rows)}{total} robots · page {gallery.page_number} of {count}"
-    _load_bundle_pictures(gallery)
+    _load_bundle_pictures(gallery, gallery.page_rows)
     _draw_grid(gallery)
     session.run_in_background(lambda: _draw_missing(gallery), "thumbnails")
 
@@ -203,22 +248,30 @@ def _draw_grid(gallery: Gallery) -> None:
     if gallery.grid is None:
         return
     columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
-    for row in gallery.page_rows:
+    sizes, height = shares(gallery, gallery.page_rows)
+    for row, share in zip(gallery.page_rows, sizes, strict=True):
         thumbnail, fault = gallery.thumbnails.get(row.uri, ""), gallery.faults.get(row.uri, "")
         role = row.role if gallery.columns else ""
-        columns.setdefault(role, []).append(card(row, thumbnail, fault))
+        columns.setdefault(role, []).append(card(row, thumbnail, fault, share))
     html = [
         f"<div>{f'<h3>{role} ({len(cards)})</h3>' if role else ''}"
         f'<div class="grid">{"".join(cards)}</div></div>'
         for role, cards in columns.items()
     ]
-    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
+    scale = "" if math.isnan(height) else f" · a card is {height:.2g} m high"
+    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}{scale}</div>'
     gallery.grid.content = markup.framed(summary, f'<div class="columns">{"".join(html)}</div>')
 
 
-def _load_bundle_pictures(gallery: Gallery) -> None:
+def load_pictures(gallery: Gallery, rows: Sequence[robot_rows.Row]) -> None:
+    """Load or draw the pictures of rows that have none yet, and measure their scale if needed."""
+    _load_bundle_pictures(gallery, rows)
+    _request_missing(gallery, rows, lambda: True)
+
+
+def _load_bundle_pictures(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> None:
     """Load the pictures that bundles have, for robots whose facts are known."""
-    for row in gallery.page_rows:
+    for row in rows:
         if row.uri in gallery.thumbnails or ":" in row.uri:
             continue
         path = gallery.session.files.path(row.uri) / PICTURE
@@ -229,25 +282,34 @@ def _load_bundle_pictures(gallery: Gallery) -> None:
 
 def _draw_missing(gallery: Gallery) -> None:
     """Let the workers draw the page's missing thumbnails; retry once if a worker dies."""
+    rows = gallery.page_rows
+
+    def is_current() -> bool:
+        """Return whether the page still shows these robots; otherwise thumbnails can wait."""
+        return gallery.page_rows is rows
+
     try:
-        _request_missing(gallery)
+        _request_missing(gallery, rows, is_current)
     except WorkerDied:
         gallery.session.notify("A worker died", "another one continues with the thumbnails")
-        _request_missing(gallery)
+        _request_missing(gallery, rows, is_current)
 
 
-def _request_missing(gallery: Gallery) -> None:
+def _request_missing(
+    gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool]
+) -> None:
     """Draw missing thumbnails in the workers, and show them as they arrive."""
-    session, rows, workers = gallery.session, gallery.page_rows, gallery.session.workers
-    finished_uris = gallery.thumbnails.keys() | gallery.faults.keys()
-    pending = {
-        row.uri: workers.submit(make_thumbnail, row.uri, session.files)
-        for row in rows
-        if row.uri not in finished_uris
-    }
+    session, workers = gallery.session, gallery.session.workers
+    pending = {}
+    for row in rows:
+        if row.uri in gallery.faults:
+            continue
+        if row.uri not in gallery.thumbnails:
+            pending[row.uri] = workers.submit(make_thumbnail, row.uri, session.files)
+        elif row.picture_height is None and gallery.controls["scale"].value == "common":
+            pending[row.uri] = workers.submit(measure_picture, row.uri, session.files)
     total = len(pending)
-    # Another page of the gallery replaces ``page_rows``; then these thumbnails can wait.
-    while pending and not session.closed.is_set() and gallery.page_rows is rows:
+    while pending and not session.closed.is_set() and is_wanted():
         session.set_status(f"drawing {total} robots", (total - len(pending)) / total)
         wait(pending.values(), timeout=REFRESH_INTERVAL, return_when=FIRST_COMPLETED)
         for uri in [uri for uri, future in pending.items() if future.done()]:
@@ -261,7 +323,7 @@ def _request_missing(gallery: Gallery) -> None:
 def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
     if thumbnail.error:
         gallery.faults[uri] = thumbnail.error
-    else:
+    elif thumbnail.image:
         gallery.thumbnails[uri] = thumbnail.image
     facts: dict[str, Any] = thumbnail.facts
     for rows in (gallery.rows, gallery.page_rows):

@@ -33,6 +33,7 @@ margin-right:3px}
 .mg a.card{display:block;border:1px solid #8883;border-radius:6px;overflow:hidden;color:inherit;
 background:#fff}
 .mg a.card:hover{border-color:#339af0;text-decoration:none;box-shadow:0 1px 6px #0002}
+.mg .picture{overflow:hidden;background:#fff}.mg .picture img{transform-origin:50% 96%}
 .mg .card img,.mg .card .empty{display:block;width:100%;aspect-ratio:4/3;object-fit:cover;
 background:#f1f3f5}
 .mg .card .empty{display:flex;align-items:center;justify-content:center;color:#adb5bd;

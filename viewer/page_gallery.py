@@ -5,6 +5,7 @@ from __future__ import annotations
 import viser
 
 from morphgen.errors import BenchmarkError
+from morphgen.grammar.robot_set import INDEX
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
@@ -15,6 +16,7 @@ from morphgen.viewer.gallery_grid import (
     passing_rows,
     show_saved,
 )
+from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
 from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
@@ -27,7 +29,9 @@ def show(session: Session) -> None:
         UriError: If the folder does not exist or holds no robot.
     """
     folder = session.address.subject
-    gallery = Gallery(session, folder, folder_rows(folder, session.files))
+    rows = folder_rows(folder, session.files)
+    is_set = (session.files.path(folder) / INDEX).is_file()
+    gallery = Gallery(session, folder, rows, scale="common" if is_set else "own")
     names = robot_subfolders(session.files.path(folder))
     below = [f"{folder.rstrip('/')}/{name}" for name in names]
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
@@ -35,6 +39,7 @@ def show(session: Session) -> None:
     header = population + (f"<br>{links}" if links else "")
     open_panels(gallery, markup.breadcrumbs((folder, None)), header)
     add_controls(gallery)
+    add_sheet_buttons(gallery)
     _add_split_form(gallery)
 
 

@@ -9,6 +9,7 @@ from morphgen.grammar.grammar_file import grammar_names
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.gallery_grid import Gallery, add_controls, open_panels
+from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.robot_rows import part_rows, robot_subfolders
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.session import Session
@@ -34,6 +35,7 @@ def show(session: Session) -> None:
 
     upload.on_upload(uploaded)
     add_controls(gallery)
+    add_sheet_buttons(gallery)
 
 
 def library_links(files: FileAccess) -> str:

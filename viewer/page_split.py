@@ -22,6 +22,7 @@ from morphgen.viewer.gallery_grid import (
     passing_rows,
     show_saved,
 )
+from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.session import Session
@@ -55,13 +56,14 @@ def show(session: Session) -> None:
     """
     name = session.address.subject
     split = resolve_split(name, session.files)
-    gallery = Gallery(session, split.name, split_rows(name, split), SIDES)
+    gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")
     gui = session.client.gui
     header = _description(split) + _rollout_link(name, split)
     open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         add_controls(gallery)
+        add_sheet_buttons(gallery)
         _add_split_form(gallery, split)
     texts = {}
     with tabs.add_tab("Map", viser.Icon.MAP):

@@ -18,7 +18,7 @@ from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, MJCF, PICTURE, URDF, write_bundle
 from morphgen.formats.files import write_atomic, write_cache_file
-from morphgen.formats.picture import render
+from morphgen.formats.picture import framed_height, render
 from morphgen.formats.zip_files import write_entries
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.model.robot import Robot
@@ -29,7 +29,7 @@ SIZE = (240, 180)
 """Largest width and height of a thumbnail [pixels]."""
 _JPEG_QUALITY = 82
 """JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card."""
-_CACHE_FORMAT = 1
+_CACHE_FORMAT = 2
 """Version of the cache; increase it when a thumbnail or its facts change for the same robot."""
 
 
@@ -60,6 +60,14 @@ def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     with suppress(OSError):  # without a writable cache it is drawn again next time
         write_cache_file(path, json.dumps({"thumbnail": thumbnail.image, "facts": thumbnail.facts}))
     return thumbnail
+
+
+def measure_picture(uri: str, files: FileAccess) -> Thumbnail:
+    """Return a thumbnail without its image, with the height that it shows. Runs in a worker."""
+    try:
+        return Thumbnail("", {"picture_height": framed_height(read_robot_uri(uri, files))})
+    except MorphgenError as error:
+        return Thumbnail("", {}, files.redact(error))
 
 
 def thumbnail_of_picture(path: Path) -> str:
@@ -119,6 +127,7 @@ def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
         "reach": stats.reach if has_tool(robot) and stats.dof else None,
         "mass": stats.mass,
         "findings": tuple(sorted(findings)),
+        "picture_height": framed_height(robot),
     }
     with tempfile.TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / "robot", picture=False)

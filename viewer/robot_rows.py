@@ -58,6 +58,8 @@ class Row:
     findings: tuple[str, ...] | None = None
     """Codes of errors and warnings; of all findings for rows from the index of a set."""
     order: int = 0
+    picture_height: float | None = None
+    """Height at the middle of the robot that its picture shows [m]."""
 
 
 @dataclass(frozen=True)

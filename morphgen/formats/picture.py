@@ -75,6 +75,12 @@ def render(
     return _render_mujoco(robot, mjcf, configuration, view, size)
 
 
+def framed_height(robot: Robot) -> float:
+    """Return the height at the middle of a robot that its picture at home shows [m]."""
+    view = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
+    return 2 * view.distance * math.tan(math.radians(_FOV / 2))
+
+
 def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
     """Return the closest view that shows the whole robot and its root's origin, centred."""
     T_root_link = forward_kinematics(robot, q)
