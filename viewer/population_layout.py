@@ -17,7 +17,8 @@ ASPECT = 0.85
 """Width of an arrangement divided by its depth: seen from above the front, it fills a window."""
 UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
 """Facts by which robots can be arranged, and their units."""
-_NUM_TICKS = 5
+_NUM_TICKS, _MAX_LABELS = 5, 16
+"""Labels along an axis of a scatter, and beside rows: more would cover each other."""
 _LOOSENESS = 1.6
 """Area of a scatter per robot, in cells: points that are spread evenly do not have to move."""
 _MAX_ROUNDS = 200
@@ -56,13 +57,15 @@ def grid(n: int, cell: Array) -> Layout:
 
 
 def sorted_grid(rows: Sequence[Row], fact: str, cell: Array) -> Layout:
-    """Arrange robots in rows by a fact, smallest first; each row's first value is beside it."""
+    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots."""
     index = {row.uri: i for i, row in enumerate(rows)}
     ordered = sort_rows(rows, fact)
     cells, positions = _cells(len(rows), cell), np.zeros((len(rows), 2))
     positions[[index[row.uri] for row in ordered]] = cells
     labels = []
-    for i in range(0, len(rows), _columns(len(rows), cell)):
+    columns = _columns(len(rows), cell)
+    step = math.ceil(math.ceil(len(rows) / columns) / _MAX_LABELS)
+    for i in range(0, len(rows), step * columns):
         value = getattr(ordered[i], fact)
         text = "unknown" if value is None else f"{value:.3g} {UNITS[fact]}"
         labels.append((text, (float(cells[i, 0] - cell[0]), float(cells[i, 1]))))

@@ -14,7 +14,7 @@ from morphgen.model.geometry import Box, Cylinder, Mesh, Sphere
 from morphgen.model.mesh import load_mesh
 from morphgen.typing import Array
 from morphgen.viewer.population import Population, Prototype, shape_poses
-from morphgen.viewer.scene_robot import SHARP_ANGLE, Rgb, Triangles, triangles
+from morphgen.viewer.scene_robot import SHARP_ANGLE, Rgb, Triangles, batch_colours, triangles
 
 NODE = "/population"
 MAX_FACES = 3000
@@ -68,7 +68,7 @@ def add_population(
             batched_wxyzs=wxyzs[part],
             batched_positions=poses[part, :3, 3],
             batched_scales=instances.scale[part],
-            batched_colors=instances.colour[part],
+            batched_colors=batch_colours(instances.colour[part]),
             lod="auto" if is_mesh else "off",
             cast_shadow=len(population) <= MAX_SHADOWS,
             side="double" if is_mesh else "front",  # some meshes have their faces inside out
@@ -108,7 +108,7 @@ def fade(scene: PopulationScene, selected: NDArray[np.bool_], background: Rgb) -
         colours = np.where(selected[instances.robot][:, None], colours, faded)
     with scene.client.atomic():
         for prototype, part in instances.prototypes.items():
-            scene.handles[prototype].batched_colors = colours[part].astype(np.uint8)
+            scene.handles[prototype].batched_colors = batch_colours(colours[part])
 
 
 def world_poses(population: Population, positions: Array, q: Array) -> NDArray[np.float32]:

@@ -242,6 +242,16 @@ def shape_colour(shape: Shape) -> Rgb:
     return (red, green, blue)
 
 
+def batch_colours(colours: ArrayLike) -> NDArray[np.uint8]:
+    """Return colours (n, 3) for batched meshes, which viser takes as linear, not as sRGB.
+
+    The transfer function is that of IEC 61966-2-1.
+    """
+    share = np.asarray(colours, dtype=np.float64) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.round(255 * linear), dtype=np.uint8)
+
+
 def triangles(geometry: Geometry) -> Triangles:
     """Return the surface of a geometry in its own frame.
 

@@ -10,7 +10,7 @@ import viser
 
 from morphgen.model.geometry import Box
 from morphgen.typing import Array
-from morphgen.viewer.scene_robot import Rgb, triangles
+from morphgen.viewer.scene_robot import Rgb, batch_colours, triangles
 
 BRAND: Rgb = (24, 100, 171)
 """Colour of links, buttons and sliders."""
@@ -103,17 +103,19 @@ def add_scale_bar(
     """
     extent = float((high - low).max())
     length = bar_length(0.3 * extent)
-    width, gap = 0.02 * length + 0.004 * extent, 0.08 * extent
+    width, gap = 0.04 * length + 0.006 * extent, 0.08 * extent
     y = float(low[1]) - gap if direction[1] < 0 else float(high[1]) + gap
     x = float(low[0] + high[0] - length) / 2
     part = length / _BAR_PARTS
-    centres = np.arange(_BAR_PARTS) * part + x + part / 2
+    centres = np.empty((_BAR_PARTS, 3))
+    centres[:, 0] = x + (np.arange(_BAR_PARTS) + 0.5) * part
+    centres[:, 1:] = y, width / 8
     scene.add_batched_meshes_simple(
         "/scale",
         *triangles(Box((part, width, width / 4))),
         batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (_BAR_PARTS, 1)),
-        batched_positions=np.stack([centres, np.full(10, y), np.full(10, width / 8)], axis=1),
-        batched_colors=np.array([_BAR_COLOURS[i % 2] for i in range(_BAR_PARTS)], dtype=np.uint8),
+        batched_positions=centres,
+        batched_colors=batch_colours([_BAR_COLOURS[i % 2] for i in range(_BAR_PARTS)]),
         lod="off",
         cast_shadow=False,
     )

@@ -35,6 +35,7 @@ from morphgen.viewer.population_state import (
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, owned_set, read_robot_uri
 from morphgen.viewer.scene_population import quaternions, world_poses
+from morphgen.viewer.scene_robot import batch_colours
 from morphgen.viewer.scene_robot import robot_bounds as one_robot_bounds
 
 
@@ -100,6 +101,10 @@ def test_quaternions_are_those_of_the_rotations():
     similarity = np.abs((quaternions(poses) * expected).sum(axis=1))
     np.testing.assert_allclose(similarity, 1, atol=1e-6)
     assert quaternions(poses[:0]).shape == (0, 4)
+
+
+def test_batched_meshes_get_linear_colours():
+    assert batch_colours([(0, 128, 255)]).tolist() == [[0, 55, 255]]
 
 
 def test_rows_are_sorted_and_labelled_by_their_first_robot():
