@@ -95,11 +95,6 @@ class ProcessGroup:
         distributed.all_gather_object(values, value)
         return values  # type: ignore[return-value]  # every process has put its value
 
-    def wait(self) -> None:
-        """Wait until all processes are here."""
-        if self.size > 1:
-            distributed.barrier()
-
 
 ALONE = ProcessGroup()
 

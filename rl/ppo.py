@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Mapping
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import torch
@@ -207,13 +208,13 @@ class Learner:
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated
             reward_terms.append({name: term.mean() for name, term in result.terms.items()})
-            final = self._network_input(result.final_observation)
-            final_observations.add(final, result.truncated.to(self.device))
+            final = truncate_links(result.final_observation, self.num_link_rows)
+            final_observations.add(final, result.truncated)
             self._observation = result.observation
             obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
         self.next_observation = {name: value.clone() for name, value in obs.items()}
-        self.final_observations = final_observations.gather()
+        self.final_observations = self._network_input(final_observations.gather())
         metrics = self._rollout_metrics()
         metrics["terms"] = {
             name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
@@ -298,7 +299,7 @@ class Learner:
                 loss, loss_metrics = self._run_loss(obs, minibatch, self._robot_weights())
                 loss.backward()  # type: ignore[no-untyped-call]
                 self.processes.average_gradients(
-                    [*self.actor.parameters(), *self.critic.parameters()]
+                    chain(self.actor.parameters(), self.critic.parameters())
                 )
                 # Apart: a large gradient of the critic shall not shrink the actor's.
                 norms = [

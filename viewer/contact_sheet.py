@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from morphgen.viewer.scene_stage import bar_length
+from morphgen.viewer.scene_stage import bar_length, length_text
 
 _CELL_WIDTH, _PICTURE_HEIGHT, _TEXT_HEIGHT = 1.5, 1.125, 0.36
 """Size of a cell, its picture above its text [inches]."""
@@ -66,8 +66,7 @@ def contact_sheet(title: str, cells: Sequence[Cell], height: float, suffix: str)
             bar = length / height * _PICTURE_HEIGHT
             right, y = width - _BORDER, top - 0.28
             axes.plot((right - bar, right), (y, y), color="black", linewidth=2)
-            text = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-            axes.text(right - bar / 2, y + 0.05, text, fontsize=7, ha="center")
+            axes.text(right - bar / 2, y + 0.05, length_text(length), fontsize=7, ha="center")
         for i, cell in enumerate(cells):
             row, column = divmod(i, columns)
             left = _BORDER + column * _CELL_WIDTH

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import viser
-
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.robot_set import INDEX
-from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.gallery_grid import (
@@ -14,12 +11,11 @@ from morphgen.viewer.gallery_grid import (
     add_controls,
     open_panels,
     passing_rows,
-    show_saved,
 )
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
-from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
+from morphgen.viewer.split_form import ChooseSides, add_split_form
 
 
 def show(session: Session) -> None:
@@ -40,7 +36,8 @@ def show(session: Session) -> None:
     open_panels(gallery, markup.breadcrumbs((folder, None)), header)
     add_controls(gallery)
     add_sheet_buttons(gallery)
-    _add_split_form(gallery)
+    hint = "train: pass the filter; test: do not"
+    add_split_form(session, lambda: _add_choice(gallery), hint)
 
 
 def choose_sides(
@@ -61,37 +58,11 @@ def choose_sides(
     return passing[:num_train], failing[:num_test]
 
 
-def _add_split_form(gallery: Gallery) -> None:
-    """Add controls that make a new split of the robots that pass the filter and the others."""
-    gui, session = gallery.session.client.gui, gallery.session
-    with gui.add_folder("New split", expand_by_default=False):
-        gui.add_html(markup.framed(markup.dim("train: pass the filter; test: do not")))
-        name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", SAVED_REGIMES)
-        task = gui.add_dropdown("task", tuple(TASKS))
-        obstacles = gui.add_checkbox("obstacles", False)
-        num_train = gui.add_number("to train on", 10, min=1, step=1)
-        num_test = gui.add_number("to test on", 1, min=1, step=1)
-        text = gui.add_html("")
-        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-
-    def save() -> None:
-        """Compose the robots in the worker processes, and write the split."""
-        passing = passing_rows(gallery)
-        sides = choose_sides(gallery.rows, passing, num_train.value, num_test.value)
-        train, test = (
-            make_members(
-                rows,
-                task.value,
-                obstacles.value,
-                session.files,
-                session.workers,
-                lambda done, total: session.set_status(f"composing {total} robots", done / total),
-            )
-            for rows in sides
-        )
-        session.set_status("")
-        path = save_split(name.value, regime.value, train, test, session.files)
-        show_saved(session, path, text)
-
-    session.on_change(button, lambda: session.run_in_background(save))
+def _add_choice(gallery: Gallery) -> ChooseSides:
+    """Add the numbers of robots on the sides: those that pass the filter, and the others."""
+    gui = gallery.session.client.gui
+    num_train = gui.add_number("to train on", 10, min=1, step=1)
+    num_test = gui.add_number("to test on", 1, min=1, step=1)
+    return lambda: choose_sides(
+        gallery.rows, passing_rows(gallery), num_train.value, num_test.value
+    )

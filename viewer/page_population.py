@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any, cast
+from typing import Any
 
 import viser
 
@@ -68,10 +68,10 @@ def _load(session: Session, source: Source) -> None:
     def progress(done: int, total: int) -> None:
         session.set_status(f"reading {total} robots", done / total)
 
-    key = f"population {hash(source)}"
-    if key not in session.cache:
-        session.cache[key] = load_population(source, session.files, session.workers, progress)
-    population, faults = cast(tuple[Population, list[tuple[str, str]]], session.cache[key])
+    population, faults = session.cached(
+        f"population {hash(source)}",
+        lambda: load_population(source, session.files, session.workers, progress),
+    )
     if not session.closed.is_set():
         session.enqueue(lambda: _show_population(session, source, population, faults))
 

@@ -1,4 +1,4 @@
-"""What can be done with the selected robots of a population."""
+"""The actions on the selected robots of a population: compare, export, save a split, delete."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ import viser
 from morphgen.benchmark.split import SIDES
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.robot_set import remove_robots
-from morphgen.tasks.registry import TASKS
 from morphgen.viewer.address import Address
-from morphgen.viewer.gallery_grid import show_saved
 from morphgen.viewer.page_compare import MAX_ROBOTS
 from morphgen.viewer.page_population_show import PopulationPage, selected_rows, show_selection
 from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import UriError, owned_set
-from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
+from morphgen.viewer.split_form import ChooseSides, add_split_form
 
 MAX_EXPORT = 200 * 2**20
 """Largest export before compression [bytes]."""
@@ -33,7 +31,7 @@ def add_actions(page: PopulationPage) -> None:
         select = gui.add_button_group("Select", _SELECT)
         compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_LEFT_RIGHT)
         export = gui.add_button("Export bundles (.zip)", icon=viser.Icon.DOWNLOAD)
-        _add_split_form(page)
+        add_split_form(session, lambda: _add_choice(page))
         if _is_owned_set(page):
             delete = gui.add_button("Delete from the set", icon=viser.Icon.TRASH, color="red")
             session.on_change(delete, lambda: _confirm_delete(page))
@@ -99,47 +97,21 @@ def _export(page: PopulationPage) -> None:
     session.set_status("")
 
 
-def _add_split_form(page: PopulationPage) -> None:
-    """Add controls that save a split with the selected robots on one side."""
-    gui, session = page.session.client.gui, page.session
-    with gui.add_folder("New split", expand_by_default=False):
-        name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", SAVED_REGIMES)
-        task = gui.add_dropdown("task", tuple(TASKS))
-        obstacles = gui.add_checkbox("obstacles", False)
-        side = gui.add_dropdown(
-            "selected robots", SIDES, initial_value="test", hint="the others are on the other side"
-        )
-        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-        text = gui.add_html("")
+def _add_choice(page: PopulationPage) -> ChooseSides:
+    """Add the side of the selected robots; the others are on the other side."""
+    side = page.session.client.gui.add_dropdown(
+        "selected robots", SIDES, initial_value="test", hint="the others are on the other side"
+    )
 
-    def save() -> None:
+    def choose_sides() -> tuple[list[Row], list[Row]]:
         chosen = _require_selection(page)
-        if len(chosen) == len(page.population):
+        rows = zip(page.population.rows, page.selected, strict=True)
+        others = [row for row, is_selected in rows if not is_selected]
+        if not others:
             raise BenchmarkError("all robots are selected: none is left for the other side")
-        rows = page.population.rows
+        return (chosen, others) if side.value == "train" else (others, chosen)
 
-        def members(is_selected: bool) -> list[Row]:
-            return [
-                row for row, flag in zip(rows, page.selected, strict=True) if flag == is_selected
-            ]
-
-        sides = {
-            part: make_members(
-                members(part == side.value),
-                task.value,
-                obstacles.value,
-                session.files,
-                session.workers,
-                lambda done, total: session.set_status("composing", done / total),
-            )
-            for part in SIDES
-        }
-        session.set_status("")
-        path = save_split(name.value, regime.value, sides["train"], sides["test"], session.files)
-        show_saved(session, path, text)
-
-    session.on_change(button, lambda: session.run_in_background(save))
+    return choose_sides
 
 
 def _confirm_delete(page: PopulationPage) -> None:

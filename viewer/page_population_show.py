@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 import viser
@@ -86,11 +85,10 @@ def _free_configurations(page: PopulationPage) -> tuple[Array, NDArray[np.bool_]
     def progress(done: int, total: int) -> None:
         session.set_status(f"testing {total} robots for collisions", done / total)
 
-    key = f"free {id(population)}"
-    if key not in session.cache:
-        session.cache[key] = load_free_configurations(population, session.workers, progress)
-        session.set_status("")
-    return cast(tuple[Array, NDArray[np.bool_]], session.cache[key])
+    return session.cached(
+        f"free {id(population)}",
+        lambda: load_free_configurations(population, session.workers, progress),
+    )
 
 
 def _positions(page: PopulationPage) -> population_layout.Layout:
@@ -108,13 +106,11 @@ def _positions(page: PopulationPage) -> population_layout.Layout:
     def progress(done: int, total: int) -> None:
         session.set_status(f"comparing {total} robots", done / total)
 
-    cache_key = f"map {id(page.population)}"
-    if cache_key not in session.cache:
-        session.cache[cache_key] = load_map(
-            page.population, session.files, session.workers, progress
-        )
-        session.set_status("")
-    return population_layout.similarity_map(cast(Array, session.cache[cache_key]), cell)
+    points = session.cached(
+        f"map {id(page.population)}",
+        lambda: load_map(page.population, session.files, session.workers, progress),
+    )
+    return population_layout.similarity_map(points, cell)
 
 
 def _arrangement(page: PopulationPage) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
-from typing import cast
 
 import viser
 
@@ -140,16 +139,15 @@ def _format(value: object) -> str:
 def _study(page: SplitPage) -> None:
     """Study the split in the worker processes, once for all browsers, and show the results."""
     session = page.session
-    key = f"study {split_id(page.split)}"
-    if key not in session.cache:
 
-        def progress(done: int, total: int) -> None:
-            session.set_status(f"comparing {total} robots", done / total)
+    def progress(done: int, total: int) -> None:
+        session.set_status(f"comparing {total} robots", done / total)
 
-        folders = session.files.library_folders
-        session.cache[key] = study_split(page.split, folders, session.workers, progress)
-        session.set_status("")
-    page.study = cast(SplitStudy, session.cache[key])
+    folders = session.files.library_folders
+    page.study = session.cached(
+        f"study {split_id(page.split)}",
+        lambda: study_split(page.split, folders, session.workers, progress),
+    )
     if page.study.statistics:
         table = statistics_table(page.study.statistics)
         page.texts["statistics"].content = markup.framed(table)

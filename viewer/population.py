@@ -27,7 +27,7 @@ from morphgen.viewer.scene_robot import shape_colour
 UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
 """Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""
 Prototype = Box | Cylinder | Sphere | Mesh
-"""What an instance is a scaled copy of."""
+"""Geometry of which instances are scaled copies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +161,12 @@ def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
     return np.asarray(T_root_link[instances.robot, instances.link] @ instances.T_link_shape)
 
 
+def instance_centres(instances: Instances, poses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the centres of the bounding boxes of instances at poses (m, 4, 4), (m, 3) [m]."""
+    turned = (poses[:, :3, :3] @ instances.centre[..., None])[..., 0]
+    return np.asarray(turned + poses[:, :3, 3])
+
+
 def robot_bounds(population: Population, T_root_shape: NDArray[np.float32]) -> Array:
     """Return the bounding boxes of robots in their root frames; the root's origin counts too.
 
@@ -172,9 +178,8 @@ def robot_bounds(population: Population, T_root_shape: NDArray[np.float32]) -> A
         Lowest and highest corners, shape (n, 2, 3) [m].
     """
     instances = population.instances
-    rotation = T_root_shape[:, :3, :3]
-    centre = (rotation @ instances.centre[..., None])[..., 0] + T_root_shape[:, :3, 3]
-    half = (np.abs(rotation) @ instances.size[..., None])[..., 0] / 2
+    centre = instance_centres(instances, T_root_shape)
+    half = (np.abs(T_root_shape[:, :3, :3]) @ instances.size[..., None])[..., 0] / 2
     bounds = np.zeros((len(population), 2, 3))
     np.minimum.at(bounds[:, 0], instances.robot, centre - half)
     np.maximum.at(bounds[:, 1], instances.robot, centre + half)

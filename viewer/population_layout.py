@@ -1,4 +1,4 @@
-"""Where the robots of a population stand: in a grid, by facts, or on the map of similarity."""
+"""Layouts of a population on the ground: grids, scatters of facts, and maps of similarity."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.typing import Array
-from morphgen.viewer.population import Population
+from morphgen.viewer.population import Population, instance_centres
 
 TOLERANCE = 0.008
 """Distance from a robot at which it still counts as hit [heights of the picture]."""
@@ -79,8 +79,7 @@ def project(view: View, population: Population, T_world_shape: NDArray[np.float3
     rows = np.arange(len(order))
     longest, second = instances.size[rows, order[:, 2]], instances.size[rows, order[:, 1]]
     axis = T_world_shape[rows, :3, order[:, 2]]
-    centre = (T_world_shape[:, :3, :3] @ instances.centre[..., None])[..., 0]
-    centre = centre + T_world_shape[:, :3, 3]
+    centre = instance_centres(instances, T_world_shape)
     half = ((longest - second) / 2)[:, None] * axis
     ends, depths = project_points(view, np.stack([centre - half, centre + half], axis=1))
     depth = depths.mean(axis=1)

@@ -14,12 +14,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.similarity import classical_mds
+from morphgen.benchmark.similarity import classical_mds, compared_tokens
 from morphgen.benchmark.split import SIDES
 from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
-from morphgen.benchmark.token_layout import POSITION, default_max_links
-from morphgen.benchmark.tokens import tokens
+from morphgen.benchmark.token_layout import default_max_links
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
@@ -255,8 +254,7 @@ def token_rows(robots: Sequence[Robot], max_links: int, files: FileAccess) -> li
         try:
             source = with_library_meshes(robot, files.library)
             shapes = token_shapes(source, files.library_folders)
-            table = tokens(source, shapes, max_links=max_links)
-            results.append(table[:, : POSITION.start].ravel())
+            results.append(compared_tokens(source, shapes, max_links=max_links).ravel())
         except MorphgenError:
             results.append(None)
     return results

@@ -119,14 +119,18 @@ def add_scale_bar(
         lod="off",
         cast_shadow=False,
     )
-    text = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-    scene.add_label("/scale/label", text, position=(x + length + 0.4 * part, y, 0.0))
+    scene.add_label("/scale/label", length_text(length), position=(x + length + 0.4 * part, y, 0.0))
 
 
 def bar_length(longest: float) -> float:
     """Return the largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ... m that is not above a length [m]."""
     power = 10.0 ** math.floor(math.log10(longest))
     return power * max(factor for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9))
+
+
+def length_text(length: float) -> str:
+    """Return a length [m] in metres or, below one, in centimetres."""
+    return f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
 
 
 def look_at(
@@ -140,7 +144,8 @@ def look_at(
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    across, ahead, up = (corners @ np.stack([right, forward, np.cross(right, forward)]).T).T
+    axes = np.stack([right, forward, np.cross(right, forward)])
+    across, ahead, up = (corners @ axes.T).T
     middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
     tangent = _MARGIN * math.tan(_FOV / 2)
     aspect = min(client.camera.aspect, _MAX_ASPECT)
@@ -148,7 +153,7 @@ def look_at(
         np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
     )
     distance = max(float((distances - (ahead - middle[1])).max()), 0.15)
-    target = middle @ np.stack([right, forward, np.cross(right, forward)])
+    target = middle @ axes
     client.camera.fov = _FOV
     client.camera.position, client.camera.look_at = target - distance * forward, target
     client.camera.near = min(0.01, distance / 50)

@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import msgspec
 import viser
@@ -97,6 +97,18 @@ class Session:
             MorphgenError: If the function raises it, or the process died.
         """
         return self.workers.result(self.workers.submit(work, *arguments))
+
+    def cached(self, key: str, make: Callable[[], T]) -> T:
+        """Return the result of slow work, which is done once for all browsers.
+
+        Args:
+            key: Name of the result.
+            make: Computes it; it may show its progress in the status line.
+        """
+        if key not in self.cache:
+            self.cache[key] = make()
+            self.set_status("")
+        return cast(T, self.cache[key])
 
     def call_later(self, seconds: float, work: Work, key: str) -> None:
         """Enqueue work after a delay; calls of the same key until then are merged into one."""
@@ -242,7 +254,7 @@ def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
 
 @dataclass(frozen=True)
 class Location:
-    """What a browser says about itself."""
+    """The URL and the theme that a browser reports."""
 
     query: str = ""
     """Query of its URL with the question mark; empty if there is none."""

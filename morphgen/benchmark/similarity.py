@@ -58,9 +58,19 @@ def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_
             links.
         RobotError: If a joint axis is zero.
     """
-    table = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
+    table = compared_tokens(robot, shapes, max_links=max_links)
     space = workspace(robot)
     return Features(robot.name, table, labelled_tree(robot, shapes, space.reach), space)
+
+
+def compared_tokens(
+    robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS
+) -> Array:
+    """Return the tokens that ``cosine`` compares, without joint positions, shape (n_links, 32).
+
+    Arguments and errors are those of ``features``.
+    """
+    return tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
 
 
 def cosine(a: Features, b: Features) -> float:

@@ -42,6 +42,7 @@ def new_split(args: argparse.Namespace) -> None:
         )
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)
+    parts = [licenced_parts(split, library) for split in splits]
     data = [
         {
             "file": str(path),
@@ -49,13 +50,13 @@ def new_split(args: argparse.Namespace) -> None:
             "id": split_id(split),
             "train": len(split.train),
             "test": len(split.test),
-            "restricted": [part.as_dict() for part in restricted(licenced_parts(split, library))],
+            "restricted": [part.as_dict() for part in restricted(licenced)],
         }
-        for split, path in zip(splits, paths, strict=True)
+        for split, path, licenced in zip(splits, paths, parts, strict=True)
     ]
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
     lines += _hold_out_notes(splits[-1], library)
-    if limits := restriction_line(licenced_parts(splits[-1], library)):  # of the largest split
+    if limits := restriction_line(parts[-1]):  # of the largest split
         lines.append(f"  {limits}")
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))

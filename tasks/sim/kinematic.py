@@ -10,8 +10,14 @@ import torch
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
 from morphgen.tasks.host import is_host
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
-from morphgen.tasks.sim.motor_law import CONTROL_STEP, LAG, speed_limit
+from morphgen.tasks.sim.base import (
+    Contacts,
+    Scene,
+    Simulator,
+    require_one_worker,
+    require_reset_shapes,
+)
+from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
 from morphgen.typing import Array
 
 UNLIMITED = (-np.inf, np.inf)
@@ -177,7 +183,7 @@ def _joint_table(robots: Sequence[Robot]) -> Array:
             UNLIMITED if joint.is_continuous else joint.limits or UNLIMITED for joint in joints
         ]
         table[1:3, row, : robot.dof] = np.array(limits).reshape(-1, 2).T
-        table[3, row, : robot.dof] = [LAG * speed_limit(joint) for joint in joints]
+        table[3, row, : robot.dof] = farthest_targets(robot, robot.independent_joints)
     return table
 
 
@@ -195,10 +201,7 @@ def _load(
     Raises:
         SimulationError: If a scene has contacts, or there are several workers.
     """
-    if workers != 1:
-        raise SimulationError(
-            f"simulator 'kinematic' steps all environments at once: {workers} workers; expected 1"
-        )
+    require_one_worker("kinematic", workers)
     return KinematicSimulation(scenes, contacts, device=device)
 
 

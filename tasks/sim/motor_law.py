@@ -50,6 +50,11 @@ def speed_limit(joint: Joint) -> float:
     return joint.velocity or (FASTEST_SLIDE if joint.kind == "prismatic" else FASTEST_TURN)
 
 
+def farthest_targets(robot: Robot, joints: Sequence[int]) -> list[float]:
+    """Return the largest distance of some joints from their targets that pulls [rad or m]."""
+    return [LAG * speed_limit(robot.joints[k]) for k in joints]
+
+
 class MotorForces:
     """Force limits of the motors of many robots, so that arms yield under contact.
 
@@ -83,7 +88,7 @@ class MotorForces:
             self._row[: robot.dof, start:end] = [
                 [start + robot.movable_joints.index(k)] for k in robot.independent_joints
             ]
-            farthest.extend(LAG * speed_limit(robot.joints[k]) for k in robot.movable_joints)
+            farthest.extend(farthest_targets(robot, robot.movable_joints))
         self._farthest = np.array(farthest)
 
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.sim.motor_law import CONTROL_STEP, GAIN, LAG, speed_limit
+from morphgen.tasks.sim.motor_law import CONTROL_STEP, GAIN, farthest_targets
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
 from morphgen.tasks.sim.mujoco_state import GatheredArrays
 from morphgen.tasks.sim.short_arrays import clamp
@@ -66,9 +66,8 @@ class PositionControl:
             force, acceleration = self._force[begin:end], self._acceleration[begin:end]
             self._products.append((world.model, env_data, force, acceleration))
             self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
-            self._farthest[i, : world.robot.dof] = [
-                LAG * speed_limit(world.robot.joints[k]) for k in world.robot.independent_joints
-            ]
+            robot = world.robot
+            self._farthest[i, : robot.dof] = farthest_targets(robot, robot.independent_joints)
             matrix, _ = world.robot.mimic_map
             rows, columns = np.nonzero(matrix)
             slots.append(begin + world.movable_qd_at[rows])

@@ -69,10 +69,15 @@ class World:
     def block_pose_in(self, data: mujoco.MjData) -> tuple[Array, Array]:
         """Return views of the block's position (3,) and quaternion (4,) in data of this model."""
         if self.block_moves:
-            at = int(self.model.jnt_qposadr[self.model.body_jntadr[self.block]])
+            at = self.block_q_at
             return data.qpos[at : at + 3], data.qpos[at + 3 : at + 7]
         mocap = int(self.model.body_mocapid[self.block])
         return data.mocap_pos[mocap], data.mocap_quat[mocap]
+
+    @property
+    def block_q_at(self) -> int:
+        """First index in ``qpos`` of the pose of a block that moves."""
+        return int(self.model.jnt_qposadr[self.model.body_jntadr[self.block]])
 
     @property
     def block_qd_at(self) -> int:

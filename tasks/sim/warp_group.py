@@ -12,7 +12,7 @@ from mujoco_warp import Data, OverflowType
 
 from morphgen.tasks.sim import warp_kernels as kernels
 from morphgen.tasks.sim.base import SUBSTEPS
-from morphgen.tasks.sim.motor_law import LAG, speed_limit
+from morphgen.tasks.sim.motor_law import farthest_targets
 from morphgen.tasks.sim.mujoco_model import World
 from morphgen.tasks.sim.warp_model import Structure, dof_leaders, put_model
 
@@ -25,7 +25,7 @@ IGNORED_OVERFLOW = int(OverflowType.EPA_HORIZON | OverflowType.CONTACT_MATCH)
 
 
 class Group:
-    """Environments of one structure: a model, the data of its worlds, and a graph of a step."""
+    """Environments of one structure: a model, and the data of its worlds."""
 
     def __init__(
         self, structure: Structure, number: int, device: str, buffers: dict[str, wp.array]
@@ -38,8 +38,7 @@ class Group:
             device: Name of the device of Warp.
             buffers: Arrays of all environments, see ``WarpSimulation``.
         """
-        self._buffers, self._number, self._device = buffers, number, device
-        self.worlds, self.envs = structure.worlds, structure.envs
+        self._buffers, self._number = buffers, number
         first = structure.worlds[0]
         model = first.model
         count = len(structure.envs)
@@ -199,21 +198,19 @@ def _joints(structure: Structure) -> kernels.Joints:
     joints.dof_offset = _array([offset for _, _, offset in leaders], float)
     joints.compliance = _array([1 / world.model.actuator_gainprm[:, 0] for world in rows], float)
     joints.farthest = _array(
-        [[LAG * speed_limit(w.robot.joints[k]) for k in w.robot.independent_joints] for w in rows],
-        float,
+        [farthest_targets(world.robot, world.robot.independent_joints) for world in rows], float
     )
     return joints
 
 
 def _things(world: World) -> kernels.Things:
     """Return the block and the obstacles of a structure."""
-    model, things = world.model, kernels.Things()
+    things = kernels.Things()
     things.block_q_at, things.block_qd_at, things.block_mocap = -1, 0, -1
     if world.block is not None and world.block_moves:
-        things.block_q_at = int(model.jnt_qposadr[model.body_jntadr[world.block]])
-        things.block_qd_at = world.block_qd_at
+        things.block_q_at, things.block_qd_at = world.block_q_at, world.block_qd_at
     elif world.block is not None:
-        things.block_mocap = int(model.body_mocapid[world.block])
+        things.block_mocap = int(world.model.body_mocapid[world.block])
     things.obstacles = _array(world.obstacles, int)
     return things
 

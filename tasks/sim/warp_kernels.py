@@ -55,6 +55,23 @@ class Things:
     """Indices in ``mocap_pos`` of the obstacles."""
 
 
+@wp.func
+def _law(
+    joints: Joints,
+    targets: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    world: int,
+    joint: int,
+) -> wp.vec2:
+    """Return the error of an independent joint, and the law's mean acceleration in the step."""
+    farthest = joints.farthest[world % joints.farthest.shape[0], joint]
+    error = targets[joints.env[world], joint] - qpos[world, joints.q_at[joint]]
+    error = wp.clamp(error, -farthest, farthest)
+    mean = _BY_ERROR * error + _BY_VELOCITY * qvel[world, joints.qd_at[joint]]
+    return wp.vec2(error, mean)
+
+
 @wp.kernel
 def accelerations(
     joints: Joints,
@@ -73,12 +90,8 @@ def accelerations(
     joint = joints.dof_leader[dof]
     value = float(0.0)
     if joint >= 0:
-        row = world % joints.farthest.shape[0]
-        farthest = joints.farthest[row, joint]
-        error = targets[joints.env[world], joint] - qpos[world, joints.q_at[joint]]
-        velocity = qvel[world, joints.qd_at[joint]]
-        mean = _BY_ERROR * wp.clamp(error, -farthest, farthest) + _BY_VELOCITY * velocity
-        value = joints.dof_gain[world % joints.dof_gain.shape[0], dof] * mean
+        law = _law(joints, targets, qpos, qvel, world, joint)
+        value = joints.dof_gain[world % joints.dof_gain.shape[0], dof] * law[1]
     acceleration[world, dof] = value
     applied[world, dof] = damping[world % damping.shape[0], dof] * qvel[world, dof]
 
@@ -114,18 +127,13 @@ def controls(
         if joints.dof_leader[dof] == joint:
             gain = joints.dof_gain[world % joints.dof_gain.shape[0], dof]
             missing += gain * (force[world, dof] + bias[world, dof] - weight[world, dof])
-    row = world % joints.farthest.shape[0]
-    q = qpos[world, joints.q_at[joint]]
-    qd = qvel[world, joints.qd_at[joint]]
-    farthest = joints.farthest[row, joint]
-    error = wp.clamp(targets[joints.env[world], joint] - q, -farthest, farthest)
-    mean = _BY_ERROR * error + _BY_VELOCITY * qd
+    law = _law(joints, targets, qpos, qvel, world, joint)
     control[world, joint] = (
-        missing * joints.compliance[row, joint]
-        + q
-        + error
-        - _PASSIVE_LEAD * qd
-        - _PER_ACCELERATION * mean
+        missing * joints.compliance[world % joints.compliance.shape[0], joint]
+        + qpos[world, joints.q_at[joint]]
+        + law[0]
+        - _PASSIVE_LEAD * qvel[world, joints.qd_at[joint]]
+        - _PER_ACCELERATION * law[1]
     )
 
 

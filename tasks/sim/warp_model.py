@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import mujoco
@@ -33,6 +33,20 @@ class Structure:
     """Rows of the fields of the model that differ, R rows each."""
 
 
+@dataclass
+class _Group:
+    """A structure while its environments are collected."""
+
+    first: World
+    """Compiled scene with which the others are compared."""
+    size: int = 0
+    """Number of different compiled scenes."""
+    batched: dict[str, None] = field(default_factory=dict)
+    """Names of the fields in which they differ."""
+    envs: list[int] = field(default_factory=list)
+    """Environments."""
+
+
 def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
     """Group environments by the structure of their models.
 
@@ -48,31 +62,31 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
         SimulationError: If MuJoCo Warp does not support a model.
     """
     models: dict[int, Model] = {}
-    groups: list[tuple[World, dict[int, World], list[int]]] = []
-    group_of_world: dict[int, int] = {}
+    groups: list[_Group] = []
+    group_of_world: dict[int, _Group] = {}
     for env, world in enumerate(compiled):
         if id(world) not in group_of_world:
-            models[id(world)] = _warp_model(world, scenes[env])
-            model = models[id(world)]
-            for number, (first, members, _) in enumerate(groups):
-                if not _structural(_differences(models[id(first)], model)) and _same_indices(
-                    first, world
-                ):
-                    members[id(world)] = world
-                    group_of_world[id(world)] = number
+            models[id(world)] = model = _warp_model(world, scenes[env])
+            for group in groups:
+                names = _differences(models[id(group.first)], model)
+                if all(map(_is_batched, names)) and _same_indices(group.first, world):
+                    group.batched.update(dict.fromkeys(names))
                     break
             else:
-                group_of_world[id(world)] = len(groups)
-                groups.append((world, {id(world): world}, []))
-        groups[group_of_world[id(world)]][2].append(env)
-    return [
-        Structure(
-            rows := _cyclic_rows([compiled[env] for env in envs], len(members)),
-            np.array(envs, dtype=np.int64),
-            _batched([models[id(world)] for world in rows]),
-        )
-        for _, members, envs in groups
-    ]
+                group = _Group(world)
+                groups.append(group)
+            group.size += 1
+            group_of_world[id(world)] = group
+        group_of_world[id(world)].envs.append(env)
+    found = []
+    for group in groups:
+        rows = _cyclic_rows([compiled[env] for env in group.envs], group.size)
+        batched = {
+            name: np.concatenate([getattr(models[id(world)], name).numpy() for world in rows])
+            for name in group.batched
+        }
+        found.append(Structure(rows, np.array(group.envs, dtype=np.int64), batched))
+    return found
 
 
 def put_model(structure: Structure, device: str) -> Model:
@@ -120,7 +134,7 @@ def _is_batched(name: str) -> bool:
     return getattr(spec, "shape", ("",))[:1] == ("*",)
 
 
-_FIELDS: dict[str, Any] = {field.name: field.type for field in fields(Model)}
+_FIELDS: dict[str, Any] = {f.name: f.type for f in fields(Model)}
 
 
 def _differences(first: Model, other: Model) -> list[str]:
@@ -130,11 +144,6 @@ def _differences(first: Model, other: Model) -> list[str]:
         for name in _FIELDS
         if name not in UNUSED and not _equal(getattr(first, name), getattr(other, name))
     ]
-
-
-def _structural(names: Sequence[str]) -> list[str]:
-    """Return the fields that are not batched."""
-    return [name for name in names if not _is_batched(name)]
 
 
 def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
@@ -187,14 +196,3 @@ def _cyclic_rows(worlds: Sequence[World], distinct: int) -> tuple[World, ...]:
     if all(world is rows[i % len(rows)] for i, world in enumerate(worlds)):
         return rows
     return tuple(worlds)
-
-
-def _batched(models: Sequence[Model]) -> dict[str, NDArray[Any]]:
-    """Return the rows of all fields in which some models differ."""
-    distinct = list({id(model): model for model in models}.values())
-    names = dict.fromkeys(
-        name for model in distinct[1:] for name in _differences(distinct[0], model)
-    )
-    return {
-        name: np.concatenate([getattr(model, name).numpy() for model in models]) for name in names
-    }

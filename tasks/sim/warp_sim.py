@@ -15,7 +15,13 @@ except ModuleNotFoundError as error:
     raise MissingDependencyError(
         f"simulator 'warp' needs MuJoCo Warp: {error}; install it with: pip install 'morphgen[gpu]'"
     ) from error
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
+from morphgen.tasks.sim.base import (
+    Contacts,
+    Scene,
+    Simulator,
+    require_one_worker,
+    require_reset_shapes,
+)
 from morphgen.tasks.sim.mujoco_model import World, worlds
 from morphgen.tasks.sim.warp_group import Group
 from morphgen.tasks.sim.warp_model import structures
@@ -105,11 +111,9 @@ class WarpSimulation:
         with wp.ScopedDevice(name):
             self._no_poses = wp.zeros((n, 0, 7), dtype=float)
             self._poses = wp.from_torch(self._obstacle_poses) if most else self._no_poses
-        self._go_home(compiled)
         self._streams = _Streams(name, self._groups) if self.device.type == "cuda" else None
-        if self._streams is not None:  # capturing ran steps
-            self._go_home(compiled)
-        self.counts.zero_()
+        self._go_home(compiled)
+        self.counts.zero_()  # capturing ran steps
 
     def reset(
         self,
@@ -170,19 +174,15 @@ class WarpSimulation:
 
     def _go_home(self, compiled: Sequence[World]) -> None:
         """Reset all environments to the home positions and to the poses of their scenes."""
-        everything = torch.ones_like(self._mask, dtype=torch.bool)
-        q, block = torch.zeros_like(self.q), torch.zeros_like(self.block_pose)
-        poses = torch.zeros_like(self._obstacle_poses)
-        rows = [torch.zeros(tensor.shape) for tensor in (q, block, poses)]
+        buffers = (self.q, self.block_pose, self._obstacle_poses)
+        q, block, poses = (torch.zeros(buffer.shape) for buffer in buffers)
         for env, (scene, world) in enumerate(zip(self.scenes, compiled, strict=True)):
-            rows[0][env, : world.robot.dof] = torch.tensor(world.robot.home)
-            if scene.block is not None:
-                pose = scene.block.pose
-                rows[1][env] = torch.tensor((*pose.position, *pose.quaternion))
-            for k, obstacle in enumerate(scene.obstacles):
-                pose = obstacle.pose
-                rows[2][env, k] = torch.tensor((*pose.position, *pose.quaternion))
-        q, block, poses = (row.to(self.device) for row in rows)
+            q[env, : world.robot.dof] = torch.tensor(world.robot.home)
+            boxes = [] if scene.block is None else [(block[env], scene.block)]
+            for row, box in (*boxes, *zip(poses[env], scene.obstacles, strict=False)):
+                row[:] = torch.tensor((*box.pose.position, *box.pose.quaternion))
+        q, block, poses = (rows.to(self.device) for rows in (q, block, poses))
+        everything = torch.ones_like(self._mask, dtype=torch.bool)
         self.reset(everything, q, block, poses if poses.shape[1] else None)
 
     def _on_torch_stream(self) -> wp.ScopedStream | wp.ScopedDevice:
@@ -238,10 +238,7 @@ def _load(
     Raises:
         SimulationError: If there are several workers.
     """
-    if workers != 1:
-        raise SimulationError(
-            f"simulator 'warp' steps all environments at once: {workers} workers; expected 1"
-        )
+    require_one_worker("warp", workers)
     return WarpSimulation(scenes, contacts, device=device)
 
 
