@@ -39,6 +39,7 @@ from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.sim.warp_group import Group
 from morphgen.tasks.sim.warp_sim import WarpSimulation
+from morphgen.tasks.step_graph import StepGraph
 
 SPLITS = (
     "interpolation/arm3/reach",
@@ -116,13 +117,14 @@ def _physics(split: str, envs: int, device: str) -> Row:
     assert isinstance(simulation, WarpSimulation)
     start_up = time.perf_counter() - began
     actions = _actions(batch)
+    graph = StepGraph(batch)  # as the learner steps
     batch.reset()
     q, block = simulation.q.clone(), simulation.block_pose.clone()
     poses = batch.layouts.poses if batch.layouts.any else None
     targets: list[torch.Tensor] = []
 
     def act(step: int) -> None:
-        batch.step(actions[step])
+        graph(actions[step])
 
     for step in range(STEPS + WARM_UP):
         act(step)
@@ -233,8 +235,9 @@ def _robots(grammar: str, number: int, envs: int, device: str) -> Row:
     simulation = batch.simulation
     assert isinstance(simulation, WarpSimulation)
     actions = _actions(batch)
+    graph = StepGraph(batch)
     batch.reset()
-    speed = _steps_per_second(lambda step: batch.step(actions[step]), envs)
+    speed = _steps_per_second(lambda step: graph(actions[step]), envs)
     free, total = torch.cuda.mem_get_info()
     batch.close()
     return {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 from torch import nn
@@ -12,7 +14,7 @@ from morphgen.rl.agents.encoder import Network
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
 from morphgen.rl.normalizer import RunningNormalizer
-from morphgen.rl.observation_layout import Layout, last_link
+from morphgen.rl.observation_layout import Layout, absent_entries, last_link
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import Observation
@@ -96,10 +98,16 @@ def make_networks(config: PolicyConfig, layout: Layout, seed: int) -> tuple[Acto
 def rows_needed(config: PolicyConfig, observation: Observation) -> int:
     """Return how many rows of links the networks need.
 
-    A network that does not need all links gets those up to the last one that some robot has: the
-    others would not change its outputs, and would take time.
+    A network that does not need all entries gets the rows up to the last one that some robot has:
+    the others would not change its outputs, and would take time.
     """
-    network: type[Network] = AGENTS[config.agent].network
-    if network.needs_all_links:
+    if AGENTS[config.agent].network.needs_all_entries:
         return observation["links"].shape[1]
     return last_link(observation)
+
+
+def entries_unneeded(config: PolicyConfig, tasks: Collection[str]) -> frozenset[str]:
+    """Return the entries of observations that the networks do not need, as no task fills them."""
+    if AGENTS[config.agent].network.needs_all_entries:
+        return frozenset()
+    return absent_entries(tasks)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from itertools import chain
 
@@ -27,9 +27,10 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.distributed import ALONE, ProcessGroup, merged_metrics
 from morphgen.rl.final_observations import FinalObservations
 from morphgen.rl.heads import joint_entropy
+from morphgen.rl.learning_rate import next_actor_lr_scale
 from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
 from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
-from morphgen.rl.policies import make_networks, rows_needed
+from morphgen.rl.policies import entries_unneeded, make_networks, rows_needed
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
@@ -38,10 +39,6 @@ from morphgen.tasks.step_graph import StepGraph, can_record
 LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
 """Metrics of a gradient step; see ``UpdateMetrics``."""
-KL_FACTOR = 1.2
-"""Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
-MIN_ACTOR_LR_SCALE = 0.01
-"""Smallest factor on the actor's learning rate, so that it rises again soon (rsl_rl: 1e-5/1e-3)."""
 
 
 class Learner:
@@ -56,6 +53,7 @@ class Learner:
         seed: int = 0,
         device: torch.device | str = "cpu",
         least_links: int = 0,
+        tasks: Collection[str] = (),
         processes: ProcessGroup = ALONE,
     ) -> None:
         """Build networks, optimiser and buffers, and begin episodes in the batch.
@@ -67,6 +65,7 @@ class Learner:
             seed: Seed of weights, actions, minibatches and random weights of robots.
             device: Device of networks and rollouts; the batch may be on another.
             least_links: Links of the largest robot of later batches; see ``use_batch``.
+            tasks: Tasks of later batches.
             processes: Processes that train together; each has its own environments.
 
         Raises:
@@ -84,6 +83,7 @@ class Learner:
         observation = self._current_observation()
         self.layout = layout_of(observation)
         self.num_link_rows = max(rows_needed(policy, observation), least_links)
+        self._unneeded = entries_unneeded(policy, {*tasks, *(spec.task for spec in batch.specs)})
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
         if processes.rank:  # the same networks, but other actions and minibatches
@@ -163,7 +163,8 @@ class Learner:
         """Continue in the environments of a batch, where all begin new episodes."""
         self.batch = batch
         self.env_robot_index = batch.env_robot_index.to(self.device)
-        self.num_robots = int(batch.env_robot_index.max()) + 1
+        self._envs_of_robots = torch.bincount(batch.env_robot_index).cpu().numpy()
+        self.num_robots = len(self._envs_of_robots)
         self._step_graph = StepGraph(batch) if can_record(batch) else None
         self.restart_episodes()
 
@@ -182,10 +183,14 @@ class Learner:
             self._observation = self.batch.observe()
         return self._observation
 
+    def _needed(self, observation: Observation) -> Observation:
+        """Return the entries and the rows of links that the networks need."""
+        entries = {name: observation[name] for name in observation if name not in self._unneeded}
+        return truncate_links(entries, self.num_link_rows)
+
     def _network_input(self, observation: Observation) -> Observation:
-        """Return an observation with the rows of links that the networks need, on their device."""
-        needed = truncate_links(observation, self.num_link_rows)
-        return {name: value.to(self.device) for name, value in needed.items()}
+        """Return what the networks need of an observation, on their device."""
+        return {name: value.to(self.device) for name, value in self._needed(observation).items()}
 
     @torch.no_grad()
     def _collect_rollout(self) -> Metrics:
@@ -208,35 +213,46 @@ class Learner:
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated
             reward_terms.append({name: term.mean() for name, term in result.terms.items()})
-            final = truncate_links(result.final_observation, self.num_link_rows)
-            final_observations.add(final, result.truncated)
+            final_observations.add(self._needed(result.final_observation), result.truncated)
             self._observation = result.observation
             obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
         self.next_observation = {name: value.clone() for name, value in obs.items()}
         self.final_observations = self._network_input(final_observations.gather())
-        metrics = self._rollout_metrics()
-        metrics["terms"] = {
-            name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
+        terms = {
+            name: torch.stack([means[name] for means in reward_terms]).mean()
             for name in reward_terms[0]
         }
-        return merged_metrics(self.processes.gather(metrics))
+        return merged_metrics(self.processes.gather(self._rollout_metrics(terms)))
 
-    def _rollout_metrics(self) -> Metrics:
-        """Return rewards and scores of the rollout, and counts of the episodes that ended in it."""
+    def _rollout_metrics(self, terms: Mapping[str, torch.Tensor]) -> Metrics:
+        """Return rewards and scores of the rollout, and counts of the episodes that ended in it.
+
+        Args:
+            terms: Mean of each reward term, shape ().
+        """
         ended = self.terminated | self.truncated
-        robots, num_robots = self.batch.env_robot_index, self.num_robots
+        episodes = ended.sum()
         env_scores = self.scores.mean(dim=0)
-        num_envs = torch.bincount(robots, minlength=num_robots)
-        robot_scores = torch.zeros(num_robots, device=robots.device)
-        robot_scores.index_add_(0, robots, env_scores)
+        robot_scores = torch.zeros(self.num_robots, device=env_scores.device)
+        robot_scores.index_add_(0, self.batch.env_robot_index, env_scores)
+        numbers = {
+            "reward": self.rewards.mean(),
+            "score": env_scores.mean(),
+            "success": (self.successes & ended).sum() / episodes,
+            "episodes": episodes,
+            "unstable": self.diverged.sum(),
+            **terms,
+        }
+        # One copy from the device instead of one for each number.
+        values = torch.cat([torch.stack([*numbers.values()]), robot_scores]).tolist()
+        read = dict(zip(numbers, values, strict=False))
+        scores = np.array(values[len(numbers) :]) / self._envs_of_robots
         return {
-            "reward": float(self.rewards.mean()),
-            "score": float(env_scores.mean()),
-            "scores": tuple((robot_scores / num_envs).tolist()),
-            "success": float(self.successes[ended].float().mean()),
-            "episodes": int(ended.sum()),
-            "unstable": int(self.diverged.sum()),
+            **{name: read[name] for name in ("reward", "score", "success")},
+            **{name: int(read[name]) for name in ("episodes", "unstable")},
+            "scores": tuple(scores.tolist()),
+            "terms": {name: read[name] for name in terms},
         }
 
     @torch.no_grad()
@@ -366,21 +382,6 @@ def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip_coef: flo
     ratio = log_ratio.exp()
     clipped_ratio = ratio.clamp(1 - clip_coef, 1 + clip_coef)
     return -torch.minimum(ratio * advantage, clipped_ratio * advantage)
-
-
-def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
-    """Return the factor on the actor's learning rate in the next update.
-
-    Args:
-        config: The algorithm; without a ``desired_kl`` the factor is 1.
-        scale: Factor in the last update.
-        kl: Mean divergence of the last update's gradient steps [nats].
-    """
-    if not config.desired_kl:
-        return 1.0
-    if kl > config.desired_kl:
-        return max(scale / KL_FACTOR, MIN_ACTOR_LR_SCALE)
-    return min(scale * KL_FACTOR, 1.0)
 
 
 @torch.no_grad()

@@ -265,6 +265,7 @@ def _learner(
             seed=config.seed,
             device=device,
             least_links=batches.most_links,
+            tasks=batches.tasks,
             processes=processes,
         )
         if state:

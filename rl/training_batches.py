@@ -79,6 +79,7 @@ class TrainingBatches:
     Attributes:
         drawn: The robots drawn from grammars; None for other sources.
         most_links: Number of links of the largest robot.
+        tasks: Names of the tasks of all robots.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class TrainingBatches:
             links = len(spec.robot.links)
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
         self.most_links = max(len(spec.robot.links) for spec in self._specs)
+        self.tasks = {spec.task for spec in self._specs}
         self._channels = config.interface.channels
         if config.slice_updates:
             joints = max(num_actuated(spec.robot, spec.task) for spec in self._specs)

@@ -32,8 +32,9 @@ likely and values near zero."""
 class Network(nn.Module, ABC):
     """A network from observations to numbers: for each link (actor), or one row (critic)."""
 
-    needs_all_links = True
-    """Whether the network needs all rows of links; otherwise rows that no robot uses are cut."""
+    needs_all_entries = True
+    """Whether the network needs all rows of links, and goal, object and line for every task;
+    otherwise rows and entries that no environment uses are left out."""
     logit_scale = 1.0
     """Factor on the actor's logits."""
     shares_joints = False
@@ -63,7 +64,8 @@ class Entities(nn.Module):
 
     The tool's position is part of the goal's and of the object's vector, so that the distance left
     is a difference of numbers within one vector. Without ``links`` only the other entities are
-    encoded, for networks that encode links in their own way.
+    encoded, for networks that encode links in their own way. Entities that an observation lacks
+    are left out.
     """
 
     def __init__(
@@ -106,6 +108,8 @@ class Entities(nn.Module):
         entries = self._entries(observation)
         vectors, masks = [], []
         for name, kind in zip(self.kinds, self.kind, strict=True):
+            if name not in entries:
+                continue
             values, mask = entries[name]
             visible = torch.where(mask[..., None], values, 0.0)
             vectors.append(torch.where(mask[..., None], self.project[name](visible) + kind, 0.0))
@@ -113,18 +117,19 @@ class Entities(nn.Module):
         return torch.cat(vectors, dim=1), torch.cat(masks, dim=1)
 
     def _entries(self, observation: Observation) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Return values (n, k, size) and masks (n, k) of each kind."""
+        """Return values (n, k, size) and masks (n, k) of each kind that the observation has."""
         tool = [observation["tool"]] if self.tool else []
-        reach, push = observation["goal_mask"][:, None], observation["object_mask"][:, None]
         entries = {
-            "goal": (torch.cat([observation["goal"], *tool], dim=-1)[:, None], reach),
-            "object": (torch.cat([observation["object"], *tool], dim=-1)[:, None], push),
-            "line": (observation["line"][:, None], push),
-            **{
-                f"field{i}": (observation[name][:, None], observation[mask][:, None])
-                for i, (name, _, mask) in enumerate(self.fields)
-            },
+            f"field{i}": (observation[name][:, None], observation[mask][:, None])
+            for i, (name, _, mask) in enumerate(self.fields)
         }
+        if "goal" in observation:
+            goal = torch.cat([observation["goal"], *tool], dim=-1)
+            entries["goal"] = (goal[:, None], observation["goal_mask"][:, None])
+        if "object" in observation:
+            block = torch.cat([observation["object"], *tool], dim=-1)
+            entries["object"] = (block[:, None], observation["object_mask"][:, None])
+            entries["line"] = (observation["line"][:, None], observation["object_mask"][:, None])
         if "links" in self.project:
             extra = [observation[name][..., None] for name in self.channels]
             extra += [observation[name] for name in self.vectors]

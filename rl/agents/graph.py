@@ -63,7 +63,7 @@ class Config(NetworkConfig):
 class Network(encoder.Network):
     """Joints attend to each other and to what is around them; one head reads every joint."""
 
-    needs_all_links = False
+    needs_all_entries = False
     shares_joints = True
 
     def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:

@@ -51,7 +51,7 @@ class Config(NetworkConfig):
 class Network(encoder.Network):
     """Entities attend to each other; a small MLP reads each link, or the mean of all links."""
 
-    needs_all_links = False
+    needs_all_entries = False
 
     def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:
         super().__init__(config, layout, outputs, per_link)

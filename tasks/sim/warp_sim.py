@@ -189,7 +189,7 @@ class WarpSimulation:
         """Return a context in which Warp launches its kernels after those of torch."""
         if self.device.type == "cpu":
             return wp.ScopedDevice("cpu")
-        return wp.ScopedStream(wp.stream_from_torch(self.device))
+        return wp.ScopedStream(wp.stream_from_torch(self.device), sync_enter=False)
 
     def _require_open(self) -> None:
         if not self._groups:

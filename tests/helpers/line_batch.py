@@ -22,6 +22,7 @@ class OnALine:
 
     def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12, tree=False):
         self.tree = tree
+        self.specs = [SimpleNamespace(task=task) for task in ("reach", "push")]
         self.num_envs, self.action_kind, self.horizon = num_envs, kind, horizon
         self.device = torch.device("cpu")
         self.env_robot_index = torch.arange(num_envs) % 2

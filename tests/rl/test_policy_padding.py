@@ -20,7 +20,7 @@ from helpers.observations import (
 )
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.observation_layout import pad_links, truncate_links
-from morphgen.rl.policies import rows_needed
+from morphgen.rl.policies import entries_unneeded, rows_needed
 
 
 @agents
@@ -115,6 +115,32 @@ def test_the_transformer_acts_and_learns_the_same_without_unused_rows(discrete):
         found.append([actions, probable, head.entropy(), value, *gradients])
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@kinds
+@pytest.mark.parametrize("agent", ["me-tf", "me-graph"])
+def test_entries_that_no_task_fills_are_left_out_and_change_nothing(agent, discrete):
+    seen = {**observed(), "object_mask": torch.zeros(N, dtype=torch.bool)}
+    unneeded = entries_unneeded(PolicyConfig(agent), {"reach"})
+    assert unneeded == {"object", "object_mask", "line"}
+    less = {name: value for name, value in seen.items() if name not in unneeded}
+    found = []
+    for needed in (seen, less):
+        actor, critic = networks(agent, seen, discrete=discrete)
+        _, log_prob, value = outputs(actor, critic, needed)
+        (log_prob + value).sum().backward()
+        weights = (*actor.parameters(), *critic.parameters())
+        found.append(
+            [log_prob, value, *(w.grad for w in weights if w.grad is not None and w.grad.any())]
+        )
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_entries_are_left_out_only_if_no_task_fills_them():
+    assert entries_unneeded(PolicyConfig("me-tf"), {"push"}) == {"goal", "goal_mask"}
+    assert not entries_unneeded(PolicyConfig("me-tf"), {"push", "reach"})
+    assert not entries_unneeded(PolicyConfig("me-mlp"), {"reach"})
 
 
 @pytest.mark.parametrize("agent", ["se", "me-mlp"])

@@ -12,13 +12,11 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.learning_rate import KL_FACTOR, MIN_ACTOR_LR_SCALE, next_actor_lr_scale
 from morphgen.rl.metrics import explained_variance
 from morphgen.rl.ppo import (
-    KL_FACTOR,
-    MIN_ACTOR_LR_SCALE,
     Learner,
     ema_update,
-    next_actor_lr_scale,
     policy_loss,
 )
 from morphgen.rl.symlog import symlog
@@ -94,17 +92,18 @@ def test_explained_variance_by_hand():
 def test_the_metrics_of_a_rollout_by_hand():
     true, false = True, False
     trainer = learner(OnALine(3), num_steps=2, minibatches=1)
-    trainer.batch.env_robot_index, trainer.num_robots = torch.tensor([1, 0, 1]), 3
+    trainer.batch.env_robot_index = torch.tensor([1, 0, 1])
+    trainer.use(trainer.batch)
     trainer.rewards[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     trainer.scores[:] = torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]])
     trainer.successes[:] = torch.tensor([[true, true, false], [false, false, true]])
     trainer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
     trainer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
     trainer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
-    metrics = trainer._rollout_metrics()
+    metrics = trainer._rollout_metrics({"one": torch.tensor(0.5)})
+    assert metrics["terms"] == {"one": 0.5}
     assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
-    assert metrics["scores"][:2] == (2.0, 2.0)
-    assert math.isnan(metrics["scores"][2])
+    assert metrics["scores"] == (2.0, 2.0)
     assert (metrics["success"], metrics["episodes"], metrics["unstable"]) == (0.5, 4, 1)
 
 

@@ -26,6 +26,7 @@ from morphgen.tasks.step_graph import StepGraph
 
 IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
 DIFFERENT = ("arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims", "chain beads=2")
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
 
 def simulation(scenes, contacts=None):
@@ -55,15 +56,17 @@ def arms():
     ]
 
 
-def test_joints_are_within_a_milliradian_of_mujoco_after_a_second_without_contact():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_gpu)])
+def test_joints_are_within_a_milliradian_of_mujoco_after_a_second_without_contact(device):
     scenes = [Scene(robot(words), ground=None) for words in DIFFERENT]
-    ours, mujoco = simulation(scenes, IN_FREE_SPACE), MujocoSimulation(scenes, IN_FREE_SPACE)
-    assert torch.equal(ours.q, mujoco.q)
+    ours = WarpSimulation(scenes, IN_FREE_SPACE, device=device)
+    mujoco = MujocoSimulation(scenes, IN_FREE_SPACE)
+    assert torch.equal(ours.q.cpu(), mujoco.q)
     home = ours.q.clone()
     for targets in walks(scenes, ours.q.shape[1]):
-        assert not ours.step(targets).any()
+        assert not ours.step(targets.to(device)).any()
         mujoco.step(targets)
-    assert (ours.q - mujoco.q).abs().max() < 1e-3
+    assert (ours.q.cpu() - mujoco.q).abs().max() < 1e-3
     assert (ours.q - home).abs().amax(dim=1).min() > 0.05
     assert ours.counts.tolist() == [[0, 0]] * len(DIFFERENT)
     ours.close()
@@ -280,7 +283,7 @@ def test_a_batch_has_the_episodes_and_nearly_the_steps_of_mujoco(task):
     assert (one.q - two.q).abs().max() < 5e-3
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@needs_gpu
 def test_recorded_steps_on_a_gpu_are_those_of_the_batch():
     """Graphs of a step give what the same calls give without them, also where episodes end."""
     batches = [
@@ -296,14 +299,3 @@ def test_recorded_steps_on_a_gpu_are_those_of_the_batch():
         assert torch.equal(one.truncated, two.truncated)
         assert torch.allclose(one.observation["tokens"], two.observation["tokens"], atol=1e-3)
         assert torch.equal(one.observation["goal"], two.observation["goal"])
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_a_gpu_moves_joints_as_the_cpu_does():
-    scenes = [Scene(robot(words), ground=None) for words in DIFFERENT]
-    on_gpu = WarpSimulation(scenes, IN_FREE_SPACE, device="cuda")
-    on_cpu = simulation(scenes, IN_FREE_SPACE)
-    for targets in walks(scenes, on_cpu.q.shape[1]):
-        on_gpu.step(targets.cuda())
-        on_cpu.step(targets)
-    assert (on_gpu.q.cpu() - on_cpu.q).abs().max() < 1e-3
