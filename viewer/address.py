@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from urllib.parse import parse_qsl, quote, urlencode
 
@@ -22,6 +22,12 @@ MAX_UNPACKED = 200_000
 """Longest text that is unpacked [bytes], so that a short address cannot fill the memory."""
 ROBOT = "robot"
 """Key of the page of a robot, and on the page ``play`` the key of each robot of the rollout."""
+CHOSEN = "chosen"
+"""Key of the page of chosen robots, and on other pages the key of each robot in the tray."""
+MAX_COMPARED, MAX_PLAYED = 4, 9
+"""Robots that are compared, and that do a task, at once."""
+MAX_CHOSEN = 3000
+"""Longest URIs of all chosen robots together, as the address writes them [characters]."""
 
 
 class AddressError(MorphgenError):
@@ -40,6 +46,8 @@ class Address:
     """Sort order, filter, joint positions, ... by key; default values are left out."""
     robots: tuple[str, ...] = ()
     """URIs of the robots of a rollout (page ``play`` only)."""
+    chosen: tuple[str, ...] = ()
+    """URIs of the robots in the tray; on the page ``chosen`` they are the subjects."""
 
     @property
     def subject(self) -> str:
@@ -51,8 +59,8 @@ class Address:
         """The query of the URL, with its question mark."""
         robots = ((ROBOT, robot) for robot in self.robots)
         subjects = ((self.page, subject) for subject in self.subjects)
-        pairs = [*subjects, *robots, *self.state.items()]
-        return "?" + urlencode(pairs, quote_via=quote, safe="/=:,@+")
+        chosen = ((CHOSEN, uri) for uri in self.chosen)
+        return "?" + _encode([*subjects, *robots, *self.state.items(), *chosen])
 
     def with_state(self, **changes: str) -> Address:
         """Return the same page with other state; an empty value removes a key."""
@@ -78,13 +86,35 @@ def parse_address(query: str) -> Address | None:
     keys = {key for key, _ in pairs}
     robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in keys else ()
     pages = [page for page in PAGES if page in keys and not (page == ROBOT and robots)]
+    chosen: tuple[str, ...] = ()
+    if CHOSEN in pages and len(pages) > 1:
+        pages.remove(CHOSEN)
+        chosen = tuple(value for key, value in pairs if key == CHOSEN and value)
     if not pages:
         raise AddressError(f"address {query!r:.100} names no page{nearest(pairs[0][0], PAGES)}")
     if len(pages) > 1:
         raise AddressError(f"address {query!r:.100} names two pages: {' and '.join(pages)}")
     subjects = tuple(value for key, value in pairs if key == pages[0])
     state = {key: value for key, value in pairs if key not in PAGES}
-    return Address(pages[0], subjects, state, robots)
+    return Address(pages[0], subjects, state, robots, chosen)
+
+
+def _encode(pairs: Iterable[tuple[str, str]]) -> str:
+    return urlencode(list(pairs), quote_via=quote, safe="/=:,@+")
+
+
+def require_few_chosen(chosen: Sequence[str]) -> None:
+    """Require that the tray's robots fit into every page's address.
+
+    Raises:
+        AddressError: If they do not.
+    """
+    n = len(_encode((CHOSEN, uri) for uri in chosen))
+    if n > MAX_CHOSEN:
+        raise AddressError(
+            f"{len(chosen)} chosen robots take {n} characters of the address; expected at most "
+            f"{MAX_CHOSEN}: choose fewer, or select them on the population page"
+        )
 
 
 def parse_count(text: str, default: int) -> int:

@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
+import secrets
 import socket
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from urllib.parse import parse_qsl
 
 import viser
 
-from morphgen.benchmark.split_file import split_names
-from morphgen.benchmark.split_folder import SPLIT_FILE
-from morphgen.errors import MorphgenError, nearest
+from morphgen.errors import MorphgenError
 from morphgen.formats.urdf import UnsoundError
-from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
-from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.viewer import markup
 from morphgen.viewer.access import access_policy
-from morphgen.viewer.address import Address, parse_address
+from morphgen.viewer.address import CHOSEN, Address, parse_address, parse_count
+from morphgen.viewer.frame import call
+from morphgen.viewer.location import DEFAULT_WIDTH, read_location
 from morphgen.viewer.messages import MessageFilter
 from morphgen.viewer.pages import load_page
 from morphgen.viewer.robot_uri import (
-    CHECKPOINT,
-    EPISODE_SUFFIX,
-    WORDS,
     FileAccess,
-    UriError,
-    resolve_words,
 )
 from morphgen.viewer.scene_stage import BRAND, set_stage
 from morphgen.viewer.server import start_server, stop_server
-from morphgen.viewer.session import BUG, Session, read_location
+from morphgen.viewer.session import BUG, Session
+from morphgen.viewer.start_address import start_address
+from morphgen.viewer.tray import change_tray
+from morphgen.viewer.viser_internals import clear_page
 from morphgen.viewer.workers import Workers
 
 NOTHING = "There is nothing to see here"
@@ -57,7 +55,9 @@ class Viewer:
     uploads: TemporaryDirectory[str]
     """Folder of uploads; deleted with the viewer, at the latest when its process ends."""
     sessions: dict[int, Session] = field(default_factory=dict)
-    """Sessions of the connected browsers, by viser's client number."""
+    """Current sessions of the connected browsers, by viser's client number."""
+    browsers: dict[str, int] = field(default_factory=dict)
+    """Numbers of the browsers by the secret token that their scripts send."""
     cache: dict[str, object] = field(default_factory=dict)
     """Results of slow work that all sessions share."""
 
@@ -69,7 +69,7 @@ class Viewer:
     def stop(self) -> None:
         """End all sessions, the server and its workers, and delete the uploads."""
         for session in list(self.sessions.values()):
-            session.close()
+            session.disconnect()
         stop_server(self.server)
         self.workers.close()
         self.uploads.cleanup()
@@ -104,86 +104,122 @@ def serve(
     _require_local_address(host)
     uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
     files = FileAccess(files.library_folders, roots, Path(uploads.name).resolve())
-    server = start_server(host, port, policy)
+    viewer: Viewer | None = None
+
+    def receive(token: str, query: str) -> bool:
+        return viewer is not None and _receive(viewer, token, query)
+
+    server = start_server(host, port, policy, receive)
     # Work that ends after its browser has disconnected still writes to the page; that is harmless.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
-
-    async def connect(client: viser.ClientHandle) -> None:
-        session = Session(client, files, viewer.workers, start, cache=viewer.cache)
-        viewer.sessions[client.client_id] = session
-        MessageFilter(client, session.report_error)
-        session.enqueue(lambda: open_page(session))
-
-    async def disconnect(client: viser.ClientHandle) -> None:
-        session = viewer.sessions.pop(client.client_id, None)
-        if session is not None:
-            session.close()
-
-    server.on_client_disconnect(disconnect)
-    server.on_client_connect(connect)
+    _accept_browsers(viewer)
     return viewer
 
 
-def start_address(words: Sequence[str], files: FileAccess) -> Address:
-    """Return the page that ``morphgen view`` opens.
+def _accept_browsers(viewer: Viewer) -> None:
+    """Give every browser that connects a session."""
+
+    async def connect(client: viser.ClientHandle) -> None:
+        session = Session(client, viewer.files, viewer.workers, viewer.start, cache=viewer.cache)
+        viewer.sessions[client.client_id] = session
+        MessageFilter(client, lambda reason: _report(viewer, client.client_id, reason))
+        token = secrets.token_urlsafe(24)
+        viewer.browsers[token] = client.client_id
+        session.enqueue(lambda: open_first_page(session, token))
+
+    async def disconnect(client: viser.ClientHandle) -> None:
+        session = viewer.sessions.pop(client.client_id, None)
+        for token in [key for key, number in viewer.browsers.items() if number == client.client_id]:
+            del viewer.browsers[token]
+        if session is not None:
+            session.disconnect()
+
+    viewer.server.on_client_disconnect(disconnect)
+    viewer.server.on_client_connect(connect)
+
+
+def _report(viewer: Viewer, browser: int, reason: str) -> None:
+    """Show on a browser's page why its message was rejected."""
+    if (session := viewer.sessions.get(browser)) is not None:
+        session.report_error(reason)
+
+
+def _receive(viewer: Viewer, token: str, query: str) -> bool:
+    """Handle a request of a page's script; return whether the browser is connected.
+
+    The token is secret, so that only the script of a page can change what its browser shows.
 
     Args:
-        words: Nothing for the library; a folder, a file, or the name of a split or grammar; or
-            words of ``morphgen compose``.
-        files: Files that may be read.
-
-    Raises:
-        MorphgenError: If the target does not exist.
+        viewer: The viewer.
+        token: Secret of the browser.
+        query: An action with its value; ``open`` replaces the page by that of an address, others
+            are actions of the tray. Then the number of the page, whether pages are dark, and the
+            width of the window [pixels].
     """
-    if not words:
-        return Address("library")
-    if len(words) > 1 or "=" in words[0]:
-        resolve_words(" ".join(words), files)
-        return Address("robot", (WORDS + " ".join(words),))
-    word = words[0]
-    if Path(word).exists():
-        return _path_address(word, files)
-    if word in split_names():
-        return Address("split", (word,))
-    if word in grammar_names():
-        return Address("compose", (word,))
-    valid = (*split_names(), *grammar_names())
-    raise UriError(f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}")
+    browser = viewer.browsers.get(token)
+    session = None if browser is None else viewer.sessions.get(browser)
+    fields = parse_qsl(query, keep_blank_values=True)
+    if browser is None or session is None or not fields:
+        return False
+    (action, value), state = fields[0], dict(fields[1:])
+    if action != "open":
+        session.enqueue(lambda: change_tray(session, action, value))
+        return True
+    following = session.next_session(
+        parse_count(state.get("visit", ""), 0),
+        dark=bool(state.get("dark")),
+        width=parse_count(state.get("width", ""), DEFAULT_WIDTH),
+    )
+    viewer.sessions[browser] = following
+
+    def find_address() -> None:
+        following.address = parse_address(value) or viewer.start
+
+    following.enqueue(lambda: open_page(following, find_address))
+    return True
 
 
-def _path_address(text: str, files: FileAccess) -> Address:
-    """Return the page of a file or folder."""
-    path = files.path(text)
-    if path.suffix == EPISODE_SUFFIX:
-        from morphgen.viewer.episode import read_episode
+def open_first_page(session: Session, token: str) -> None:
+    """Build the page that a browser's URL names.
 
-        read_episode(path, files)
-        return Address("play", (text,))
-    if path.suffix == ".pt" or (path / CHECKPOINT).is_file():
-        from morphgen.rl.runs import read_checkpoint
+    Args:
+        session: The session of a browser that has just connected.
+        token: Secret of the browser, which its script sends with every request.
+    """
 
-        read_checkpoint(path)
-        return Address("play", state={"policy": text})
-    if path.is_file():
-        return Address({".yaml": "split", SUFFIX: "compose"}.get(path.suffix, "robot"), (text,))
-    if (path / SPLIT_FILE).is_file():
-        return Address("split", (text,))
-    return Address("robot" if is_robot_folder(path) else "gallery", (text,))
+    def find_address() -> None:
+        location = read_location(session.client)
+        session.dark, session.width = location.dark, location.width
+        session.run_script(call("connect", token))
+        session.address = parse_address(location.query) or session.address
+        session.chosen = session.address.chosen
+
+    open_page(session, find_address)
 
 
-def open_page(session: Session) -> None:
-    """Build the page that a browser's URL names, or a page that says why it cannot be shown."""
+def open_page(session: Session, find_address: Callable[[], object]) -> None:
+    """Build a page, or one that says why it cannot be shown.
+
+    Args:
+        session: The session.
+        find_address: Sets the session's address.
+    """
     client, redact = session.client, session.files.redact
     try:
-        location = read_location(client)
-        session.dark = location.dark
+        clear_page(client)
+        find_address()
         client.gui.configure_theme(
             show_logo=False, show_share_button=False, dark_mode=session.dark, brand_color=BRAND
         )
         set_stage(client.scene, dark=session.dark)
-        session.address = parse_address(location.query) or session.address
-        load_page(session.address.page)(session)
+        address = session.address
+        if address.page == CHOSEN:
+            session.chosen = tuple(filter(None, address.subjects))
+        session.address = replace(address, chosen=()).with_state(theme="")
+        session.show_address(session.title)
+        session.show_tray()
+        load_page(address.page)(session)
     except UnsoundError as error:
         _show_fault(session, redact(error.origin), markup.findings_table(error.findings, redact))
     except (MorphgenError, TimeoutError) as error:
@@ -202,8 +238,7 @@ def open_page(session: Session) -> None:
 def _show_fault(session: Session, title: str, html: str) -> None:
     """Replace the page by a panel that says why it cannot be shown."""
     gui = session.client.gui
-    gui.reset()
-    session.client.scene.reset()
+    clear_page(session.client)
     session.open_panel(FAULT_WIDTH, markup.breadcrumbs((session.address.page, None)), left=True)
     gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{html}"))
 

@@ -67,6 +67,34 @@ def all_roles(robots: Sequence[Robot]) -> list[str]:
     return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
 
 
+def parse_moves(state: Mapping[str, str], roles: Sequence[str], low: float) -> dict[str, float]:
+    """Return the positions of roles that an address's state gives, by role.
+
+    Args:
+        state: State of the address; values that are no numbers are ignored.
+        roles: Roles of the page, such as ``joint 1``, whose key is ``joint1``.
+        low: Smallest position; the largest is 1.
+    """
+    moves = {}
+    for role in roles:
+        try:
+            position = float(state.get(_role_key(role), "nan"))
+        except ValueError:
+            continue
+        if not np.isnan(position):
+            moves[role] = min(max(position, low), 1.0)
+    return moves
+
+
+def format_moves(moves: Mapping[str, float], roles: Sequence[str]) -> dict[str, str]:
+    """Return the state of an address for moved roles; roles that are not moved get no value."""
+    return {_role_key(role): f"{moves[role]:g}" if role in moves else "" for role in roles}
+
+
+def _role_key(role: str) -> str:
+    return role.replace(" ", "")
+
+
 def normalized_positions(robot: Robot, q: Array) -> Array:
     """Map joint positions to -1 at the lower limit and 1 at the upper, shape (dof,)."""
     low, high = joint_limits(robot).T

@@ -93,7 +93,7 @@ def open_panels(
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
     panel.dock_left()
-    panel.set_width(max(client.camera.image_width - width - CANVAS_WIDTH, 400.0))
+    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, 400.0))
 
 
 def add_controls(gallery: Gallery) -> None:
@@ -128,12 +128,12 @@ def add_controls(gallery: Gallery) -> None:
     buttons = gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
 
     def turn_page() -> None:
-        _show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
+        show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
 
     for control in controls.values():
-        gallery.session.on_change(control, lambda: _show_page(gallery, 1), "filter")
+        gallery.session.on_change(control, lambda: show_page(gallery, 1), "filter")
     gallery.session.on_change(buttons, turn_page)
-    _show_page(gallery, gallery.page_number)
+    show_page(gallery, gallery.page_number)
 
 
 def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
@@ -155,7 +155,7 @@ def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
 
 
 def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) -> str:
-    """Return a robot's card in the grid, a link to its page.
+    """Return a robot's card in the grid: a link to its page, and a check box that chooses it.
 
     Args:
         row: The robot.
@@ -175,9 +175,9 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) ->
     facts = robot_rows.facts_line(row) or escape(row.category)
     query = escape(Address("robot", (row.uri,)).query)
     return (
-        f'<a class="card" href="{query}" title="{escape(fault or row.uri)}">'
+        f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}">'
         f'{image}<div class="text"><div class="name">{escape(row.name)}</div>'
-        f"{markup.dim(facts)}{tags}</div></a>"
+        f"{markup.dim(facts)}{tags}</div></a>{'' if fault else markup.choose_box(row.uri)}</div>"
     )
 
 
@@ -196,7 +196,7 @@ def shares(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> tuple[list[float
     return [1.0 if math.isnan(height) else height / tallest for height in heights], tallest
 
 
-def _show_page(gallery: Gallery, number: int) -> None:
+def show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
     session, controls, rows = gallery.session, gallery.controls, shown_rows(gallery)
     sort = _SORT_KEYS[controls["sort"].value]

@@ -11,6 +11,9 @@ from morphgen.viewer.address import Address
 STYLE = """<style>
 .mg{font-size:13px;line-height:1.45;padding:0 .8em .3em .8em;color:inherit}
 .mg a{color:#1864ab;text-decoration:none}.mg a:hover{text-decoration:underline}
+.mg h2{font-size:17px;margin:.8em 0 .3em 0;font-weight:600}
+.mg a.button,.mg a.button:hover{display:inline-block;background:#1864ab;color:#fff!important;
+padding:5px 14px;border-radius:5px;font-weight:600;text-decoration:none}
 .mg h3{font-size:13px;margin:.9em 0 .35em 0;font-weight:600}
 .mg table{border-collapse:collapse;width:100%;font-size:12px}
 .mg td,.mg th{padding:2px 8px 2px 0;text-align:left;vertical-align:top;
@@ -22,7 +25,6 @@ border-radius:3px}
 .mg code{padding:0 3px}.mg pre{padding:6px 8px;overflow-x:auto;white-space:pre-wrap;margin:.3em 0;
 user-select:all}
 .mg .crumbs{color:#868e96;font-size:12.5px;padding-top:.5em}
-.mg.theme{float:right;padding-top:.6em;font-size:12px}
 .mg .tag{display:inline-block;border-radius:3px;padding:0 5px;font-size:11px;background:#8882;
 margin-right:3px}
 .mg .train{background:#d0ebff;color:#1864ab}.mg .test{background:#ffe8cc;color:#d9480f}
@@ -30,6 +32,12 @@ margin-right:3px}
 .mg .info{background:#e7f5ff;color:#1971c2}
 .mg .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(172px,1fr));gap:10px}
 .mg .columns{display:flex;gap:20px;align-items:flex-start}.mg .columns>div{flex:1}
+.mg .cell{position:relative}.mg .cell .choose{position:absolute;top:6px;left:6px;opacity:.35}
+.mg .cell:hover .choose,.mg .choose:has(:checked){opacity:1}
+.mg .choose{cursor:pointer;white-space:nowrap}
+.mg .choose input{margin:0;vertical-align:-2px;width:16px;height:16px;
+accent-color:#1864ab;cursor:pointer}
+.mg .cell:has(:checked) a.card{border-color:#1864ab;box-shadow:0 0 0 1px #1864ab}
 .mg a.card{display:block;border:1px solid #8883;border-radius:6px;overflow:hidden;color:inherit;
 background:#fff}
 .mg a.card:hover{border-color:#339af0;text-decoration:none;box-shadow:0 1px 6px #0002}
@@ -59,6 +67,17 @@ def dim(html: str) -> str:
 def link(address: Address, text: str) -> str:
     """Return a link to a page."""
     return f'<a href="{escape(address.query)}">{escape(text)}</a>'
+
+
+def button_link(address: Address, text: str) -> str:
+    """Return a link to a page that looks like a button."""
+    return f'<a class="button" href="{escape(address.query)}">{escape(text)}</a>'
+
+
+def choose_box(uri: str, label: str = "") -> str:
+    """Return a check box that puts a robot into the tray, with a label behind it."""
+    box = f'<input type="checkbox" data-choose="{escape(uri)}">'
+    return f'<label class="choose" title="choose">{box} {escape(label)}</label>'
 
 
 def breadcrumbs(*steps: tuple[str, Address | None]) -> str:

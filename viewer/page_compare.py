@@ -14,15 +14,22 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup, scene_robot, scene_stage
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import MAX_COMPARED, Address
 from morphgen.viewer.figures import tokens_png
+from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.session import Session, set_value
 
-MAX_ROBOTS = 4
-"""Robots that are compared at once."""
 PANEL_WIDTH = 520.0
 """Width of the panel [pixels]."""
+EMPTY = (
+    "<h2>Compare two to four robots</h2>Pick them here, or tick the box of cards in a gallery and "
+    "press <i>compare</i> in the tray."
+)
+PRIMITIVES = "primitives"
+"""Value of ``show`` in the address when primitives are drawn."""
+ADDRESS_DELAY = 0.5
+"""Delay of URL updates after a move [s]."""
 GAP = 0.35
 """Distance between the bounding boxes of two robots [m]."""
 _CAMERA_DIRECTION = (0.74, 0.09, 0.28)
@@ -48,13 +55,19 @@ def show(session: Session) -> None:
     """Build the page.
 
     Raises:
-        UriError: If the address names more than ``MAX_ROBOTS`` robots.
+        UriError: If the address names more than ``MAX_COMPARED`` robots.
         MorphgenError: If a robot cannot be read.
     """
-    uris = session.address.subjects
-    if not 1 <= len(uris) <= MAX_ROBOTS:
-        raise UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_ROBOTS}")
+    uris = tuple(filter(None, session.address.subjects))
+    if len(uris) > MAX_COMPARED:
+        raise UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_COMPARED}")
     header = markup.breadcrumbs(("compare", None))
+    if not uris:
+        session.open_panel(PANEL_WIDTH, header)
+        session.client.gui.add_html(markup.framed(EMPTY))
+        _add_picker(session, uris)
+        session.show_address("compare")
+        return
     session.open_panel(PANEL_WIDTH, header, f"reading {len(uris)} robots")
     robots = [split_colours(read_robot_uri(uri, session.files)) for uri in uris]
     page = ComparePage(session, uris, robots, _add_robots(session, robots))
@@ -69,17 +82,17 @@ def show(session: Session) -> None:
     with tabs.add_tab("Primitives", viser.Icon.CUBE):
         box = gui.add_checkbox("primitives in place of meshes, coloured by IoU", False)
         page.texts["fits"] = gui.add_html("")
-    session.on_change(
-        box, lambda: session.run_in_background(lambda: _show_fits(page, on=box.value))
-    )
+
+    def toggle_primitives() -> None:
+        session.address = session.address.with_state(show=PRIMITIVES if box.value else "")
+        _show_in_address(page)
+        session.run_in_background(lambda: _show_fits(page, on=box.value))
+
+    session.on_change(box, toggle_primitives)
     session.set_status("")
-    session.update_address("compare " + ", ".join(robot.name for robot in robots))
+    _apply_address(page, box)
+    _show_in_address(page)
     session.run_in_background(lambda: _compare(page))
-
-
-def parse_uris(text: str) -> tuple[str, ...]:
-    """Return the URIs in a text, one per line."""
-    return tuple(line.strip() for line in text.splitlines() if line.strip())
 
 
 def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.RobotView]:
@@ -101,29 +114,61 @@ def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.R
 
 
 def _add_robots_tab(page: ComparePage) -> None:
-    """Add the list of URIs to edit, and a table of the robots."""
-    gui, session = page.session.client.gui, page.session
-    text = gui.add_text(
-        "a robot a line",
-        "\n".join(page.uris),
-        multiline=True,
-        hint="URIs as in addresses: robots/ur5-plane, words:arm=ur5 ee=plane, ...",
-    )
-    button = gui.add_button("Compare these", icon=viser.Icon.ARROWS_LEFT_RIGHT)
-    session.on_change(
-        button, lambda: session.open_address(Address("compare", parse_uris(text.value)))
-    )
+    """Add a table of the robots with links that remove one, and controls that add one."""
+    gui = page.session.client.gui
     rows = [
         (
             markup.link(Address("robot", (uri,)), robot.name or uri_name(uri)),
             str(len(robot.links)),
             str(robot.dof),
             f"{robot.mass:.3g}",
+            markup.choose_box(uri),
+            markup.link(Address("compare", _without(page.uris, i)), "remove"),
         )
-        for uri, robot in zip(page.uris, page.robots, strict=True)
+        for i, (uri, robot) in enumerate(zip(page.uris, page.robots, strict=True))
     ]
-    gui.add_html(markup.framed(markup.table(("robot", "links", "DoF", "kg"), rows, (1, 2, 3))))
+    header = ("robot", "links", "DoF", "kg", "choose", "")
+    gui.add_html(markup.framed(markup.table(header, rows, (1, 2, 3))))
+    if len(page.uris) < MAX_COMPARED:
+        _add_picker(page.session, page.uris)
     page.texts["similarity"] = gui.add_html("")
+
+
+def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
+    return (*uris[:i], *uris[i + 1 :]) or ("",)
+
+
+def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
+    """Add controls that add a robot to the compared ones."""
+    lists = robot_lists(uris[0] if uris else "", session.files, {})
+    with session.client.gui.add_folder("Add a robot"):
+        picker = add_picker(session, lists, lambda: uris[0] if uris else "")
+        button = session.client.gui.add_button("Add", icon=viser.Icon.PLUS)
+
+    def add() -> None:
+        session.open_address(Address("compare", (*uris, picked_uri(picker))))
+
+    session.on_change(picker.robot, add)
+    session.on_change(button, add)
+
+
+def _apply_address(page: ComparePage, box: viser.GuiCheckboxHandle) -> None:
+    """Restore the moved joints and the primitives from the page's address."""
+    state = page.session.address.state
+    page.moved = comparison.parse_moves(state, tuple(page.sliders), -1.0)
+    for role, value in page.moved.items():
+        set_value(page.sliders[role], value)
+    _move(page)
+    if state.get("show") == PRIMITIVES:
+        set_value(box, True)
+        page.session.run_in_background(lambda: _show_fits(page, on=True))
+
+
+def _show_in_address(page: ComparePage) -> None:
+    page.session.update_address(
+        "compare " + ", ".join(robot.name for robot in page.robots),
+        **comparison.format_moves(page.moved, tuple(page.sliders)),
+    )
 
 
 def _add_move_tab(page: ComparePage) -> None:
@@ -166,23 +211,30 @@ def _move(page: ComparePage) -> None:
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
             view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))
+    page.session.call_later(ADDRESS_DELAY, lambda: _show_in_address(page), "address")
 
 
 def _show_fits(page: ComparePage, *, on: bool) -> None:
     """Show the stored primitives of the robots and their IoU, or the meshes again."""
+    folders = page.session.files.library_folders
+    qualities = [comparison.fit_quality(robot, folders) for robot in page.robots] if on else []
+    page.session.enqueue(lambda: _draw_fits(page, qualities))
+
+
+def _draw_fits(page: ComparePage, qualities: Sequence[comparison.FitQuality]) -> None:
+    """Draw the primitives of the robots; without any, draw the meshes."""
     parts = []
-    for robot, view in zip(page.robots, page.views, strict=True):
-        view.set_visible("visual", not on)
+    for view in page.views:
+        view.set_visible("visual", not qualities)
         view.remove_layer("primitives")
-        if not on:
-            continue
-        quality = comparison.fit_quality(robot, page.session.files.library_folders)
-        shapes = [quality[link.name][1] if link.name in quality else () for link in robot.links]
-        view.show_shapes("primitives", shapes)
-        view.paint(
-            "primitives", {name: comparison.iou_colour(iou) for name, (iou, _) in quality.items()}
-        )
-        parts.append(f"<h3>{escape(robot.name)}</h3>" + comparison.fit_table(robot, quality))
+    if qualities:
+        for robot, view, quality in zip(page.robots, page.views, qualities, strict=True):
+            shapes = [quality[link.name][1] if link.name in quality else () for link in robot.links]
+            view.show_shapes("primitives", shapes)
+            colours = {name: comparison.iou_colour(iou) for name, (iou, _) in quality.items()}
+            view.paint("primitives", colours)
+            table = comparison.fit_table(robot, quality)
+            parts.append(f"<h3>{escape(robot.name)}</h3>{table}")
     page.texts["fits"].content = markup.framed(*parts)
 
 

@@ -3,32 +3,45 @@
 from __future__ import annotations
 
 import functools
-import shlex
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import viser
 
 from morphgen.checks import check
-from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
-from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.grammar_file import SUFFIX
+from morphgen.grammar.request import known_grammars
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup, part_choice
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_compose_grammar import add_grammar_tab, show_grammar
+from morphgen.viewer.page_compose_parameters import add_parameters_tab
+from morphgen.viewer.page_compose_parts import add_parts_tab
 from morphgen.viewer.page_robot import PANEL_WIDTH, summary
+from morphgen.viewer.part_choice import choice_of
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
 from morphgen.viewer.robot_tables import has_tool
-from morphgen.viewer.robot_uri import WORDS, resolve_grammar, resolve_words
+from morphgen.viewer.robot_uri import (
+    DEFAULT_WORDS,
+    DERIVATION,
+    MEMBER,
+    UPLOAD,
+    FileAccess,
+    UriError,
+    read_robot_uri,
+    resolve_derivation,
+    resolve_grammar,
+    shorten,
+)
 from morphgen.viewer.scene_robot import RobotView, add_robot, robot_bounds
 from morphgen.viewer.scene_stage import add_ground, look_at
 from morphgen.viewer.session import Session
 
 ROBOTS = "robots"
 """Folder in which bundles are written."""
-DEFAULT_PARTS = ("arm=ur5", "ee=plane")
 DEFAULT_GRAMMAR = "arm3"
 
 
@@ -44,50 +57,75 @@ class ComposePage:
     view: RobotView | None = None
 
 
-@dataclass(eq=False)
-class PartsTab:
-    """The tab on which parts are chosen."""
-
-    page: ComposePage
-    choice: part_choice.PartChoice
-    fault: viser.GuiHtmlHandle
-    folder: viser.GuiFolderHandle
-    slots: dict[str, viser.GuiFolderHandle] = field(default_factory=dict)
-    """Folders with the controls of each slot."""
-
-
 def show(session: Session) -> None:
     """Build the page.
 
     Raises:
-        MorphgenError: If the address names invalid words or an unknown grammar.
+        MorphgenError: If the address names invalid words, an unknown grammar or robot, or a robot
+            without derivation.
     """
-    words = session.address.subject.split()
-    is_grammar = bool(words) and "=" not in words[0]
-    parts = DEFAULT_PARTS if is_grammar or not words else words
-    choice = part_choice.parse_choice(parts, session.files.library)
-    name = words[0] if is_grammar else DEFAULT_GRAMMAR
-    grammar = resolve_grammar(name, session.files)
+    files, subject = session.files, session.address.subject or DEFAULT_WORDS
+    derivation = subject_derivation(subject, files)
+    words = DEFAULT_WORDS if derivation else subject
+    grammar_name = DEFAULT_GRAMMAR
+    if is_grammar := not derivation and "=" not in subject.split()[0]:
+        grammar_name, words = subject.split()[0], DEFAULT_WORDS
+    choice = choice_of(derivation, files.library) if derivation else None
+    is_tree = derivation is not None and choice is None
+    choice = choice or part_choice.parse_choice(words.split(), files.library)
+    grammar = resolve_grammar(grammar_name, files)
     session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
     gui = session.client.gui
     page = ComposePage(session, gui.add_html(""))
     add_ground(session.client.scene, 2.0)
     tabs = gui.add_tab_group()
     show_in_page = functools.partial(show_robot, page)
-    if is_grammar:  # the tab that the address asks for comes first
-        grammar_tab = add_grammar_tab(session, tabs, grammar, name, show_in_page)
-        _add_parts_tab(page, tabs, choice)
+    start: Callable[[], None]
+    # The tab that the address asks for comes first.
+    if is_grammar:
+        grammar_tab = add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
+        add_parts_tab(session, tabs, choice, show_in_page)
+        drawn = "number" in session.address.state
+        start = functools.partial(show_grammar, grammar_tab, drawn=drawn)
     else:
-        parts_tab = _add_parts_tab(page, tabs, choice)
-        add_grammar_tab(session, tabs, grammar, name, show_in_page)
+        if derivation and is_tree:
+            start = add_parameters_tab(session, tabs, derivation, show_in_page)
+        else:
+            start = add_parts_tab(session, tabs, choice, show_in_page)
+        add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.findings = gui.add_html("")
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
         _add_downloads_tab(page)
-    if is_grammar:
-        show_grammar(grammar_tab, drawn="number" in session.address.state)
-    else:
-        _show_choice(parts_tab)
+    start()
+
+
+def subject_derivation(subject: str, files: FileAccess) -> Derivation | None:
+    """Return the derivation of the robot that an address names by its URI; None for words.
+
+    Raises:
+        MorphgenError: If the robot cannot be read, or has no derivation.
+    """
+    if subject.startswith((DERIVATION, MEMBER)):
+        return resolve_derivation(subject, files)
+    first = subject.split()[0]
+    is_path = subject.startswith(UPLOAD) or ("=" not in first and not first.endswith(SUFFIX))
+    if not is_path or first in known_grammars(files.library):
+        return None
+    if not subject.startswith(UPLOAD) and "/" not in subject and not _exists(subject, files):
+        return None  # the name of a grammar that does not exist
+    text = read_robot_uri(subject, files).provenance.get("derivation")
+    if not text:
+        raise UriError(f"{shorten(subject)} was imported: only composed robots can be edited")
+    return parse_derivation(str(text))
+
+
+def _exists(subject: str, files: FileAccess) -> bool:
+    try:
+        files.path(subject)
+    except UriError:
+        return False
+    return True
 
 
 def show_robot(
@@ -172,92 +210,3 @@ def _send_bundle(page: ComposePage, name: str) -> None:
     name = bundle_folder(Path(), name or robot.name or "robot").name  # validates the name
     session.client.send_file_download(f"{name}.zip", zip_files(name, files), save_immediately=True)
     session.set_status("")
-
-
-def _add_parts_tab(
-    page: ComposePage, tabs: viser.GuiTabGroupHandle, choice: part_choice.PartChoice
-) -> PartsTab:
-    """Add the tab with a dropdown for the base and the controls of its slots."""
-    session = page.session
-    gui = session.client.gui
-    with tabs.add_tab("Parts", viser.Icon.PUZZLE):
-        fault = gui.add_html("")
-        bases = tuple(session.files.library.names("base"))
-        base = gui.add_dropdown("base", bases, initial_value=choice.parts["base"])
-        tab = PartsTab(page, choice, fault, gui.add_folder(None))
-    session.on_change(base, lambda: _choose_part(tab, "base", base.value))
-    _add_slots(tab)
-    return tab
-
-
-def _show_choice(tab: PartsTab) -> None:
-    """Show the robot of the chosen parts, or why they do not fit; then the last robot stays."""
-    session, words = tab.page.session, tab.choice.words
-    try:
-        derivation, name = resolve_words(words, session.files)
-        robot = compose(derivation, session.files.library, name)
-    except MorphgenError as error:
-        tab.fault.content = markup.error(session.files.redact(error))
-        return
-    tab.fault.content = ""
-    session.address = Address("compose", (words,))
-    session.show_address(f"compose {name}")
-    command = shlex.join(["morphgen", "compose", *words.split()])
-    show_robot(tab.page, robot, derivation, command, WORDS + words)
-
-
-def _add_slots(tab: PartsTab) -> None:
-    """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
-    session = tab.page.session
-    gui, library = session.client.gui, session.files.library
-    for folder in tab.slots.values():
-        folder.remove()
-    tab.slots.clear()
-    with tab.folder:
-        for slot in ("base", *part_choice.slots_of(tab.choice, library)):
-            folder = tab.slots[slot] = gui.add_folder(slot)
-            with folder:
-                if slot != "base":
-                    _add_part_dropdown(tab, slot)
-                if part := tab.choice.parts.get(slot):
-                    for control in part_choice.controls_of(
-                        slot, library.manifest(part, part_choice.kind_of(slot))
-                    ):
-                        _add_slider(tab, control)
-
-
-def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
-    session = tab.page.session
-    names = part_choice.part_options(slot, session.files.library)
-    chosen = tab.choice.parts.get(slot)
-    dropdown = session.client.gui.add_dropdown(
-        part_choice.kind_of(slot),
-        tuple(names),
-        initial_value=chosen if chosen in names else part_choice.NO_PART,
-    )
-    session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
-
-
-def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
-    """Add the slider of a part's parameter."""
-    slider = tab.page.session.client.gui.add_slider(
-        control.label,
-        control.low,
-        control.high,
-        control.step,
-        tab.choice.values.get(control.key, control.default),
-        hint=control.hint,
-    )
-
-    def set_parameter() -> None:
-        tab.choice = part_choice.with_value(tab.choice, control, slider.value)
-        _show_choice(tab)
-
-    tab.page.session.on_change(slider, set_parameter, control.key)
-
-
-def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
-    """Put a part into a slot, and show its controls and the robot."""
-    tab.choice = part_choice.with_part(tab.choice, slot, part, tab.page.session.files.library)
-    _add_slots(tab)
-    _show_choice(tab)

@@ -13,6 +13,7 @@ from morphgen.viewer.gallery_grid import (
     passing_rows,
 )
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
+from morphgen.viewer.page_index import show_index
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
 from morphgen.viewer.split_form import ChooseSides, add_split_form
@@ -24,6 +25,9 @@ def show(session: Session) -> None:
     Raises:
         UriError: If the folder does not exist or holds no robot.
     """
+    if not session.address.subject:
+        show_index(session)
+        return
     folder = session.address.subject
     rows = folder_rows(folder, session.files)
     is_set = (session.files.path(folder) / INDEX).is_file()

@@ -57,6 +57,9 @@ class PlayPage:
             if self.scene is not None:
                 self.scene.root.remove()
             self.scene = add_episode(client.scene, source.episode)
+        if self.session.closed.is_set():  # the browser has left the page meanwhile
+            self.scene.root.remove()
+            return
         uris = tuple(track.uri for track in source.episode.tracks)
         if uris != self.framed:  # the next episode of the same robots keeps the user's camera
             self.framed = uris

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import viser
 
-from morphgen.benchmark.split_file import split_names
 from morphgen.errors import MorphgenError, nearest
-from morphgen.grammar.robot_source import is_set_folder
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer.address import Address, parse_count
-from morphgen.viewer.robot_rows import folder_rows, split_rows
-from morphgen.viewer.robot_uri import (
-    WORDS,
-    FileAccess,
-    member_split,
-    parent_folder,
-    resolve_split,
-)
+from morphgen.viewer.address import MAX_PLAYED, Address, parse_count
+from morphgen.viewer.robot_picker import Robots, add_picker, picked_uri, robot_lists
+from morphgen.viewer.robot_uri import DEFAULT_WORDS, WORDS, FileAccess
 from morphgen.viewer.rollout import (
-    MAX_ROBOTS,
     RolloutConfig,
     list_checkpoints,
     simulators,
@@ -33,16 +24,8 @@ from morphgen.viewer.rollout import (
 )
 from morphgen.viewer.session import Session
 
-DEFAULT_ROBOT = "words:arm=ur5 ee=plane"
-"""Robot of an address that names none."""
-ARMS = "arms with a plate"
-MAX_CHOICES = 500
-"""Robots that a dropdown offers; others can be named by words."""
 ACTIONS = ("replace", "add", "only")
 """Actions on the chosen robot: replace the first, add it, or remove all others."""
-
-Robots = list[tuple[str, str]]
-"""Names and URIs."""
 
 
 @dataclass(eq=False)
@@ -57,8 +40,6 @@ class RolloutControls:
     start: Callable[[RolloutConfig], object]
     """Starts a rollout."""
     handles: dict[str, Any] = field(default_factory=dict)
-    choices: dict[str, str] = field(default_factory=dict)
-    """URIs of the robots in the dropdown, by label."""
 
 
 def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
@@ -83,10 +64,10 @@ def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
     seed_text = state.get("seed", "0")
     if (seed := parse_count(seed_text, -1)) < 0:
         raise MorphgenError(f"seed {seed_text!r:.80}: expected a whole number, 0 or more")
-    robot = trained_on[0][1] if trained_on else DEFAULT_ROBOT
+    robot = trained_on[0][1] if trained_on else WORDS + DEFAULT_WORDS
     return RolloutConfig(
         task,
-        (address.robots or (robot,))[:MAX_ROBOTS],
+        (address.robots or (robot,))[:MAX_PLAYED],
         state.get("policy") or baselines_for(task)[0],
         seed,
         bool(state.get("obstacles")),
@@ -133,11 +114,9 @@ def add_rollout_controls(controls: RolloutControls) -> None:
         names = tuple(simulators())
         handles["simulator"] = gui.add_dropdown("simulator", names, initial_value=config.simulator)
     with gui.add_folder("Robots"):
-        handles["from"] = gui.add_dropdown("from", tuple(_robot_lists(controls)))
-        handles["robot"] = gui.add_dropdown("robot", ("",))
-        handles["words"] = gui.add_text(
-            "or words", "", hint="such as arm=ur5 ee=plane, or a bundle's folder; then Enter"
-        )
+        trained_on = {"trained on": lambda: controls.trained_on} if controls.trained_on else {}
+        lists = robot_lists(config.robots[0], session.files, trained_on)
+        picker = add_picker(session, lists, lambda: controls.config.robots[0])
         action = gui.add_button_group("this robot", ACTIONS)
     session.on_change(restart, lambda: _change(controls, seed=controls.config.seed + 1))
     session.on_change(handles["task"], lambda: _change_task(controls))
@@ -147,55 +126,8 @@ def add_rollout_controls(controls: RolloutControls) -> None:
 
     for name in ("policy", "obstacles", "seed", "simulator"):
         session.on_change(handles[name], functools.partial(apply, name), name)
-    session.on_change(handles["from"], lambda: _list_robots(controls))
-    session.on_change(handles["robot"], lambda: _use_robot(controls, "replace"))
-    session.on_change(action, lambda: _use_robot(controls, action.value))
-    _list_robots(controls)
-
-
-def label_robots(robots: Robots, current: Sequence[str]) -> dict[str, str]:
-    """Return URIs by distinct labels, in the order of the robots.
-
-    Args:
-        robots: Names and URIs.
-        current: URIs of the rollout; those that are not among the robots come first.
-    """
-    listed_uris = {uri for _, uri in robots}
-    labels: dict[str, str] = {}
-    for name, uri in [*((uri, uri) for uri in current if uri not in listed_uris), *robots]:
-        label = name
-        while label in labels:
-            label += "'"
-        labels[label] = uri
-    return labels
-
-
-def _robot_lists(controls: RolloutControls) -> Mapping[str, Callable[[], Robots]]:
-    """Return functions that list robots to choose from, by the name of their source.
-
-    The robots that the policy was trained on come first, then the split or set of the first robot.
-    """
-    uri, files = controls.config.robots[0], controls.session.files
-    lists: dict[str, Callable[[], Robots]] = {}
-    if controls.trained_on:
-        lists["trained on"] = lambda: controls.trained_on
-    if split := member_split(uri):
-        lists[split] = functools.partial(_split_robots, split, files)
-    folder = parent_folder(uri)
-    if folder and is_set_folder(files.path(folder)):
-        lists[folder] = lambda: [(row.name, row.uri) for row in folder_rows(folder, files)]
-    lists[ARMS] = lambda: [
-        *((arm, f"{WORDS}arm={arm} ee=plane") for arm in files.library.names("arm")),
-        ("planar-cube", f"{WORDS}base=planar ee=cube"),
-    ]
-    for split in split_names():
-        lists.setdefault(split, functools.partial(_split_robots, split, files))
-    return lists
-
-
-def _split_robots(split: str, files: FileAccess) -> Robots:
-    rows = split_rows(split, resolve_split(split, files))
-    return [(f"{row.role}: {row.name}", row.uri) for row in rows]
+    session.on_change(picker.robot, lambda: _use_robot(controls, picked_uri(picker), "replace"))
+    session.on_change(action, lambda: _use_robot(controls, picked_uri(picker), action.value))
 
 
 def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
@@ -204,25 +136,12 @@ def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _list_robots(controls: RolloutControls) -> None:
-    """Fill the dropdown of robots from the chosen source."""
-    current, dropdown = controls.config.robots[0], controls.handles["robot"]
-    list_robots = _robot_lists(controls).get(controls.handles["from"].value, list)
-    controls.choices = label_robots(list_robots()[:MAX_CHOICES], (current,))
-    dropdown.options = tuple(controls.choices)
-    dropdown.value = next(label for label, uri in controls.choices.items() if uri == current)
-
-
-def _use_robot(controls: RolloutControls, action: str) -> None:
-    """Apply one of ``ACTIONS`` to the robot that the user named or chose."""
-    robots, text = controls.config.robots, controls.handles["words"].value.strip()
-    uri = controls.choices[controls.handles["robot"].value]
-    if text:
-        uri = WORDS + text if "=" in text and ":" not in text else text
-        controls.handles["words"].value = ""
+def _use_robot(controls: RolloutControls, uri: str, action: str) -> None:
+    """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
+    robots = controls.config.robots
     if action == "add":
-        if len(robots) >= MAX_ROBOTS:
-            raise MorphgenError(f"at most {MAX_ROBOTS} robots are shown")
+        if len(robots) >= MAX_PLAYED:
+            raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
         _change(controls, robots=(*robots, uri))
     else:
         _change(controls, robots=(uri, *(robots[1:] if action == "replace" else ())))

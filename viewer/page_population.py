@@ -9,6 +9,8 @@ import viser
 
 from morphgen.viewer import markup, population_layout, scene_population
 from morphgen.viewer.address import Address, parse_count
+from morphgen.viewer.comparison import parse_moves
+from morphgen.viewer.page_index import show_index
 from morphgen.viewer.page_population_actions import add_actions
 from morphgen.viewer.page_population_show import (
     ARRANGEMENTS,
@@ -30,7 +32,7 @@ from morphgen.viewer.population_source import (
     find_source,
     load_population,
 )
-from morphgen.viewer.population_state import card, parse_selection, parse_shares
+from morphgen.viewer.population_state import card, parse_selection
 from morphgen.viewer.session import Session
 from morphgen.viewer.viser_internals import run_javascript
 
@@ -44,6 +46,9 @@ def show(session: Session) -> None:
     Raises:
         MorphgenError: If the address names no robots.
     """
+    if not session.address.subject:
+        show_index(session)
+        return
     subject, state = session.address.subject, session.address.state
     seed, number = (
         parse_count(state.get(key, ""), value)
@@ -96,7 +101,7 @@ def _show_population(
         axes,
         sliders,
         parse_selection(state.get("select", ""), n),
-        parse_shares(state, population.roles),
+        parse_moves(state, population.roles, 0.0),
         min(parse_count(state.get("pose", ""), 0), NUM_POSES),
     )
     add_actions(page)
@@ -154,7 +159,7 @@ def _add_sliders(
     gui = session.client.gui
     buttons = gui.add_button_group("Pose", POSES)
     sliders = {}
-    shares = parse_shares(session.address.state, population.roles)
+    shares = parse_moves(session.address.state, population.roles, 0.0)
     folders = [
         ("Joints from the base to the tool", [r for r in population.roles if r[0] == "j"]),
         ("Fingers and other joints", [r for r in population.roles if r[0] != "j"]),

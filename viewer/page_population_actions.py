@@ -10,16 +10,13 @@ import viser
 from morphgen.benchmark.split import SIDES
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.robot_set import remove_robots
-from morphgen.viewer.address import Address
-from morphgen.viewer.page_compare import MAX_ROBOTS
+from morphgen.viewer.address import MAX_COMPARED, Address
 from morphgen.viewer.page_population_show import PopulationPage, selected_rows, show_selection
-from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import UriError, owned_set
 from morphgen.viewer.split_form import ChooseSides, add_split_form
+from morphgen.viewer.tray import send_bundles
 
-MAX_EXPORT = 200 * 2**20
-"""Largest export before compression [bytes]."""
 _SELECT = ("all", "none", "invert")
 
 
@@ -30,6 +27,7 @@ def add_actions(page: PopulationPage) -> None:
         page.texts["selection"] = gui.add_html("")
         select = gui.add_button_group("Select", _SELECT)
         compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_LEFT_RIGHT)
+        choose = gui.add_button("Choose", icon=viser.Icon.CHECKBOX, hint="add them to the tray")
         export = gui.add_button("Export bundles (.zip)", icon=viser.Icon.DOWNLOAD)
         add_split_form(session, lambda: _add_choice(page))
         if _is_owned_set(page):
@@ -37,7 +35,8 @@ def add_actions(page: PopulationPage) -> None:
             session.on_change(delete, lambda: _confirm_delete(page))
     session.on_change(select, lambda: _select(page, select.value))
     session.on_change(compare, lambda: _compare(page))
-    session.on_change(export, lambda: session.run_in_background(lambda: _export(page)))
+    session.on_change(choose, lambda: _choose(page))
+    session.on_change(export, lambda: _export(page))
 
 
 def _is_owned_set(page: PopulationPage) -> bool:
@@ -69,32 +68,20 @@ def _require_selection(page: PopulationPage) -> list[Row]:
 
 def _compare(page: PopulationPage) -> None:
     rows = _require_selection(page)
-    if not 2 <= len(rows) <= MAX_ROBOTS:
-        raise UriError(f"{len(rows)} selected robots to compare; expected 2 to {MAX_ROBOTS}")
+    if not 2 <= len(rows) <= MAX_COMPARED:
+        raise UriError(f"{len(rows)} selected robots to compare; expected 2 to {MAX_COMPARED}")
     page.session.open_address(Address("compare", tuple(row.uri for row in rows)))
 
 
 def _export(page: PopulationPage) -> None:
-    """Send a zip with the bundles of the selected robots, each in a folder of its name."""
-    session, rows = page.session, _require_selection(page)
-    futures = [session.workers.submit(bundle_files, row.uri, session.files) for row in rows]
-    files: dict[str, bytes] = {}
-    size = 0
-    for i, (row, future) in enumerate(zip(rows, futures, strict=True)):
-        session.set_status(f"packing {len(rows)} robots", i / len(rows))
-        bundle = session.workers.result(future)
-        files |= {f"{i:04d}-{row.name}/{path}": data for path, data in bundle.items()}
-        size += sum(map(len, bundle.values()))
-        if size > MAX_EXPORT:
-            for waiting in futures:
-                waiting.cancel()
-            raise UriError(
-                f"the first {i + 1} of {len(rows)} robots have {size / 2**20:.0f} MB; at most "
-                f"{MAX_EXPORT // 2**20} MB are exported: select fewer, or copy their folders"
-            )
-    content = zip_files("robots", files)
-    session.client.send_file_download("robots.zip", content, save_immediately=True)
-    session.set_status("")
+    uris = [row.uri for row in _require_selection(page)]
+    page.session.run_in_background(lambda: send_bundles(page.session, uris))
+
+
+def _choose(page: PopulationPage) -> None:
+    """Add the selected robots to the tray."""
+    rows = _require_selection(page)
+    page.session.choose((*page.session.chosen, *(row.uri for row in rows)))
 
 
 def _add_choice(page: PopulationPage) -> ChooseSides:

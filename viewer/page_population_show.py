@@ -8,20 +8,20 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from morphgen.model.rotation import to_matrix
 from morphgen.typing import Array
 from morphgen.viewer import markup, population_layout, scene_population
 from morphgen.viewer.address import Address
+from morphgen.viewer.comparison import format_moves
 from morphgen.viewer.population import Population, move_roles
 from morphgen.viewer.population_hover import update_script
-from morphgen.viewer.population_pick import View, project, robot_at, robots_in
+from morphgen.viewer.population_pick import camera_view, project, robot_at, robots_in
 from morphgen.viewer.population_source import (
     NUM_POSES,
     Source,
     load_free_configurations,
     load_map,
 )
-from morphgen.viewer.population_state import format_selection, role_key, selection_text
+from morphgen.viewer.population_state import format_selection, selection_text
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.scene_stage import add_ground, add_scale_bar, background_colour, look_at
 from morphgen.viewer.session import Session, set_value
@@ -188,8 +188,6 @@ def show_selection(page: PopulationPage) -> None:
 
 def _show_in_address(page: PopulationPage) -> None:
     key = _arrangement(page)
-    shares = {role_key(role): "" for role in page.sliders}
-    shares |= {role_key(role): f"{share:g}" for role, share in page.moved.items()}
     page.session.update_address(
         page.session.address.subject,
         arrange="" if key == "grid" else key,
@@ -197,16 +195,8 @@ def _show_in_address(page: PopulationPage) -> None:
         y=page.axes[1].value if key == "scatter" else "",
         pose=str(page.pose) if page.pose else "",
         select=format_selection(page.selected),
-        **shares,
+        **format_moves(page.moved, tuple(page.sliders)),
     )
-
-
-def _view(client: viser.ClientHandle) -> View:
-    """Return the camera of a browser."""
-    camera = client.camera
-    w, x, y, z = camera.wxyz.tolist()
-    rotation = np.array(to_matrix((w, x, y, z)))
-    return View(np.asarray(camera.position), rotation, camera.fov, camera.aspect)
 
 
 def connect_pointer(page: PopulationPage) -> None:
@@ -223,7 +213,7 @@ def connect_pointer(page: PopulationPage) -> None:
 
 
 def _clicked_robot(page: PopulationPage, event: viser.SceneClickEvent) -> int | None:
-    view = _view(page.session.client)
+    view = camera_view(page.session.client)
     capsules = project(view, page.population, page.scene.T_world_shape)
     return robot_at(capsules, np.array(event.screen_pos) * (view.aspect, 1.0))
 
@@ -241,7 +231,7 @@ def _toggle_robot(page: PopulationPage, event: viser.SceneClickEvent) -> None:
 
 def _select_rectangle(page: PopulationPage, event: viser.SceneRectSelectEvent) -> None:
     """Select the robots inside a rectangle instead of the previous selection."""
-    view = _view(page.session.client)
+    view = camera_view(page.session.client)
     corners = np.array([event.screen_min, event.screen_max]) * (view.aspect, 1.0)
     centres = page.population.home_bounds.mean(axis=1)
     centres[:, :2] += page.scene.positions
@@ -253,7 +243,9 @@ def _update_hover_later(page: PopulationPage) -> None:
     """Send the browser's hover table, once what moves has stopped."""
 
     def update() -> None:
-        capsules = project(_view(page.session.client), page.population, page.scene.T_world_shape)
+        capsules = project(
+            camera_view(page.session.client), page.population, page.scene.T_world_shape
+        )
         run_javascript(page.session.client, update_script(capsules))
 
     page.session.call_later(HOVER_DELAY, update, "hover")

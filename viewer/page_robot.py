@@ -72,11 +72,7 @@ def show(session: Session) -> None:
     scene_stage.look_at(session.client, low, high)
     view = scene_robot.add_robot(session.client.scene, robot, "/robot")
     page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
-    rollouts = ""
-    if has_tool(robot) and robot.dof:
-        links = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
-        rollouts = f"<br>see it {' · '.join(links)}"
-    gui.add_html(summary(robot, rollouts))
+    gui.add_html(summary(robot, _links(robot, uri)))
     tabs = gui.add_tab_group()
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
         _add_move_tab(page)
@@ -126,6 +122,19 @@ def _location(session: Session, uri: str) -> str:
     ]
     neighbours = markup.dim(" · ".join(links)) if links else ""
     return markup.breadcrumbs(*steps, (uri_name(uri), None)) + markup.framed(neighbours)
+
+
+def _links(robot: Robot, uri: str) -> str:
+    """Return links to what can be done with a robot, as HTML."""
+    links = [markup.choose_box(uri, "choose")]
+    if robot.provenance.get("derivation"):
+        target = Address("compose", (uri.removeprefix(WORDS),))
+        links.append(markup.link(target, "Edit in Compose"))
+    links.append(markup.link(Address("compare", (uri,)), "compare"))
+    if has_tool(robot) and robot.dof:
+        play = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
+        links.append(f"see it {' · '.join(play)}")
+    return f"<br>{' · '.join(links)}"
 
 
 def _add_move_tab(page: RobotPage) -> None:
@@ -236,8 +245,6 @@ def _add_downloads_tab(page: RobotPage) -> None:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
         session.on_change(button, functools.partial(session.run_in_background, send))
     gui.add_html(markup.framed(markup.command(_command(page))))
-    compare = Address("compare", (page.uri, page.uri))
-    gui.add_html(markup.framed(markup.link(compare, "compare it with another robot")))
 
 
 def _command(page: RobotPage) -> str:

@@ -22,6 +22,7 @@ from morphgen.viewer.gallery_grid import (
     show_saved,
 )
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
+from morphgen.viewer.page_index import show_index
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.session import Session
@@ -53,6 +54,9 @@ def show(session: Session) -> None:
     Raises:
         MorphgenError: If the split does not exist or cannot be read.
     """
+    if not session.address.subject:
+        show_index(session)
+        return
     name = session.address.subject
     split = resolve_split(name, session.files)
     gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")

@@ -12,6 +12,7 @@ PAGES: Mapping[str, str] = {
     "population": "morphgen.viewer.page_population:show",
     "robot": "morphgen.viewer.page_robot:show",
     "compose": "morphgen.viewer.page_compose:show",
+    "chosen": "morphgen.viewer.page_chosen:show",
     "compare": "morphgen.viewer.page_compare:show",
     "split": "morphgen.viewer.page_split:show",
     "play": "morphgen.viewer.page_play:show",

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from morphgen.errors import CompositionError, nearest
+from morphgen.errors import CompositionError, MorphgenError, nearest
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest, PartKind
 from morphgen.grammar.parameters import Parameter, parse_value
-from morphgen.grammar.request import MAIN_PORTS, SLOTS
+from morphgen.grammar.request import MAIN_PORTS, SLOTS, parse_request
 from morphgen.viewer.robot_tables import slider_step
 
 NO_PART = "(none)"
@@ -118,19 +118,59 @@ def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
 
 
 def controls_of(slot: str, manifest: Manifest) -> list[Control]:
-    """Return a slider for every parameter of a part."""
+    """Return a slider for every parameter of a part in a slot."""
     return [
-        Control(
-            f"{slot}.{name}",
-            name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
-            parameter.minimum,
-            parameter.maximum,
-            1.0 if parameter.integer else slider_step(parameter.minimum, parameter.maximum),
-            parameter.default,
-            parameter.summary or name,
-        )
+        _control(f"{slot}.{name}", name, parameter)
         for name, parameter in parameters_of(slot, manifest).items()
     ]
+
+
+def node_controls(node: Derivation, library: Library, *, is_root: bool) -> list[Control]:
+    """Return a slider for every parameter of a part of a derivation; the keys are their names."""
+    manifest = library.manifest(node.part)
+    parameters = manifest.parameters if is_root else manifest.attached_parameters
+    names = dict(node.parameters)
+    return [
+        _control(name, name, parameter) for name, parameter in parameters.items() if name in names
+    ]
+
+
+def _control(key: str, name: str, parameter: Parameter) -> Control:
+    return Control(
+        key,
+        name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
+        parameter.minimum,
+        parameter.maximum,
+        1.0 if parameter.integer else slider_step(parameter.minimum, parameter.maximum),
+        parameter.default,
+        parameter.summary or name,
+    )
+
+
+def choice_of(derivation: Derivation, library: Library) -> PartChoice | None:
+    """Return the parts that give a derivation; None if words cannot describe it."""
+    words = []
+    for node in derivation.walk():
+        limb, _, kind = node.label.rpartition("_")
+        if kind not in SLOTS:
+            return None
+        slot = f"{limb}.{kind}" if limb else kind
+        if node.part != "none":
+            words.append(f"{slot}={node.part}")
+        defaults = {
+            name: parameter.default
+            for name, parameter in parameters_of(slot, library.manifest(node.part)).items()
+        }
+        words += [
+            f"{slot}.{name}={format_number(value)}"
+            for name, value in node.parameters
+            if format_number(value) != format_number(defaults[name])
+        ]
+    try:
+        is_same = parse_request(words, library) == derivation
+        return parse_choice(words, library) if is_same else None
+    except MorphgenError:
+        return None  # labels that only look like slots
 
 
 def with_part(choice: PartChoice, slot: str, part: str, library: Library) -> PartChoice:

@@ -10,8 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
+from morphgen.model.rotation import to_matrix
 from morphgen.typing import Array
 from morphgen.viewer.population import Population, instance_centres
 
@@ -45,6 +47,14 @@ class Capsules:
     """Shape (k,)."""
     robot: NDArray[np.intp]
     """Shape (k,)."""
+
+
+def camera_view(client: viser.ClientHandle) -> View:
+    """Return the camera of a browser."""
+    camera = client.camera
+    w, x, y, z = camera.wxyz.tolist()
+    rotation = np.array(to_matrix((w, x, y, z)))
+    return View(np.asarray(camera.position), rotation, camera.fov, camera.aspect)
 
 
 def project_points(view: View, points: Array) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -39,24 +39,6 @@ def parse_selection(text: str, n: int) -> NDArray[np.bool_]:
         start = parse_count(first, n)
         selected[start : (parse_count(last, -1) if dash else start) + 1] = True
     return selected
-
-
-def parse_shares(state: Mapping[str, str], roles: tuple[str, ...]) -> dict[str, float]:
-    """Return the share of its range of each role that an address moves; see ``role_key``."""
-    shares = {}
-    for role in roles:
-        try:
-            share = float(state.get(role_key(role), "nan"))
-        except ValueError:
-            continue
-        if not np.isnan(share):
-            shares[role] = min(max(share, 0.0), 1.0)
-    return shares
-
-
-def role_key(role: str) -> str:
-    """Return the key of a role in the address, such as ``joint1``."""
-    return role.replace(" ", "")
 
 
 def selection_text(rows: Sequence[Row]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +26,7 @@ from morphgen.viewer.robot_uri import (
     member_uri,
     parent_folder,
     resolve_split,
+    uri_name,
 )
 
 T = TypeVar("T")
@@ -179,6 +180,12 @@ def folder_rows(text: str, files: FileAccess) -> list[Row]:
     return rows
 
 
+def robot_folders(root: Path) -> list[str]:
+    """Return the folders of robots below a folder and below its ``robots/``, relative to it."""
+    below = [f"robots/{name}" for name in robot_subfolders(root / "robots")]
+    return [*robot_subfolders(root), *below]
+
+
 def robot_subfolders(folder: Path) -> list[str]:
     """Return the sorted names of the subfolders that hold robots, sets or bundles."""
     if not folder.is_dir():
@@ -206,6 +213,25 @@ def split_rows(name: str, split: Split) -> list[Row]:
         )
         for i, (side, member) in enumerate(members)
     ]
+
+
+def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
+    """Return the rows of robots; those of sets and splits have the facts that these know.
+
+    Raises:
+        MorphgenError: If a robot's split or folder does not exist.
+    """
+    rows = []
+    for i, uri in enumerate(uris):
+        split, folder = member_split(uri), parent_folder(uri)
+        listed: Iterable[Row] = ()
+        if split:
+            listed = split_rows(split, resolve_split(split, files))
+        elif folder and (files.path(folder) / INDEX).is_file():
+            listed = folder_rows(folder, files)
+        row = next((row for row in listed if row.uri == uri), Row(uri_name(uri), uri))
+        rows.append(replace(row, order=i))
+    return rows
 
 
 def part_rows(library: Library) -> list[Row]:

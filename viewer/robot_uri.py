@@ -44,6 +44,8 @@ from morphgen.model.robot import Robot
 
 WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 """Schemes of robot URIs; a URI without scheme is a path."""
+DEFAULT_WORDS = "arm=ur5 ee=plane"
+"""Words of the robot that pages show when none is named."""
 EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
 MAX_ERROR = 1000
 """Longest error that a page shows [characters]."""

@@ -28,6 +28,7 @@ from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS, installed_simulators
 from morphgen.tasks.renderer import render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.viewer.address import MAX_PLAYED
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,
@@ -41,8 +42,6 @@ from morphgen.viewer.robot_uri import (
     with_library_meshes,
 )
 
-MAX_ROBOTS = 9
-"""Robots of a rollout."""
 MAX_CHECKPOINTS = 50
 """Checkpoints that a page offers."""
 
@@ -126,7 +125,7 @@ class Rollout:
         self._robots: list[_SimulatedRobot] = []
         spec = _read_controller(config.policy, config.task, files)
         first_error: MorphgenError | None = None
-        for uri in config.robots[:MAX_ROBOTS]:
+        for uri in config.robots[:MAX_PLAYED]:
             progress(f"preparing {uri_name(uri)}")
             try:
                 self._robots.append(_start_robot(config, uri, spec, files))

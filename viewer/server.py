@@ -21,8 +21,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from morphgen.viewer.access import AccessPolicy, content_security_policy, refusal_reason
+from morphgen.viewer.frame import frame_page
 from morphgen.viewer.messages import message_fault
-from morphgen.viewer.page_cover import cover_page
 from morphgen.viewer.viser_internals import disable_share_links
 
 MAX_REQUEST_LINE = 65_536
@@ -34,6 +34,11 @@ _starting = threading.Lock()
 """Held while websockets' ``serve`` is replaced."""
 
 Answer = Callable[[ServerConnection, Request], Response | None]
+Receive = Callable[[str, str], bool]
+"""Receives a request of a page's script: the token of the page, and a query. Returns whether there
+is such a page."""
+REQUESTS = "/morphgen/"
+"""Path of these requests, before the token."""
 
 
 class _OneLine(logging.Filter):
@@ -64,13 +69,21 @@ class _Connection(ServerConnection):
         return data
 
 
-def start_server(host: str, port: int, policy: AccessPolicy) -> viser.ViserServer:
+def start_server(
+    host: str, port: int, policy: AccessPolicy, receive: Receive = lambda token, query: False
+) -> viser.ViserServer:
     """Start viser's server; every request has to pass the access policy.
+
+    Args:
+        host: Address to bind.
+        port: Port; if it is taken, the next free one.
+        policy: The access policy.
+        receive: Receives the requests of the pages' scripts.
 
     Raises:
         RuntimeError: If the installed viser does not start a websockets server.
     """
-    with _starting, _guarded(policy), contextlib.redirect_stdout(io.StringIO()):
+    with _starting, _guarded(policy, receive), contextlib.redirect_stdout(io.StringIO()):
         # Silent, because viser's banner would name the port before ``morphgen view`` does.
         server = viser.ViserServer(host=host, port=port, verbose=False)
     disable_share_links(server)
@@ -86,7 +99,7 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 @contextlib.contextmanager
-def _guarded(policy: AccessPolicy) -> Iterator[None]:
+def _guarded(policy: AccessPolicy, receive: Receive) -> Iterator[None]:
     """Apply the policy to the websockets server that viser starts meanwhile.
 
     viser passes no options to ``websockets.serve``, so the function itself is replaced.
@@ -99,7 +112,7 @@ def _guarded(policy: AccessPolicy) -> Iterator[None]:
         started.append(True)
         return original(
             *arguments,
-            process_request=functools.partial(_answer, policy, process_request),
+            process_request=functools.partial(_answer, policy, receive, process_request),
             create_connection=_Connection,
             logger=_LOG,
             **options,
@@ -115,18 +128,27 @@ def _guarded(policy: AccessPolicy) -> Iterator[None]:
 
 
 def _answer(
-    policy: AccessPolicy, serve_file: Answer, connection: ServerConnection, request: Request
+    policy: AccessPolicy,
+    receive: Receive,
+    serve_file: Answer,
+    connection: ServerConnection,
+    request: Request,
 ) -> Response | None:
     """Answer a request; None lets a websocket be opened."""
     if reason := refusal_reason(policy, request.path, request.headers):
         return _text_response(http.HTTPStatus.FORBIDDEN, reason)
+    if request.path.startswith(REQUESTS):
+        token, _, query = request.path.removeprefix(REQUESTS).partition("?")
+        if receive(token, query):
+            return _text_response(http.HTTPStatus.OK, "ok")
+        return _text_response(http.HTTPStatus.NOT_FOUND, "there is no such page any more.")
     try:
         response = serve_file(connection, request)
     except (OSError, ValueError):  # the path is not a valid file name
         return _text_response(http.HTTPStatus.NOT_FOUND, "there is no such file.")
     if response is not None:
         if request.path.partition("?")[0] in ("/", "/index.html"):
-            cover_page(response)
+            frame_page(response)
         csp = content_security_policy(policy, request.headers["Host"])
         response.headers["Content-Security-Policy"] = csp
         response.headers["X-Content-Type-Options"] = "nosniff"

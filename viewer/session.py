@@ -1,42 +1,28 @@
-"""A session: one browser with its page, its URL, and the threads that work for it."""
+"""A session: a page in a browser, its URL, and the threads that work for it."""
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import traceback
-import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar, cast
 
-import msgspec
 import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address, AddressError
-from morphgen.viewer.page_cover import REVEAL
+from morphgen.viewer.address import Address, require_few_chosen
+from morphgen.viewer.frame import REVEAL, bar_html, call, shown_address, tray_html
+from morphgen.viewer.location import DEFAULT_WIDTH
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.viser_internals import run_javascript
 from morphgen.viewer.workers import Workers
 
 BUG = "this is a bug of morphgen; its traceback is in the terminal where the viewer was started"
 """Text that a page shows for an unexpected error."""
-URL_TIMEOUT = 20.0
-"""Time in which a browser has to report its URL [s]."""
-
-_READ_LOCATION = """
-const name = Object.keys(localStorage).find((key) => key.endsWith(%s));
-const asked = new URLSearchParams(window.location.search).get("theme");
-if (asked === "dark" || asked === "light") localStorage.setItem("morphgen-theme", asked);
-const theme = localStorage.getItem("morphgen-theme");
-const dark = theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
-if (name) localStorage.setItem(name, JSON.stringify({query: window.location.search, dark}));
-"""
-
 Work = Callable[[], object]
 T = TypeVar("T")
 
@@ -47,34 +33,83 @@ class Status(Protocol):
     content: str
 
 
+class SessionClosed(RuntimeError):  # noqa: N818
+    """The browser has left the session's page, or has disconnected."""
+
+
+def _new_events() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "morphgen-events")
+
+
+def _new_background() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "morphgen-background")
+
+
 @dataclass(eq=False)
 class Session:
-    """One browser. A thread of its own handles the user's actions one after the other."""
+    """A page in a browser. A thread handles the user's actions one after the other.
 
-    client: viser.ClientHandle
+    The next page in the same browser has a session of its own, see ``next_session``.
+    """
+
+    browser: viser.ClientHandle
     files: FileAccess
     workers: Workers
     """Processes for slow work, shared by all browsers."""
     address: Address
-    """Address of the current page with its state, as the URL shows it."""
+    """Address of the page with its state, as the URL shows it."""
     dark: bool = False
     """Whether the page is dark."""
+    width: int = DEFAULT_WIDTH
+    """Width of the browser's window when the page was opened [pixels]."""
+    chosen: tuple[str, ...] = ()
+    """URIs of the robots in the tray."""
+    visit: int = 0
+    """Number of the page in this browser, counted from the load of the browser's page."""
     cache: dict[str, object] = field(default_factory=dict)
     """Results of slow work, shared by all browsers."""
     closed: threading.Event = field(default_factory=threading.Event)
-    """Set when the browser has disconnected; long work has to check it."""
-    events: ThreadPoolExecutor = field(
-        default_factory=lambda: ThreadPoolExecutor(1, "morphgen-events")
-    )
-    background: ThreadPoolExecutor = field(
-        default_factory=lambda: ThreadPoolExecutor(1, "morphgen-background")
-    )
+    """Set when the browser has left the page or disconnected; long work has to check it."""
+    events: ThreadPoolExecutor = field(default_factory=_new_events)
+    """Thread of all pages in this browser, so that a page's work ends before the next begins."""
+    background: ThreadPoolExecutor = field(default_factory=_new_background)
     pending: set[str] = field(default_factory=set)
     """Keys of queued work that has not started yet."""
     lock: threading.Lock = field(default_factory=threading.Lock)
     close_callbacks: list[Work] = field(default_factory=list)
     status: Status | None = None
     """Line of the page that shows the current activity."""
+    title: str = "morphgen"
+    """Title of the browser's tab."""
+    on_choice: Work | None = None
+    """Called after the user has chosen other robots."""
+
+    @property
+    def client(self) -> viser.ClientHandle:
+        """The browser, for work on the page.
+
+        Raises:
+            SessionClosed: If the browser shows another page now.
+        """
+        if self.closed.is_set():
+            raise SessionClosed("the browser has left this page")
+        return self.browser
+
+    def next_session(self, visit: int, *, dark: bool, width: int) -> Session:
+        """Close the session; return one for another page in the same browser."""
+        self.close()
+        return Session(
+            self.browser,
+            self.files,
+            self.workers,
+            self.address,
+            dark,
+            width,
+            self.chosen,
+            visit,
+            self.cache,
+            events=self.events,
+        )
 
     def enqueue(self, work: Work, key: str = "") -> None:
         """Run work on the session's event thread, after everything that was enqueued before.
@@ -141,7 +176,7 @@ class Session:
         attach(changed)
 
     def on_close(self, work: Work) -> None:
-        """Call quick work when the browser disconnects; immediately if it already has."""
+        """Call quick work when the browser leaves the page; immediately if it already has."""
         with self.lock:
             if not self.closed.is_set():
                 self.close_callbacks.append(work)
@@ -149,14 +184,18 @@ class Session:
         work()
 
     def close(self) -> None:
-        """Drop the session's queued work; running work ends by itself."""
+        """Drop the page's queued work; running work ends by itself."""
         with self.lock:
             self.closed.set()
             callbacks, self.close_callbacks = self.close_callbacks, []
         for work in callbacks:
             work()
-        self.events.shutdown(wait=False, cancel_futures=True)
         self.background.shutdown(wait=False, cancel_futures=True)
+
+    def disconnect(self) -> None:
+        """Close the session of a browser that has disconnected."""
+        self.close()
+        self.events.shutdown(wait=False, cancel_futures=True)
 
     def open_panel(
         self, width: float, header: str, status: str = "", *, left: bool = False
@@ -166,16 +205,18 @@ class Session:
         gui.set_panel_label("morphgen")
         (gui.main_panel.dock_left if left else gui.main_panel.dock_right)()
         gui.main_panel.set_width(width)
-        theme = "light" if self.dark else "dark"
-        switch = markup.link(self.address.with_state(theme=theme), theme)
-        gui.add_html(f'{markup.STYLE}<div class="mg theme">{switch}</div>{header}')
+        gui.add_html(f"{markup.STYLE}{header}")
         self.status = gui.add_html(markup.status(status))
         if status:  # the page says what it does, so there is something to see
             self.reveal()
 
     def reveal(self) -> None:
         """Remove the cover that hides the page until its content is there."""
-        run_javascript(self.client, REVEAL)
+        self.run_script(REVEAL)
+
+    def run_script(self, source: str) -> None:
+        """Run JavaScript in the browser."""
+        run_javascript(self.client, source)
 
     def set_status(self, text: str, fraction: float | None = None) -> None:
         """Show the current activity and its progress in [0, 1]; an empty text clears the line."""
@@ -197,11 +238,12 @@ class Session:
         self.notify("That did not work", self.files.redact(error), error=True)
 
     def show_address(self, title: str) -> None:
-        """Show the address in the browser's URL, without loading it, and a title in its tab."""
-        run_javascript(
-            self.client,
-            f"""window.history.replaceState(null, "", {json.dumps(self.address.query)});
-            document.title = {json.dumps(title)};""",
+        """Show the address in the browser's URL and top bar, and a title in its tab."""
+        self.title = title
+        address = shown_address(self.address, self.chosen)
+        bar = bar_html(self.address, self.chosen, dark=self.dark)
+        self.run_script(
+            call("address", self.visit, address.query, title) + call("bar", bar, self.dark)
         )
 
     def update_address(self, title: str, **state: str) -> None:
@@ -209,9 +251,29 @@ class Session:
         self.address = self.address.with_state(**state)
         self.show_address(title)
 
-    def open_address(self, address: Address) -> None:
-        """Load another page, as a link would."""
-        run_javascript(self.client, f"window.location.assign({json.dumps(address.query)});")
+    def open_address(self, address: Address, *, instead: bool = False) -> None:
+        """Open another page, as a link would; ``instead``: Back will not lead to this one."""
+        self.run_script(call("visit", address.query, instead))
+
+    def choose(self, uris: Sequence[str]) -> None:
+        """Put robots into the tray in place of the previous ones.
+
+        Raises:
+            AddressError: If they do not fit into the address.
+        """
+        chosen = tuple(dict.fromkeys(uris))
+        try:
+            require_few_chosen(chosen)
+            self.chosen = chosen
+        finally:
+            self.show_tray()
+        self.show_address(self.title)
+        if self.on_choice is not None:
+            self.on_choice()
+
+    def show_tray(self) -> None:
+        """Show the chosen robots in the browser's tray and check boxes."""
+        self.run_script(call("tray", tray_html(self.chosen), self.chosen))
 
     def _submit(self, threads: ThreadPoolExecutor, work: Work, key: str) -> None:
         with self.lock:
@@ -250,38 +312,3 @@ class Session:
 def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
     """Set the value of a control, which viser's types declare as read-only."""
     handle.value = value
-
-
-@dataclass(frozen=True)
-class Location:
-    """The URL and the theme that a browser reports."""
-
-    query: str = ""
-    """Query of its URL with the question mark; empty if there is none."""
-    dark: bool = False
-    """Whether pages are dark: as the address says (``theme=dark``) or said before, else as the
-    browser prefers."""
-
-
-def read_location(client: viser.ClientHandle) -> Location:
-    """Return the URL and the theme of a browser.
-
-    viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
-    local storage, under a key that no other tab uses, and viser reads it from there.
-
-    Raises:
-        AddressError: If the browser sends something else.
-        RuntimeError: If the browser has disconnected, or has no local storage.
-        TimeoutError: If it does not answer.
-    """
-    key = f"morphgen-{uuid.uuid4().hex}"
-    client.local_storage.set_item(key, "")
-    run_javascript(client, _READ_LOCATION % json.dumps(key))
-    try:
-        text = client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
-    finally:
-        client.local_storage.remove_item(key)
-    try:
-        return msgspec.json.decode(text, type=Location) if text else Location()
-    except msgspec.MsgspecError as error:
-        raise AddressError(f"the browser sent no valid location: {error}") from error

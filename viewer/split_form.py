@@ -17,16 +17,23 @@ ChooseSides = Callable[[], tuple[list[Row], list[Row]]]
 """Function that returns the robots to train on and those to test on."""
 
 
-def add_split_form(session: Session, add_choice: Callable[[], ChooseSides], hint: str = "") -> None:
+def add_split_form(
+    session: Session,
+    add_choice: Callable[[], ChooseSides],
+    hint: str = "",
+    *,
+    expanded: bool = False,
+) -> None:
     """Add controls that save a new split.
 
     Args:
         session: The browser.
         add_choice: Adds the controls that choose the sides; returns the function that reads them.
         hint: Text above the controls.
+        expanded: Whether the controls are shown before the user opens their folder.
     """
     gui = session.client.gui
-    with gui.add_folder("New split", expand_by_default=False):
+    with gui.add_folder("New split", expand_by_default=expanded):
         if hint:
             gui.add_html(markup.framed(markup.dim(hint)))
         name = gui.add_text("split name", "")

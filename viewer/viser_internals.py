@@ -4,6 +4,7 @@ No other module of the viewer uses a private name of viser. ``pyproject.toml`` r
 1.2; check this module before raising that limit. Why each part is needed:
 
 - ``RunJavascriptMessage``: viser has no public way to read or change a browser's URL.
+- Callbacks of the camera: viser can add them, but not remove them.
 - Message classes and handlers: viser applies what browsers send without validating it, so
   ``messages`` has to see it first. Public callbacks run only after the value has been applied.
 - Share links: a browser may ask viser to publish the page on the internet through another server,
@@ -47,6 +48,16 @@ def run_javascript(client: viser.ClientHandle, source: str) -> None:
     """Run JavaScript in a browser."""
     client._websock_connection.queue_message(_messages.RunJavascriptMessage(source=source))
     client.flush()
+
+
+def clear_page(client: viser.ClientHandle) -> None:
+    """Remove everything that a page has added to a browser: controls, nodes and callbacks."""
+    with client.atomic():
+        client.gui.reset()
+        client.scene.reset()
+    client.scene.remove_click_callback()
+    client.scene.remove_rect_select_callback()
+    client.camera._state.camera_cb.clear()
 
 
 def replace_handlers(

@@ -63,7 +63,7 @@ def test_allowed_origins_are_served(tmp_path):
     viewing = start("view", "--port", "8934", "--allow-origin", site)
     port = int(re.search(r":(\d+)", address(viewing))[1])
     with PlainClient(port, origin=site, host="hub.example.com") as client:
-        client.shows("Categories")
+        client.shows("Grammars")
     with pytest.raises(InvalidStatus):
         PlainClient(port, origin="https://other.example.com")
     viewing.send_signal(signal.SIGTERM)
@@ -78,7 +78,7 @@ def test_ipv6_address_is_served(tmp_path):
     port = int(where.rpartition(":")[2])
     assert where == f"http://[::1]:{port}"
     with PlainClient(port, address="::1", origin=where) as client:
-        client.shows("Categories")
+        client.shows("Grammars")
     viewing.send_signal(signal.SIGTERM)
     assert viewing.communicate(timeout=60)[1] == ""
 

@@ -124,12 +124,12 @@ class PlainClient:
             self.send({"type": "FileTransferPart", "source_component_uuid": button, **part})
 
     def sent_to(self):
-        """Wait until the server makes the page load another one; return its query."""
+        """Wait until the server makes the page open another one; return its query."""
 
         def found():
             sources = [m["source"] for m in self.messages if m["type"] == "RunJavascriptMessage"]
-            orders = [each for each in sources if "location.assign" in each]
-            return orders and msgspec.json.decode(orders[-1].split("(", 1)[1].rstrip(");"))
+            orders = [each for each in sources if "?.visit(" in each]
+            return orders and json.JSONDecoder().raw_decode(orders[-1].split("(", 1)[1])[0]
 
         return self.until(found)
 

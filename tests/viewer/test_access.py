@@ -126,7 +126,7 @@ def test_foreign_host_name_gets_no_websocket(viewer):
 def test_own_pages_and_allowed_origins_get_a_websocket(viewer, origin):
     on = viewer(origins=[HUB])
     with PlainClient(on.port, origin=origin and origin.format(port=on.port)) as client:
-        client.shows("Categories")
+        client.shows("Grammars")
 
 
 def fetched(port, path="/", **headers):

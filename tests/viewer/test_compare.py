@@ -16,14 +16,15 @@ from morphgen.viewer.comparison import (
     compare_robots,
     fit_quality,
     fit_table,
+    format_moves,
     iou_colour,
     joint_roles,
     normalized_positions,
+    parse_moves,
     similarity_table,
     with_roles,
 )
 from morphgen.viewer.figures import heatmap_svg, map_svg, token_differences, tokens_png
-from morphgen.viewer.page_compare import parse_uris
 
 LIBRARY = default_library()
 
@@ -99,8 +100,14 @@ def test_colours_go_from_red_over_yellow_to_green():
     assert iou_colour(1.0) == (47, 158, 68)
 
 
-def test_uris_are_read_from_lines():
-    assert parse_uris(" a \n\nwords:arm=ur5 ee=plane\n") == ("a", "words:arm=ur5 ee=plane")
+def test_moves_of_roles_are_kept_in_an_address():
+    roles = ["joint 1", "joint 2", "finger 1"]
+    state = format_moves({"joint 1": -0.5}, roles)
+    assert state == {"joint1": "-0.5", "joint2": "", "finger1": ""}
+    assert parse_moves(state | {"joint2": "x", "finger1": "-3"}, roles, -1.0) == {
+        "joint 1": -0.5,
+        "finger 1": -1.0,
+    }
 
 
 def test_figures_link_to_robots_and_escape_names():

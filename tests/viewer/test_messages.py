@@ -31,11 +31,11 @@ from morphgen.viewer.messages import message_fault
 def test_malformed_message_closes_only_its_connection(viewer, capfd, message):
     on = viewer()
     with PlainClient(on.port) as client, PlainClient(on.port) as other:
-        client.shows("Categories")
+        client.shows("Grammars")
         client.send(message)
         code, reason = client.until_closed()
         assert (code, bool(reason)) == (1008, True)
-        other.shows("Categories")
+        other.shows("Grammars")
     assert capfd.readouterr() == ("", "")
 
 

@@ -4,12 +4,16 @@ import pytest
 
 from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
+from morphgen.viewer.page_compose_parameters import with_parameter
 from morphgen.viewer.part_choice import (
     NO_PART,
+    choice_of,
     controls_of,
     first_parts,
+    node_controls,
     parse_choice,
     part_options,
     slots_of,
@@ -120,3 +124,27 @@ def test_derivation_is_built_part_by_part():
         assert [node.label for node in partial.walk()] == [node.label for node in whole[:n]]
         assert compose(partial, LIBRARY, name).links
     assert first_parts(derivation, 99) == derivation
+
+
+@pytest.mark.parametrize("words", [WORDS, "base=planar ee=cube", "arm=arm3 ee=claw ee.mount_yaw=1"])
+def test_a_derivation_of_words_is_edited_by_its_parts(words):
+    derivation, _ = parse_words(words.split(), LIBRARY)
+    choice = choice_of(derivation, LIBRARY)
+    assert choice is not None
+    assert parse_words(choice.words.split(), LIBRARY)[0] == derivation
+
+
+@pytest.mark.parametrize(
+    "text", ["arm3=arm3(length=0.3)[flange: claw=claw]", "body=cubes(size=0.1, travel=1)"]
+)
+def test_a_derivation_of_another_shape_has_no_words(text):
+    assert choice_of(parse_derivation(text), LIBRARY) is None
+
+
+def test_parameters_of_any_derivation_can_be_changed():
+    derivation = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.2)]")
+    changed = with_parameter(derivation, "beam1", "length", 0.3)
+    assert str(changed) == "post=post(height=0.05)[top: beam1=beam(length=0.3)]"
+    node = derivation.children[0][1]
+    (control,) = node_controls(node, LIBRARY, is_root=False)
+    assert (control.key, control.label) == ("length", "length (m)")

@@ -14,7 +14,7 @@ from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Link, Robot
 from morphgen.viewer import population_layout as layout
-from morphgen.viewer.comparison import with_roles
+from morphgen.viewer.comparison import parse_moves, with_roles
 from morphgen.viewer.population import make_population, move_roles, robot_bounds, shape_poses
 from morphgen.viewer.population_hover import SCALE, pack_capsules
 from morphgen.viewer.population_pick import View, project, project_points, robot_at, robots_in
@@ -30,7 +30,6 @@ from morphgen.viewer.population_state import (
     card,
     format_selection,
     parse_selection,
-    parse_shares,
 )
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, owned_set, read_robot_uri
@@ -199,7 +198,7 @@ def test_selections_and_shares_survive_the_address():
     assert format_selection(np.zeros(3, bool)) == ""
     roles = ("joint 1", "joint 2", "finger 1")
     state = {"joint1": "0.25", "joint2": "7", "finger1": "x"}
-    assert parse_shares(state, roles) == {"joint 1": 0.25, "joint 2": 1.0}
+    assert parse_moves(state, roles, 0.0) == {"joint 1": 0.25, "joint 2": 1.0}
 
 
 def test_cards_escape_names():

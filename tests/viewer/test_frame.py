@@ -1,0 +1,180 @@
+"""The frame of the pages: links of the top bar, the tray, and the requests of its script."""
+
+import http.client
+import json
+import re
+from urllib.parse import quote
+
+import pytest
+
+from helpers.viser_client import PlainClient
+from morphgen.viewer.address import (
+    MAX_CHOSEN,
+    Address,
+    AddressError,
+    parse_address,
+    require_few_chosen,
+)
+from morphgen.viewer.frame import page_links, shown_address, tray_html
+
+A, B = "words:arm=ur5 ee=plane", "robots/prims/prims-000001"
+
+
+def targets(address, chosen=()):
+    return {label: target.query for label, target, _ in page_links(address, chosen)}
+
+
+def test_links_of_the_bar_keep_the_subject_of_the_page():
+    of_set = targets(Address("gallery", ("robots/prims",)))
+    assert of_set["Population"] == "?population=robots/prims"
+    of_robot = targets(Address("robot", (B,)))
+    assert of_robot["Gallery"] == "?gallery=robots/prims"
+    assert of_robot["Playback"] == f"?play=reach&robot={B}"
+    of_words = targets(Address("robot", (A,)))
+    assert of_words["Compose"] == "?compose=arm=ur5%20ee=plane"
+    assert targets(Address("split", ("mine",)))["Population"] == "?population=mine"
+    assert targets(Address("library"))["Compare"] == "?compare="
+
+
+def test_links_of_the_bar_take_the_chosen_robots():
+    links = targets(Address("robot", ("robots/x",)), [A, B])
+    assert links["Compare"] == "?compare=words:arm=ur5%20ee=plane&compare=" + B
+    assert links["Playback"].count("robot=") == 2
+
+
+def test_the_page_itself_is_marked_in_the_bar():
+    links = page_links(Address("compose", ("chain",)), ())
+    assert [label for label, _, is_current in links if is_current] == ["Compose"]
+
+
+def test_the_tray_offers_what_its_robots_can_do():
+    assert tray_html([]) == ""
+    one = tray_html([B])
+    assert "1 chosen" in one
+    assert "?compare=" not in one
+    assert "?play=reach&amp;robot=robots/prims/prims-000001" in one
+    assert "?compare=" in tray_html([A, B])
+    many = tray_html([f"robots/r{i}" for i in range(12)])
+    assert "?compare=" not in many
+    assert "?play=" not in many
+    assert "?chosen=robots/r0&amp;chosen=robots/r1" in many
+
+
+def test_the_address_of_every_page_keeps_the_chosen_robots():
+    shown = shown_address(Address("library"), [A, B])
+    assert parse_address(shown.query).chosen == (A, B)
+    chosen = parse_address(f"?chosen={A}&chosen={B}&train=1")
+    assert chosen == Address("chosen", (A, B), {"train": "1"})
+    assert shown_address(chosen, [B]).query == f"?chosen={B}&train=1"
+
+
+def test_too_many_chosen_robots_are_refused():
+    require_few_chosen(["x" * (MAX_CHOSEN - 10)])
+    with pytest.raises(AddressError, match="choose fewer"):
+        require_few_chosen(["x" * MAX_CHOSEN])
+
+
+class Script:
+    """Sends what the script of a page sends."""
+
+    def __init__(self, client, port):
+        self.client, self.port = client, port
+        (source,) = client.until(lambda: [s for s in self.sources() if "?.connect(" in s][-1:])
+        self.token = json.JSONDecoder().raw_decode(source.split("(", 1)[1])[0]
+
+    def sources(self):
+        kind = "RunJavascriptMessage"
+        return [m["source"] for m in self.client.messages if m["type"] == kind]
+
+    def send(self, action, value, visit=0, token=None):
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        path = f"/morphgen/{token or self.token}?{action}={quote(value)}&visit={visit}&dark="
+        connection.request("GET", path)
+        return connection.getresponse().status
+
+    def addresses(self):
+        """Return the addresses that the page has shown, with the numbers of their pages."""
+        text = "\n".join(self.sources())
+        found = re.findall(r'\.address\((\d+), "((?:[^"\\\\]|\\\\.)*)"', text)
+        return [(int(number), json.loads(f'"{query}"')) for number, query in found]
+
+
+def test_a_script_opens_another_page_in_place(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?library=") as client:
+        script = Script(client, on.port)
+        client.shows("Grammars")
+        (first,) = on.sessions.values()
+        assert script.send("open", f"?robot={A}", visit=1) == 200
+        client.control("Slider", "opacity")
+        client.until(lambda: (1, "?robot=words:arm=ur5%20ee=plane") in script.addresses())
+        (second,) = on.sessions.values()
+        assert first.closed.is_set()
+        assert second.events is first.events
+        assert script.send("open", "?robot=nowhere", visit=2) == 200
+        client.shows("no such file or folder")
+
+
+def test_a_script_chooses_robots(viewer):
+    on = viewer()
+    with PlainClient(on.port, f"?library=&chosen={A}") as client:
+        script = Script(client, on.port)
+        client.shows("1 chosen")
+        assert script.send("choose", B) == 200
+        client.shows("2 chosen")
+        client.until(
+            lambda: (
+                f"?library=&chosen={quote(A, safe='/=:')}&chosen={B}"
+                in dict(script.addresses()).values()
+            )
+        )
+        script.send("open", "?gallery=robots/prims", visit=1)
+        client.until(lambda: any(n == 1 and query.endswith(B) for n, query in script.addresses()))
+        script.send("drop", A)
+        script.send("clear", "")
+        client.until(lambda: script.addresses()[-1] == (1, "?gallery=robots/prims"))
+        script.send("choose", "x" * MAX_CHOSEN)
+        client.shows("choose fewer")
+        script.send("explode", "")
+        client.shows("no action of the tray")
+
+
+def test_only_the_script_of_a_page_can_change_it(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?library=") as client:
+        script = Script(client, on.port)
+        assert script.send("open", "?split=", token="x" * 32) == 404
+        assert script.send("choose", A, token="../library") == 404
+    client.websocket.close()
+    with PlainClient(on.port, "?library=") as other:
+        other.shows("Grammars")
+        assert script.send("open", "?split=") == 404
+
+
+@pytest.mark.parametrize("page", ["gallery", "population", "split"])
+def test_pages_without_a_subject_list_what_there_is(viewer, page):
+    with PlainClient(viewer().port, f"?{page}=") as client:
+        client.shows(f"{page}=extrapolation/arms/reach" if page != "gallery" else "robots/prims")
+
+
+def test_compare_without_robots_offers_a_picker(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?compare=") as client:
+        client.shows("Compare two to four robots")
+        client.change(client.control("Text", "or words"), "arm=ur5 ee=plane")
+        client.send(
+            {
+                "type": "GuiUpdateMessage",
+                "uuid": client.control("Button", "Add"),
+                "updates": {"value": True},
+            }
+        )
+        assert client.sent_to() == "?compare=words:arm=ur5%20ee=plane"
+
+
+def test_chosen_robots_become_the_sides_of_a_split(viewer):
+    uris = [f"robots/prims/prims-00000{i}" for i in range(3)]
+    query = "?" + "&".join(f"chosen={uri}" for uri in uris) + "&train=1"
+    with PlainClient(viewer().port, query) as client:
+        client.shows("train (1)")
+        client.shows("test (2)")
