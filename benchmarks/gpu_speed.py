@@ -1,7 +1,7 @@
 """Speed of physics and training on a GPU, beside MuJoCo Warp alone in the same run.
 
     python benchmarks/gpu_speed.py physics [--splits A B] [--envs 1024 4096] [--json rows.json]
-    python benchmarks/gpu_speed.py training [--agents me-tf] [--split SPLIT] [--envs 16384]
+    python benchmarks/gpu_speed.py training [--agents me-tf] [--epochs 2] [--envs 16384]
     python benchmarks/gpu_speed.py robots [--grammar serial] [--numbers 10 300] [--envs 16384]
     python benchmarks/gpu_speed.py copies [--split SPLIT] [--envs 1024]
 
@@ -64,6 +64,7 @@ def main() -> int:
     parser.add_argument("--numbers", type=int, nargs="+", default=(10, 300))
     parser.add_argument("--envs", type=int, nargs="+", default=None)
     parser.add_argument("--agents", nargs="+", default=AGENTS)
+    parser.add_argument("--epochs", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--device", default="cuda")
@@ -173,12 +174,15 @@ def _steps_per_second(step: Callable[[int], object], envs: int) -> float:
     return envs * STEPS / (time.perf_counter() - began)
 
 
-def _learner(agent: str, split: str, envs: int, *, device: str, compiled: bool) -> Learner:
+def _learner(
+    agent: str, split: str, envs: int, *, epochs: int, device: str, compiled: bool
+) -> Learner:
     """Return a learner on the train robots of a split."""
     policy = PolicyConfig(agent, discrete=False)
     config = PPOConfig(
         total_timesteps=10**12,
         num_steps=16,
+        epochs=epochs,
         minibatches=max(16 * envs // 32768, 1),
         symlog=False,
         slow_critic=False,
@@ -199,7 +203,14 @@ def _learner(agent: str, split: str, envs: int, *, device: str, compiled: bool) 
 
 def _training(agent: str, split: str, envs: int, args: argparse.Namespace) -> Row:
     """Return transitions per second of training, and where the time goes."""
-    learner = _learner(agent, split, envs, device=args.device, compiled=not args.no_compile)
+    learner = _learner(
+        agent,
+        split,
+        envs,
+        epochs=args.epochs,
+        device=args.device,
+        compiled=not args.no_compile,
+    )
     for _ in range(2):
         learner.iterate()
     updates = [learner.iterate() for _ in range(args.rounds)]
@@ -214,6 +225,7 @@ def _training(agent: str, split: str, envs: int, args: argparse.Namespace) -> Ro
         "agent": agent,
         "split": split,
         "environments": envs,
+        "epochs": learner.config.epochs,
         "parameters": parameters,
         "collected/s": transitions / collect,
         "learned/s": transitions / learn,
@@ -254,7 +266,7 @@ def _robots(grammar: str, number: int, envs: int, device: str) -> Row:
 
 def _copies(split: str, envs: int, device: str) -> Row:
     """Return the number of copies between device and host in a rollout."""
-    learner = _learner("me-mlp", split, envs, device=device, compiled=False)
+    learner = _learner("me-mlp", split, envs, epochs=1, device=device, compiled=False)
     for _ in range(2):
         learner.iterate()
     activities = [torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]

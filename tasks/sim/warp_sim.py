@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 
@@ -26,6 +28,7 @@ from morphgen.tasks.sim.mujoco_model import World, worlds
 from morphgen.tasks.sim.warp_group import Group
 from morphgen.tasks.sim.warp_model import structures
 
+_log = logging.getLogger(__name__)
 DIVERGED = "diverged: a target or the state is not finite, or a velocity is too large"
 
 
@@ -201,6 +204,8 @@ class _Streams:
 
     def __init__(self, device: str, groups: Sequence[Group]) -> None:
         """Capture the control step of each group, after one step that loads the kernels."""
+        if not kernels_stored(wp.get_device(device).arch):
+            _log.warning("compiling MuJoCo Warp for this GPU: about three minutes, once")
         self._device = device
         self._streams = [wp.Stream(device) for _ in groups]
         self._graphs: list[wp.Graph] = []
@@ -220,6 +225,15 @@ class _Streams:
             stream.wait_event(begun)
             wp.capture_launch(graph, stream=stream)
             main.wait_event(stream.record_event())
+
+
+def kernels_stored(arch: int) -> bool:
+    """Return whether an earlier start compiled kernels for GPUs of an architecture.
+
+    Args:
+        arch: Compute capability, such as 90 for 9.0.
+    """
+    return any(Path(wp.config.kernel_cache_dir).rglob(f"*.sm{arch}.cubin"))
 
 
 def _fault(overflow: int) -> str:

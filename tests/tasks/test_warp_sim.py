@@ -19,7 +19,7 @@ from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
-from morphgen.tasks.sim import warp_group
+from morphgen.tasks.sim import warp_group, warp_sim
 from morphgen.tasks.sim.warp_model import structures
 from morphgen.tasks.sim.warp_sim import WarpSimulation
 from morphgen.tasks.step_graph import StepGraph
@@ -251,6 +251,14 @@ def test_without_a_gpu_the_simulator_is_refused_by_name():
         make_batch("reach", ["arm3"], 1, sim="warp")
     with pytest.raises(TaskError, match="device 'cuda': this machine has no CUDA device"):
         make_batch("reach", ["arm3"], 1, sim="warp", device="cuda")
+
+
+def test_kernels_of_another_gpu_do_not_count_as_compiled(tmp_path, monkeypatch):
+    monkeypatch.setattr(warp_sim.wp.config, "kernel_cache_dir", str(tmp_path))
+    (tmp_path / "module").mkdir()
+    (tmp_path / "module" / "module.sm90.cubin").touch()
+    assert warp_sim.kernels_stored(90)
+    assert not warp_sim.kernels_stored(80)
 
 
 def test_policies_of_the_simulator_are_judged_in_mujoco():
