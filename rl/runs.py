@@ -20,9 +20,11 @@ from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
 from morphgen.rl.robot_source import RobotSource, identity, most_obstacles, tasks_of
 from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.collision_geometry import require_geometry
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.sim.base import CollisionGeometry
 from morphgen.tasks.task import TaskConfig
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
@@ -72,6 +74,8 @@ class RunConfig:
     """Seed of weights, actions, minibatches and episodes."""
     sim: str = field(default_factory=default_simulator)
     """Name of the simulator."""
+    geometry: CollisionGeometry = "primitive"
+    """Collision shapes of the robots in training; evaluations have all of them."""
     num_envs: int = 128
     """Number of parallel environments of all robots together."""
     device: str = "cpu"
@@ -101,6 +105,7 @@ class RunConfig:
             raise TaskError(f"--envs {self.num_envs}: expected 1 or more")
         if self.sim not in SIMULATORS:
             raise TaskError(f"unknown simulator {self.sim!r}{nearest(self.sim, SIMULATORS)}")
+        require_geometry(self.geometry)
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
         if self.slice_updates < 0:

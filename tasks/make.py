@@ -16,6 +16,7 @@ from morphgen.grammar.robot_source import RobotLike, is_one_robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.collision_geometry import require_geometry, with_geometry
 from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.observation import ObservationConfig
@@ -23,7 +24,7 @@ from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.random_numbers import require_seed
 from morphgen.tasks.registry import SIMULATORS, default_simulator, installed_simulators
 from morphgen.tasks.robot_tables import build_robot_tables
-from morphgen.tasks.sim.base import Contacts, Simulator
+from morphgen.tasks.sim.base import CollisionGeometry, Contacts, Simulator
 from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
@@ -46,6 +47,7 @@ class BatchOptions(TypedDict, total=False):
     first: int
     layouts: LayoutSide
     device: str
+    geometry: CollisionGeometry
 
 
 def make_batch(
@@ -161,6 +163,7 @@ def batch_from_specs(
     first: int = 0,
     layouts: LayoutSide = "train",
     device: str = "cpu",
+    geometry: CollisionGeometry = "primitive",
     library: Iterable[Path] = (),
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
@@ -180,6 +183,8 @@ def batch_from_specs(
         first: Number of the first environment, where a batch is made in parts.
         layouts: Layouts of obstacles that episodes draw from: those of training or of evaluation.
         device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
+        geometry: Collision shapes of the simulated robots: all (``primitive``), or one for each
+            link (``light``). Observations and goals do not depend on it.
         library: Folders of your own parts.
 
     Raises:
@@ -198,15 +203,15 @@ def batch_from_specs(
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
     simulator = SIMULATORS[sim or default_simulator()]
     require_simulator_device(simulator.name, device)
-    _require_contacts(simulator, specs)
+    _require_contacts(simulator, specs, geometry)
+    folders = default_library(tuple(library)).folders
     robots = [spec.robot for spec in specs]
     if max_links is None:
         max_links = default_max_links(len(robot.links) for robot in robots)
-    tables = build_robot_tables(
-        robots, default_library(tuple(library)).folders, max_links=max_links, device=device
-    )
+    tables = build_robot_tables(robots, folders, max_links=max_links, device=device)
     env_robot_index = [(first + i) % len(specs) for i in range(num_envs)]
-    scenes = [specs[i].scene for i in env_robot_index]
+    simulated = with_geometry([spec.scene for spec in specs], geometry, folders)
+    scenes = [simulated[i] for i in env_robot_index]
     simulation = simulator.load(scenes, contacts, workers, torch.device(device))
     return TaskBatch(
         tables,
@@ -221,14 +226,22 @@ def batch_from_specs(
     )
 
 
-def _require_contacts(simulator: Simulator, specs: Sequence[EnvSpec]) -> None:
+def _require_contacts(
+    simulator: Simulator, specs: Sequence[EnvSpec], geometry: CollisionGeometry
+) -> None:
     """Require a simulator with contacts if a scene has something to touch.
 
     Raises:
-        TaskError: If a scene has a block or obstacles that the simulator would ignore.
+        TaskError: If the geometry is unknown, or if a scene has a block or obstacles, or a geometry
+            was chosen, that the simulator would ignore.
     """
+    require_geometry(geometry)
     if simulator.simulates_contacts:
         return
+    if geometry != "primitive":
+        raise TaskError(
+            f"collision geometry {geometry!r}: simulator {simulator.name!r} has no contacts"
+        )
     for spec in specs:
         if spec.scene.block is not None or spec.scene.obstacles:
             thing = "a block" if spec.scene.block is not None else "obstacles"

@@ -26,6 +26,7 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.presets import PRESETS, preset_of
 from morphgen.tasks.channels import CHANNELS
 from morphgen.tasks.registry import TASKS, default_simulator
+from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
 if TYPE_CHECKING:
     from morphgen.rl.agent_spec import AgentSpec
@@ -114,6 +115,13 @@ TRAINING_OPTIONS = (
         "agent se on a split: give each robot all steps and environments instead of a share",
     ),
     opt.MAX_LINKS,
+    option(
+        "--geometry",
+        choices=COLLISION_GEOMETRIES,
+        default=COLLISION_GEOMETRIES[0],
+        help="collision shapes of the robots in training: all primitives, or one for each link, "
+        "which is faster (light); evaluations have all (default: primitive)",
+    ),
     *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
 )
 """Options of the commands that train from random weights."""
@@ -248,6 +256,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
         ppo,
         seed=args.seed,
         sim=args.sim or default_simulator(),
+        geometry=args.geometry,
         num_envs=args.envs or preset.num_envs,
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,

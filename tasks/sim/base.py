@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import IDENTITY, Pose
@@ -22,6 +22,10 @@ CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
 GRAVITY = 9.81
 """Gravity along -z [m/s^2]. Robots carry their own weight, as controllers of real arms ensure."""
+CollisionGeometry = Literal["primitive", "light"]
+"""Collision shapes of simulated robots. ``primitive``: all primitives. ``light``: for each link the
+one that its token describes, which overlaps them most; fewer shapes take less time."""
+COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 
 
 @dataclass(frozen=True)
