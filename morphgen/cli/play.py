@@ -117,6 +117,11 @@ def play(args: argparse.Namespace) -> None:
     number("--envs", "number of environments", default=64),
     opt.sim_option(),
     opt.WORKERS,
+    option(
+        "--device",
+        help="device of the environments: cpu, or cuda with --sim warp or kinematic (default: cpu; "
+        "warp: cuda)",
+    ),
     OBSTACLES,
     option(
         "--seconds",
@@ -132,6 +137,7 @@ def play(args: argparse.Namespace) -> None:
     examples=(
         "speed reach arm=ur5 ee=plane --envs 128 --sim mujoco",
         "speed push arm=panda ee=panda_hand --workers 2",
+        "speed reach arm3 --envs 4096 --sim warp",
     ),
 )
 def speed(args: argparse.Namespace) -> None:
@@ -150,6 +156,7 @@ def speed(args: argparse.Namespace) -> None:
             args.envs,
             sim=sim,
             workers=args.workers,
+            device=args.device or SIMULATORS[sim].devices[0],
             obstacles=args.obstacles,
             max_links=None,
             progress=progress,
@@ -164,7 +171,7 @@ def speed(args: argparse.Namespace) -> None:
         shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
         return (
             f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
-            f"{args.workers} worker(s)\n"
+            f"{batch.device.type}, {args.workers} worker(s)\n"
             f"environment steps per second: {result.steps_per_second:,.0f}\n"
             f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
             f"{tabulate(shares)}"

@@ -24,7 +24,7 @@ def test_speed_prints_rates_and_shares(sim, capsys):
     assert facts["shares"]["simulator"] > 0
     assert main(words) == 0
     text = capsys.readouterr().out
-    assert f"reach, arm3, 2 environments, {sim}, 1 worker(s)" in text
+    assert f"reach, arm3, 2 environments, {sim}, cpu, 1 worker(s)" in text
     assert "physics steps per second" in text
 
 
@@ -46,6 +46,7 @@ def test_robots_above_the_default_max_links_can_be_measured(capsys):
             ["reach", "arm3", "--workers", "0"],
             "argument --workers: 0: expected a whole number, 1 or more",
         ),
+        (["reach", "arm3", "--sim", "mujoco", "--device", "cuda"], "device 'cuda'"),
         (["reach", "ur55-plane"], "'ur55' is not a part"),
         (
             ["push", "prims", "--sim", "kinematic"],
