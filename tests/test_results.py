@@ -24,6 +24,7 @@ DOCS = [
 RUNS = (
     ("`me-graph` with MuJoCo", r"me-graph|graph-", "mujoco"),
     ("`me-graph` without contacts", r"me-graph|graph-", "kinematic"),
+    ("`me-graph` with MuJoCo Warp", r"me-graph|graph-", "warp"),
     ("`me-mlp` and `me-tf`", r"me-mlp|me-tf", "kinematic"),
 )
 """Runs that the docs name, a pattern of their agents, and their simulator."""
