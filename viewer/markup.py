@@ -8,6 +8,8 @@ from html import escape
 from morphgen.model.findings import Finding
 from morphgen.viewer.address import Address
 
+SELECTED = "#00bedc"
+"""Colour of what belongs to the selected link: ``scene_selection.SELECTED``."""
 STYLE = """<style>
 .mg{font-size:13px;line-height:1.45;padding:0 .8em .3em .8em;color:inherit}
 .mg a{color:#1864ab;text-decoration:none}.mg a:hover{text-decoration:underline}
@@ -47,6 +49,9 @@ background:#f1f3f5}
 .mg .card .empty{display:flex;align-items:center;justify-content:center;color:#adb5bd;
 font-size:11px}
 .mg .card .text{padding:5px 8px 7px 8px}.mg .card .name{font-weight:600;overflow-wrap:anywhere}
+.mg .selected{border-left:4px solid #00bedc;padding-left:8px;background:#00bedc18;
+margin:4px 0 8px 0}
+.mg .selected th{color:inherit}
 .mg .dim{color:#868e96;font-size:11.5px}.mg .bar{height:3px;background:#8882;margin-top:3px}
 .mg .bar div{height:3px;background:#339af0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}

@@ -16,18 +16,18 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
-from morphgen.model.kinematics import joint_limits, random_configurations, reach
+from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
-from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables, scene_robot, scene_stage
 from morphgen.viewer.address import Address
+from morphgen.viewer.page_robot_move import ANGLES, add_move_tab, set_angles
+from morphgen.viewer.page_robot_select import NO_LINK, connect_links, select_link, show_card
 from morphgen.viewer.page_robot_show import (
     RobotPage,
     add_toggles,
     apply_toggle,
     parse_joints,
-    read_sliders,
     set_configuration,
     show_in_address,
     update_scene,
@@ -48,11 +48,8 @@ from morphgen.viewer.session import Session, set_value
 
 PANEL_WIDTH = 390.0
 """Width of the panel [pixels]."""
-MAX_TRIES = 500
-"""Random configurations that are tested to find one without collision."""
 RENDER_TIMEOUT = 60.0
 """Time in which the browser has to send a screenshot [s]."""
-_NO_LINK = "(none)"
 
 
 def show(session: Session) -> None:
@@ -73,9 +70,10 @@ def show(session: Session) -> None:
     view = scene_robot.add_robot(session.client.scene, robot, "/robot")
     page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
     gui.add_html(summary(robot, _links(robot, uri)))
+    page.texts["card"], page.texts["mark"] = gui.add_html(""), gui.add_html("")
     tabs = gui.add_tab_group()
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
-        _add_move_tab(page)
+        add_move_tab(page)
     with tabs.add_tab("Show", viser.Icon.EYE):
         add_toggles(page)
     with tabs.add_tab("Links", viser.Icon.BINARY_TREE):
@@ -85,6 +83,7 @@ def show(session: Session) -> None:
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
         _add_downloads_tab(page)
     session.set_status("")
+    connect_links(page)
     _apply_address(page)
     session.run_in_background(lambda: _check_robot(page))
 
@@ -94,17 +93,6 @@ def summary(robot: Robot, links: str) -> str:
     distance = reach(robot) if has_tool(robot) and robot.dof else None
     facts = robot_tables.summary(robot, distance)
     return markup.framed(f"<h3>{escape(robot.name)}</h3>", markup.dim(facts + links))
-
-
-def free_configuration(
-    checker: SelfCollisionChecker, robot: Robot, rng: np.random.Generator
-) -> Array | None:
-    """Return a random configuration without self-collision; None if all tries collide."""
-    for _ in range(MAX_TRIES):
-        q = random_configurations(robot, 1, rng)
-        if list(checker.penetrations(q)) == [{}]:
-            return np.asarray(q[0])
-    return None
 
 
 def _location(session: Session, uri: str) -> str:
@@ -137,57 +125,18 @@ def _links(robot: Robot, uri: str) -> str:
     return f"<br>{' · '.join(links)}"
 
 
-def _add_move_tab(page: RobotPage) -> None:
-    """Add a slider for each joint, by part, and buttons for special configurations."""
-    gui, session, robot = page.session.client.gui, page.session, page.robot
-    buttons = gui.add_button_group("Go to", ("home", "zero", "random free"))
-    session.on_change(buttons, lambda: _go_to(page, buttons.value))
-    page.texts["collisions"] = gui.add_html("")
-    sliders: dict[int, viser.GuiSliderHandle[float]] = {}
-    limits = joint_limits(robot)
-    for chain in robot_tables.joint_groups(robot):
-        with gui.add_folder(chain.title):
-            for row in chain.rows:
-                joint = robot.joints[robot.independent_joints[row]]
-                low, high = (float(value) for value in limits[row])
-                sliders[row] = gui.add_slider(
-                    robot_tables.short_name(joint, chain),
-                    low,
-                    max(high, low + 1e-9),  # viser rejects an empty range
-                    robot_tables.slider_step(low, high),
-                    float(np.clip(page.q[row], low, high)),
-                    hint=robot_tables.joint_hint(joint),
-                )
-    page.sliders = [sliders[row] for row in range(robot.dof)]
-    page.slider_values = [slider.value for slider in page.sliders]
-    for slider in page.sliders:
-        session.on_change(slider, lambda: read_sliders(page), "move")
-
-
-def _go_to(page: RobotPage, target: str) -> None:
-    """Move the robot to a configuration: ``home``, ``zero`` or ``random free``."""
-    if target == "random free":
-        if page.checker is None:
-            page.checker = SelfCollisionChecker(page.robot)
-        q = free_configuration(page.checker, page.robot, np.random.default_rng())
-        if q is None:
-            text = f"{MAX_TRIES} random ones collide"
-            page.session.notify("No free configuration", text, error=True)
-            return
-    else:
-        q = np.array(page.robot.home) if target == "home" else np.zeros(page.robot.dof)
-        q = np.clip(q, *joint_limits(page.robot).T)
-    set_configuration(page, q)
-
-
 def _apply_address(page: RobotPage) -> None:
-    """Restore the configuration and the toggles from the page's address."""
+    """Restore the configuration, the toggles, the unit and the link from the page's address."""
     state = page.session.address.state
     shown = state.get("show", "visual").split(",")
     for name, box in page.toggles.items():
         if box.value != (name in shown):
             set_value(box, name in shown)
             apply_toggle(page, name)
+    if state.get("angles") in ANGLES:
+        set_angles(page, state["angles"])
+    if state.get("link") in page.robot.link_index:
+        select_link(page, state["link"])
     q = parse_joints(state.get("q", ""), page.robot)
     if q is not None:
         set_configuration(page, q)
@@ -196,22 +145,17 @@ def _apply_address(page: RobotPage) -> None:
 
 
 def _add_links_tab(page: RobotPage) -> None:
-    """Add the table of links, and a dropdown that paints one red and shows its properties."""
+    """Add a dropdown that selects a link with all its properties, and the table of links."""
     gui = page.session.client.gui
-    dropdown = gui.add_dropdown("Link", (_NO_LINK, *(link.name for link in page.robot.links)))
-    details = gui.add_html("")
+    page.link_choice = gui.add_dropdown(
+        "Link", (NO_LINK, *(link.name for link in page.robot.links))
+    )
+    page.texts["details"] = gui.add_html("")
     gui.add_html(markup.framed(robot_tables.link_table(page.robot)))
-
-    def select_link() -> None:
-        name = dropdown.value
-        if name == _NO_LINK:
-            details.content = ""
-            page.view.paint_red(())
-        else:
-            details.content = markup.framed(robot_tables.link_details(page.robot, name))
-            page.view.paint_red((name,))
-
-    page.session.on_change(dropdown, select_link)
+    choice = page.link_choice
+    page.session.on_change(
+        choice, lambda: select_link(page, "" if choice.value == NO_LINK else choice.value)
+    )
 
 
 def _check_robot(page: RobotPage) -> None:
@@ -221,6 +165,8 @@ def _check_robot(page: RobotPage) -> None:
     findings = list(check(page.robot, tool_required=has_tool(page.robot)))
     if ":" not in page.uri and (folder := session.files.path(page.uri)).is_dir():
         findings += file_findings(folder) if (folder / CARD).is_file() else ()
+    page.findings = tuple(findings)
+    session.enqueue(lambda: show_card(page))
     page.texts["findings"].content = markup.framed(markup.findings_table(findings, redact))
     session.set_status("")
     try:

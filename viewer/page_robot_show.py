@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import viser
@@ -12,6 +13,7 @@ import viser
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.fitting.replace_collision import as_primitives, stored_primitives
 from morphgen.formats.fits import read_stored_fits
+from morphgen.model.findings import Finding
 from morphgen.model.geometry import Pose
 from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.kinematics import frame_pose, joint_limits
@@ -50,8 +52,30 @@ class RobotPage:
     """Independent joint positions, shape (dof,) [rad or m]."""
     sliders: list[viser.GuiSliderHandle[float]] = field(default_factory=list)
     """Sliders in the order of q."""
+    slider_scales: list[float] = field(default_factory=list)
+    """Value of each slider per unit of q: 1, or 57.3 for an angle in degrees."""
     slider_values: list[float] = field(default_factory=list)
     """Values of the sliders when they were last read or set."""
+    slider_box: viser.GuiFolderHandle | None = None
+    """Holds the folders of sliders; None until the Move tab is there."""
+    slider_folders: list[viser.GuiFolderHandle] = field(default_factory=list)
+    angle_choice: viser.GuiDropdownHandle[str] | None = None
+    """Dropdown of the unit of angles; None for robots without rotational joints."""
+    hover_channel: viser.GuiTextHandle | None = None
+    """Hidden text field in which the browser names the joint under the pointer."""
+    angles: str = "rad"
+    """Unit of the sliders of rotational joints, ``rad`` or ``deg``."""
+    selected: str = ""
+    """Name of the selected link; empty if none is."""
+    outline: list[Any] = field(default_factory=list)
+    """Scene nodes of the selected link's outline."""
+    range_row: int | None = None
+    """Index in q of the joint whose axis and range are drawn."""
+    range_nodes: list[Any] = field(default_factory=list)
+    """Scene nodes of that axis and range."""
+    findings: tuple[Finding, ...] = ()
+    """Findings of the checks, once they are there."""
+    link_choice: viser.GuiDropdownHandle[str] | None = None
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     gizmo: viser.TransformControlsHandle | None = None
@@ -64,7 +88,8 @@ def set_configuration(page: RobotPage, q: Array) -> None:
     """Move the robot and its sliders to a configuration, shape (dof,)."""
     page.q = np.array(q, dtype=np.float64)
     for k, slider in enumerate(page.sliders):
-        set_value(slider, float(np.clip(page.q[k], slider.min, slider.max)))
+        value = robot_tables.rounded(page.q[k] * page.slider_scales[k], slider.step)
+        set_value(slider, float(np.clip(value, slider.min, slider.max)))
         page.slider_values[k] = slider.value
     update_scene(page)
 
@@ -73,7 +98,8 @@ def read_sliders(page: RobotPage) -> None:
     """Apply the sliders that the user moved; other joints keep their exact, unrounded position."""
     for k, slider in enumerate(page.sliders):
         if slider.value != page.slider_values[k]:
-            page.q[k] = page.slider_values[k] = slider.value
+            page.slider_values[k] = slider.value
+            page.q[k] = slider.value / page.slider_scales[k]
     update_scene(page)
 
 
@@ -99,13 +125,15 @@ def update_scene(page: RobotPage) -> None:
 
 
 def show_in_address(page: RobotPage) -> None:
-    """Put the configuration and the toggles into the page's address."""
+    """Put the configuration, toggles, unit and selected link into the page's address."""
     at_home = np.allclose(page.q, page.robot.home)
     toggles = ",".join(name for name, box in page.toggles.items() if box.value)
     page.session.update_address(
         page.robot.name,
         q="" if at_home else format_joints(page.q),
         show="" if toggles == "visual" else toggles,
+        angles="" if page.angles == "rad" else page.angles,
+        link=page.selected,
     )
 
 

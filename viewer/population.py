@@ -22,7 +22,7 @@ from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.comparison import all_roles, joint_roles
 from morphgen.viewer.robot_rows import Row
-from morphgen.viewer.scene_robot import shape_colour
+from morphgen.viewer.scene_shapes import shape_colour
 
 UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
 """Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.viewer import markup
@@ -74,6 +75,11 @@ def slider_step(low: float, high: float) -> float:
     return float(10.0 ** math.floor(math.log10((high - low) / 200)))
 
 
+def rounded(value: float, step: float) -> float:
+    """Return a value rounded to the digits of a slider's step, which is a power of ten."""
+    return round(value, max(-math.floor(math.log10(step)), 0))
+
+
 def summary(robot: Robot, reach: float | None) -> str:
     """Return a robot's numbers of links and joints, mass and reach [m] in one line."""
     facts = [f"{len(robot.links)} links", f"{robot.dof} DoF", f"{robot.mass:.3g} kg"]
@@ -132,6 +138,35 @@ def link_details(robot: Robot, name: str) -> str:
     )
 
 
+def link_card(robot: Robot, name: str, findings: Sequence[Finding]) -> str:
+    """Return a link's mass and inertia, its joint with limits, and the findings about both.
+
+    Args:
+        robot: The robot.
+        name: Name of the link.
+        findings: Findings about the robot; those about other links and joints are left out.
+    """
+    link, i = robot.link(name), robot.link_index[name]
+    joint = robot.joints[i - 1] if i else None
+    rows = _inertial_rows(link)
+    rows += [("joint", "none, it is the root")] if joint is None else _joint_rows(joint)
+    about = [f for f in findings if is_about(f, name, joint.name if joint else "")]
+    texts = [
+        f"{markup.tag(finding.severity, finding.severity)} {escape(finding.why)}"
+        for finding in about
+    ]
+    cells = [(escape(key), escape(text)) for key, text in rows]
+    cells.append(("findings", "<br>".join(texts) or "none"))
+    return markup.table((name, ""), cells)
+
+
+def is_about(finding: Finding, link: str, joint: str) -> bool:
+    """Return whether a finding names a link or a joint as its place."""
+    kind, _, names = finding.where.partition(" ")
+    name = {"link": link, "links": link, "joint": joint, "joints": joint}.get(kind)
+    return bool(name) and name in names.split(", ")
+
+
 def collision_text(pairs: Mapping[tuple[str, str], float]) -> str:
     """Return the colliding pairs of links with their penetration depths [m], deepest first."""
     if not pairs:
@@ -140,6 +175,25 @@ def collision_text(pairs: Mapping[tuple[str, str], float]) -> str:
     lines = [f"{escape(a)} in {escape(b)}: {1000 * d:.1f} mm" for (a, b), d in deepest[:6]]
     more = f"<br>and {len(deepest) - 6} more" if len(deepest) > 6 else ""
     return f"{markup.tag('collision', 'error')}<br>{'<br>'.join(lines)}{more}"
+
+
+def _joint_rows(joint: Joint) -> list[tuple[str, str]]:
+    """Return a joint's kind, its limits (angles in both units) and what drives it."""
+    position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)
+    rows = [("joint", f"{joint.name}, {joint.kind}")]
+    if joint.is_movable:
+        low, high = joint.effective_limits
+        limits = f"{low:.3g} to {high:.3g} {position}"
+        if joint.kind != "prismatic":
+            limits += f" ({math.degrees(low):.3g} to {math.degrees(high):.3g}°)"
+        rows.append(("limits", limits if joint.limits else "none"))
+    if joint.effort is not None:
+        rows.append(("effort", f"at most {joint.effort:.3g} {effort}"))
+    if joint.velocity is not None:
+        rows.append(("velocity", f"at most {joint.velocity:.3g} {speed}"))
+    if joint.mimic:
+        rows.append(("mimics", joint.mimic.joint))
+    return rows
 
 
 def _inertial_rows(link: Link) -> list[tuple[str, str]]:

@@ -16,7 +16,7 @@ from morphgen.model.mesh import load_mesh
 from morphgen.model.rotation_torch import quaternion_from_matrix
 from morphgen.typing import Array
 from morphgen.viewer.population import Population, Prototype, shape_poses
-from morphgen.viewer.scene_robot import SHARP_ANGLE, Rgb, Triangles, batch_colours, triangles
+from morphgen.viewer.scene_shapes import SHARP_ANGLE, Rgb, Triangles, batch_colours, triangles
 
 NODE = "/population"
 MAX_FACES = 3000

@@ -14,7 +14,8 @@ from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 from morphgen.viewer.episode import Episode, Track
-from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, robot_bounds
+from morphgen.viewer.scene_robot import RobotView, add_robot, robot_bounds
+from morphgen.viewer.scene_shapes import Rgb
 from morphgen.viewer.scene_stage import add_ground
 
 Position = tuple[float, float, float]

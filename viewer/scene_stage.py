@@ -10,7 +10,7 @@ import viser
 
 from morphgen.model.geometry import Box
 from morphgen.typing import Array
-from morphgen.viewer.scene_robot import Rgb, batch_colours, triangles
+from morphgen.viewer.scene_shapes import Rgb, batch_colours, triangles
 
 BRAND: Rgb = (24, 100, 171)
 """Colour of links, buttons and sliders."""

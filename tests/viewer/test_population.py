@@ -34,8 +34,8 @@ from morphgen.viewer.population_state import (
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, owned_set, read_robot_uri
 from morphgen.viewer.scene_population import quaternions, world_poses
-from morphgen.viewer.scene_robot import batch_colours
 from morphgen.viewer.scene_robot import robot_bounds as one_robot_bounds
+from morphgen.viewer.scene_shapes import batch_colours
 
 
 @pytest.fixture

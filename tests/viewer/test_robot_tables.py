@@ -7,7 +7,7 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.model.robot import Inertial
-from morphgen.viewer.page_robot import free_configuration
+from morphgen.viewer.page_robot_move import free_configuration
 from morphgen.viewer.page_robot_show import format_joints, parse_joints
 from morphgen.viewer.robot_tables import (
     collision_text,
@@ -18,7 +18,8 @@ from morphgen.viewer.robot_tables import (
     slider_step,
     summary,
 )
-from morphgen.viewer.scene_robot import inertia_ellipsoid, robot_bounds
+from morphgen.viewer.scene_robot import robot_bounds
+from morphgen.viewer.scene_shapes import inertia_box
 
 
 def test_joints_are_grouped_by_their_part():
@@ -83,17 +84,17 @@ def test_configurations_are_restored_from_urls():
         assert parse_joints(bad, robot) is None
 
 
-def test_the_ellipsoid_has_the_inertia_of_the_link():
+def test_the_box_has_the_inertia_of_the_link():
     a, b, c, m = 0.1, 0.2, 0.3, 2.0
-    moments = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) * m / 5
-    ellipsoid = inertia_ellipsoid(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
-    assert ellipsoid is not None
-    sizes, axes = ellipsoid
-    rebuilt = axes @ np.diag(m / 5 * (np.sum(sizes**2) - sizes**2)) @ axes.T
+    moments = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) * m / 12
+    box = inertia_box(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
+    assert box is not None
+    sizes, axes = box
+    rebuilt = axes @ np.diag(m / 12 * (np.sum(sizes**2) - sizes**2)) @ axes.T
     assert rebuilt == pytest.approx(np.diag(moments))
     assert np.linalg.det(axes) == pytest.approx(1)
-    assert inertia_ellipsoid(Inertial(0.0)) is None
-    assert inertia_ellipsoid(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
+    assert inertia_box(Inertial(0.0)) is None
+    assert inertia_box(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
 
 
 def test_bounds_contain_base_and_tip():
