@@ -52,6 +52,8 @@ font-size:11px}
 .mg .selected{border-left:4px solid #00bedc;padding-left:8px;background:#00bedc18;
 margin:4px 0 8px 0}
 .mg .selected th{color:inherit}
+.mg .scale{height:10px;border-radius:2px;margin-top:4px}
+.mg .ends{display:flex;justify-content:space-between;font-size:11.5px}
 .mg .dim{color:#868e96;font-size:11.5px}.mg .bar{height:3px;background:#8882;margin-top:3px}
 .mg .bar div{height:3px;background:#339af0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}

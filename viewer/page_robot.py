@@ -16,6 +16,7 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
+from morphgen.model.findings import Finding
 from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
@@ -25,13 +26,12 @@ from morphgen.viewer.page_robot_move import ANGLES, add_move_tab, set_angles
 from morphgen.viewer.page_robot_select import NO_LINK, connect_links, select_link, show_card
 from morphgen.viewer.page_robot_show import (
     RobotPage,
-    add_toggles,
-    apply_toggle,
     parse_joints,
     set_configuration,
     show_in_address,
     update_scene,
 )
+from morphgen.viewer.page_robot_toggles import add_toggles, apply_toggle, set_findings
 from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import neighbour_uris
 from morphgen.viewer.robot_tables import has_tool
@@ -165,8 +165,7 @@ def _check_robot(page: RobotPage) -> None:
     findings = list(check(page.robot, tool_required=has_tool(page.robot)))
     if ":" not in page.uri and (folder := session.files.path(page.uri)).is_dir():
         findings += file_findings(folder) if (folder / CARD).is_file() else ()
-    page.findings = tuple(findings)
-    session.enqueue(lambda: show_card(page))
+    session.enqueue(lambda: _show_findings(page, findings))
     page.texts["findings"].content = markup.framed(markup.findings_table(findings, redact))
     session.set_status("")
     try:
@@ -176,6 +175,11 @@ def _check_robot(page: RobotPage) -> None:
         page.texts["collisions"].content = markup.framed(markup.dim(text))
         return
     session.enqueue(lambda: update_scene(page), "move")
+
+
+def _show_findings(page: RobotPage, findings: list[Finding]) -> None:
+    set_findings(page, findings)
+    show_card(page)
 
 
 def _add_downloads_tab(page: RobotPage) -> None:

@@ -1,9 +1,8 @@
-"""The robot of a page in one browser: its configuration, its layers and overlays, its gizmo."""
+"""The robot of a page in one browser: its state, its configuration, and its address."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,30 +10,20 @@ import numpy as np
 import viser
 
 from morphgen.checks.self_collision import SelfCollisionChecker
-from morphgen.fitting.replace_collision import as_primitives, stored_primitives
-from morphgen.formats.fits import read_stored_fits
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Pose
-from morphgen.model.inverse_kinematics import solve_pose_ik
+from morphgen.model.geometry import Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables, scene_overlays, scene_robot
+from morphgen.viewer.page_robot_workspace import (
+    WorkspaceView,
+    slice_state,
+)
 from morphgen.viewer.robot_tables import has_tool
-from morphgen.viewer.robot_uri import with_library_meshes
-from morphgen.viewer.scene_overlays import Overlays, remove_overlay
+from morphgen.viewer.scene_overlays import Overlays
 from morphgen.viewer.session import Session, set_value
 
-FRAMES, GIZMO = "frames", "drag the tool"
-_SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
-    "joint axes": scene_overlays.show_joint_axes,
-    "centres of mass": scene_overlays.show_mass_centres,
-    "ignored pairs": scene_overlays.show_ignored_pairs,
-}
-TOGGLES = (*scene_robot.LAYERS, FRAMES, *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
-"""Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
-TOOL_TOGGLES = ("workspace", "trail", GIZMO)
-"""Toggles for robots with a tool only."""
 ADDRESS_DELAY = 0.5
 """Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
 
@@ -76,6 +65,10 @@ class RobotPage:
     findings: tuple[Finding, ...] = ()
     """Findings of the checks, once they are there."""
     link_choice: viser.GuiDropdownHandle[str] | None = None
+    layer_shapes: dict[scene_robot.Layer, Sequence[Sequence[Shape]]] = field(default_factory=dict)
+    """Shapes by link of the collision layer and the primitives, once they were shown."""
+    workspace: WorkspaceView | None = None
+    """Controls of the workspace; None for robots without a tool."""
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     gizmo: viser.TransformControlsHandle | None = None
@@ -134,6 +127,7 @@ def show_in_address(page: RobotPage) -> None:
         show="" if toggles == "visual" else toggles,
         angles="" if page.angles == "rad" else page.angles,
         link=page.selected,
+        slice=slice_state(page.workspace) if is_on(page, "workspace") else "",
     )
 
 
@@ -153,106 +147,6 @@ def parse_joints(text: str, robot: Robot) -> Array | None:
     return np.asarray(np.clip(q, *joint_limits(robot).T))
 
 
-def add_toggles(page: RobotPage) -> None:
-    """Add a checkbox for everything that can be shown, and the slider of the opacity."""
-    gui, session = page.session.client.gui, page.session
-    for name in TOGGLES:
-        if name in TOOL_TOGGLES and not has_tool(page.robot):
-            continue
-        box = page.toggles[name] = gui.add_checkbox(name, name == "visual")
-        session.on_change(box, functools.partial(apply_toggle, page, name))
-    opacity = gui.add_slider("opacity", 0.05, 1.0, 0.05, 1.0)
-    session.on_change(opacity, lambda: page.view.set_opacity(opacity.value), "opacity")
-
-
 def is_on(page: RobotPage, name: str) -> bool:
     """Return whether a toggle exists and is checked."""
     return name in page.toggles and page.toggles[name].value
-
-
-def apply_toggle(page: RobotPage, name: str) -> None:
-    """Show or hide what a toggle stands for."""
-    on = page.toggles[name].value
-    layer = next((layer for layer in scene_robot.LAYERS if layer == name), None)
-    if layer is not None:
-        _toggle_layer(page, layer, on)
-    elif name == FRAMES:
-        page.view.show_axes(on)
-    elif name == GIZMO:
-        _toggle_gizmo(page, on)
-    elif not on:
-        remove_overlay(page.overlays, name)
-    elif name in _SHOW_OVERLAY:
-        _SHOW_OVERLAY[name](page.overlays)
-    elif name == "workspace":
-        page.session.run_in_background(lambda: _show_workspace(page))
-    show_in_address(page)
-
-
-def _toggle_layer(page: RobotPage, layer: scene_robot.Layer, on: bool) -> None:
-    if layer in page.view.layers or not on:
-        page.view.set_visible(layer, on)
-    elif layer == "collision":
-        shapes = [link.collisions for link in page.robot.links]
-        page.view.show_shapes(layer, shapes)
-    elif layer == "inertia":
-        page.view.show_inertia()
-    else:
-        page.session.run_in_background(lambda: _show_primitives(page))
-
-
-def _show_primitives(page: RobotPage) -> None:
-    """Draw the primitives fitted to the links; fits that are not stored are computed."""
-    session = page.session
-    folders = session.files.library_folders
-    robot = with_library_meshes(page.robot, session.files.library)
-    primitives, missing = stored_primitives(robot, read_stored_fits(folders))
-    if missing:
-        session.set_status(f"fitting primitives to {len(missing)} links; this takes a while")
-        fitted = session.run_in_worker(as_primitives, robot, folders)
-        primitives = {link.name: link.collisions for link in fitted.links}
-    session.set_status("")
-    if is_on(page, "primitives"):
-        shapes = [primitives.get(link.name, ()) for link in robot.links]
-        session.enqueue(lambda: page.view.show_shapes("primitives", shapes))
-
-
-def _show_workspace(page: RobotPage) -> None:
-    page.session.set_status("sampling the workspace")
-    points = scene_overlays.sample_workspace(page.robot)
-    page.session.set_status("")
-    if is_on(page, "workspace"):
-        scene_overlays.show_workspace(page.overlays, points)
-
-
-def _toggle_gizmo(page: RobotPage, on: bool) -> None:
-    """Add or remove a gizmo at the tool; the robot follows it by inverse kinematics."""
-    if page.gizmo is not None:
-        page.gizmo.remove()
-        page.gizmo = None
-    if not on:
-        return
-    pose = Pose.from_matrix(frame_pose(page.robot, page.q))
-    page.gizmo = page.session.client.scene.add_transform_controls(
-        "/gizmo",
-        scale=0.2 * scene_robot.robot_extent(page.robot),
-        depth_test=False,
-        position=pose.position,
-        wxyz=pose.quaternion,
-    )
-
-    async def dragged(event: viser.TransformControlsEvent) -> None:
-        page.is_dragging = event.phase != "end"
-        page.session.enqueue(lambda: _follow_gizmo(page), "drag")
-
-    page.gizmo.on_update(dragged)
-
-
-def _follow_gizmo(page: RobotPage) -> None:
-    """Move the tool to the gizmo, or as near as the joint limits allow."""
-    if page.gizmo is None:
-        return
-    w, x, y, z = (float(value) for value in page.gizmo.wxyz)
-    px, py, pz = (float(value) for value in page.gizmo.position)
-    T_root_gizmo = Pose((px, py, pz), (w, x, y, z)).matrix
-    set_configuration(page, solve_pose_ik(page.robot, T_root_gizmo, page.q))

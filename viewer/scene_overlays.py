@@ -1,26 +1,33 @@
-"""Drawings over a robot: joint axes, centres of mass, ignored pairs, workspace and tool trail."""
+"""Drawings over a robot: axes, centres of mass, names, findings, workspace and tool trail."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from morphgen.model.frame_positions import frame_positions
-from morphgen.model.kinematics import random_configurations
-from morphgen.model.robot import Robot
+from morphgen.model.findings import Finding
+from morphgen.model.geometry import Box
 from morphgen.typing import Array
+from morphgen.viewer import workspace
 from morphgen.viewer.scene_robot import RobotView, robot_extent
+from morphgen.viewer.scene_shapes import Rgb, batch_colours, triangles
 
-NUM_POINTS = 12_000
-"""Configurations that are sampled to draw a workspace."""
 TRAIL_LENGTH = 400
 """Tool positions that a trail keeps."""
 _ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
-_NEAR, _FAR = np.array([32, 129, 226]), np.array([250, 176, 5])
-"""Colours of the workspace nearest to and farthest from the root."""
+_AMBER: Rgb = (232, 89, 12)
+"""Colour of the inertia of links with findings about it."""
+_SHELL: Rgb = (76, 110, 245)
+SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
+"""Colours of a slice of the workspace where few and where most configurations lead."""
+_INERTIA_CODES = ("inertia", "mass", "com-", "density")
+"""Beginnings of the codes of findings about mass and inertia."""
+_NAME_DISTANCE = 0.045
+"""Distance below which links share a label, in extents of the robot."""
 
 
 @dataclass(eq=False)
@@ -101,28 +108,98 @@ def show_ignored_pairs(overlays: Overlays) -> None:
         overlays.nodes["ignored pairs"] = [node]
 
 
-def sample_workspace(robot: Robot) -> Array:
-    """Return tool positions at uniformly random configurations, shape (n, 3) [m]."""
-    q = random_configurations(robot, NUM_POINTS, np.random.default_rng(0))
-    return frame_positions(robot, q.T).T
+def show_names(overlays: Overlays) -> None:
+    """Write the name of every link at its centre of mass, or its origin if it has no mass.
 
-
-def show_workspace(overlays: Overlays, points: Array) -> None:
-    """Draw tool positions as a cloud, coloured by their distance from the root."""
-    remove_overlay(overlays, "workspace")
+    Links that are close to each other share a label.
+    """
     view = overlays.view
-    distances = np.linalg.norm(points, axis=1)
-    spread = max(float(np.ptp(distances)), 1e-9)
-    share = ((distances - distances.min()) / spread)[:, None]
-    node = view.scene.add_point_cloud(
-        f"{view.name}/workspace",
-        points,
-        ((1 - share) * _NEAR + share * _FAR).astype(np.uint8),
-        point_size=0.0014 * max(float(distances.max()), 0.1),
-        point_shape="circle",
-        precision="float32",
-    )
-    overlays.nodes["workspace"] = [node]
+    near = _NAME_DISTANCE * robot_extent(view.robot)
+    groups: list[tuple[int, Array, list[str]]] = []
+    for i, link in enumerate(view.robot.links):
+        T_root_link = view.T_root_link[i]
+        position = T_root_link[:3, :3] @ (link.inertial.com if link.inertial else np.zeros(3))
+        position = position + T_root_link[:3, 3]
+        group = next((g for g in groups if np.linalg.norm(g[1] - position) < near), None)
+        if group is None:
+            groups.append((i, position, [link.name]))
+        else:
+            group[2].append(link.name)
+    overlays.nodes["names"] = [
+        view.scene.add_label(
+            f"{view.name}/{i}/name",
+            names[0] if len(names) == 1 else f"{names[0]} + {len(names) - 1}",
+            font_screen_scale=0.75,
+            position=inertial.com if (inertial := view.robot.links[i].inertial) else (0, 0, 0),
+            anchor="center-left",
+        )
+        for i, _, names in groups
+    ]
+
+
+def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> None:
+    """Write findings about mass and inertia beside the links' boxes, and colour these boxes."""
+    remove_overlay(overlays, "inertia findings")
+    view, nodes, colours = overlays.view, [], {}
+    for i, link in enumerate(view.robot.links):
+        about = [
+            finding
+            for finding in findings
+            if finding.where == f"link {link.name}" and finding.code.startswith(_INERTIA_CODES)
+        ]
+        if not about:
+            continue
+        colours[link.name] = _AMBER
+        nodes.append(
+            view.scene.add_label(
+                f"{view.name}/{i}/inertia_finding",
+                f"{link.name}: {', '.join(finding.code for finding in about)}",
+                font_screen_scale=0.75,
+                position=link.inertial.com if link.inertial else (0, 0, 0),
+                anchor="center-left",
+            )
+        )
+    view.paint("inertia", colours)
+    overlays.nodes["inertia findings"] = nodes
+
+
+def show_workspace(overlays: Overlays, points: Array, y: float) -> None:
+    """Draw the shell of the tool's positions behind a vertical plane, and the slice in it.
+
+    Args:
+        overlays: The overlays.
+        points: Tool positions, shape (n, 3) [m].
+        y: Position of the plane [m].
+    """
+    remove_overlay(overlays, "workspace")
+    view, section = overlays.view, workspace.cut(points, y)
+    nodes: list[Any] = [
+        view.scene.add_mesh_simple(
+            f"{view.name}/workspace",
+            *workspace.shell(points, y),
+            color=_SHELL,
+            opacity=0.22,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+    ]
+    if len(section.centres):
+        cell = (section.side, 0.02 * section.side, section.side)
+        share = np.sqrt(section.density)[:, None]  # most cells are reached seldom
+        nodes.append(
+            view.scene.add_batched_meshes_simple(
+                f"{view.name}/workspace_slice",
+                *triangles(Box(cell)),
+                batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (len(section.centres), 1)),
+                batched_positions=section.centres,
+                batched_colors=batch_colours((1 - share) * SELDOM + share * OFTEN),
+                opacity=0.65,
+                lod="off",
+                cast_shadow=False,
+            )
+        )
+    overlays.nodes["workspace"] = nodes
 
 
 def extend_trail(overlays: Overlays, position: Array) -> None:

@@ -1,0 +1,117 @@
+"""Overlays of the robot page: x-ray, names, grown shapes, inertia with findings, and workspace."""
+
+import re
+
+import numpy as np
+import pytest
+
+from helpers.robots import arm
+from helpers.viser_client import PlainClient
+from morphgen.model.geometry import Box
+from morphgen.viewer import workspace
+from morphgen.viewer.scene_shapes import grown_triangles
+
+ARM = "?robot=robots/some-arm"
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Points in a spherical shell with radii 0.5 to 1 m around (0, 0, 0.3)."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return rng.uniform(0.5, 1.0, (200_000, 1)) * directions + [0, 0, 0.3]
+
+
+def test_the_shell_encloses_the_points(ball):
+    vertices, faces = workspace.shell(ball, -np.inf)
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    volume = (a * np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
+
+
+def test_the_shell_is_open_in_front_of_the_slice(ball):
+    vertices, faces = workspace.shell(ball, 0.2)
+    assert vertices[faces.ravel(), 1].min() >= 0.2
+
+
+def test_a_slice_has_the_hole_of_the_workspace(ball):
+    section = workspace.cut(ball, 0.0)
+    radii = np.linalg.norm(section.centres - [0, 0, 0.3], axis=1)
+    assert radii.min() > 0.5 - 2 * section.side
+    assert radii.max() < 1.0 + 2 * section.side
+    assert len(radii) * section.side**2 == pytest.approx(np.pi * 0.75, rel=0.15)
+    assert section.density.max() == pytest.approx(1.0)
+
+
+def test_a_slice_beside_the_workspace_is_empty(ball):
+    assert len(workspace.cut(ball, 2.0).centres) == 0
+
+
+def test_the_workspace_of_a_robot_is_sampled_within_its_reach():
+    points = workspace.sample_workspace(arm())
+    assert points.shape == (workspace.NUM_POINTS, 3)
+    assert np.linalg.norm(points, axis=1).max() < 1.5
+
+
+def test_a_grown_box_is_larger_on_every_side():
+    vertices, _ = grown_triangles(Box((0.2, 0.2, 0.2)), 0.01)
+    assert (np.abs(vertices) > 0.1).all()
+    assert (np.abs(vertices) < 0.111).all()
+
+
+def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
+    on = viewer()
+    shown = "visual,collision,x-ray,names,inertia,workspace"
+    with PlainClient(on.port, f"{ARM}&show={shown}&slice=0.05") as client:
+        client.shows("no self-collision")
+        (session,) = on.sessions.values()
+        nodes = session.client.scene._handle_from_node_name
+        client.until(lambda: "/robot/workspace_slice" in nodes)
+        client.shows("slice=0.05")
+        client.shows("200,000 random configurations")
+        assert nodes["/robot/1/visual0"].opacity == pytest.approx(0.2)
+        assert nodes["/robot/1/name"].text == "upper"
+        assert "/robot/1/inertia" in nodes
+        radius = np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max()
+        assert 0.0205 < radius < 0.03  # the cylinder has 0.02 m
+        client.change(client.control("Checkbox", "visual"), False)
+        client.until(
+            lambda: (
+                np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max() < 0.0201
+            )
+        )
+        client.change(client.control("Checkbox", "workspace"), False)
+        client.until(lambda: "/robot/workspace" not in nodes)
+
+
+def test_findings_about_inertia_are_written_beside_the_boxes(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?robot=words:arm=ur5 ee=robotiq_2f85&show=visual,inertia") as client:
+        (found,) = client.until(
+            lambda: [
+                m["props"]["text"]
+                for m in client.messages
+                if m["type"] == "LabelMessage" and "left_inner_finger_pad" in m["props"]["text"]
+            ]
+        )
+        assert found == "ee_left_inner_finger_pad: inertia-missing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "shown", ["visual,x-ray,frames,joint axes,centres of mass,names", "visual,workspace"]
+)
+def test_overlays_are_shown(see, picture, shown):
+    page = see(f"?robot=words:arm=ur5 ee=robotiq_2f85&show={shown}")
+    page.get_by_text("no self-collision").wait_for()
+    page.get_by_role("tab", name="Show").click()
+    if "workspace" in shown:
+        page.get_by_text("many", exact=True).wait_for()
+        page.get_by_text("slice at y [m]").locator(
+            "xpath=ancestor::*[.//input][1]//input"
+        ).last.fill("0.3")
+        page.wait_for_url(re.compile("slice=0.3"))
+    page.wait_for_timeout(2000)
+    picture(page, f"overlays-{shown.rpartition(',')[2]}")
+    assert page.failures == []
