@@ -58,6 +58,8 @@ margin:4px 0 8px 0}
 .mg .bar div{height:3px;background:#339af0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}
 [data-mantine-color-scheme="dark"] .mg a.card{background:#2c3036;color:inherit}
+[data-mantine-color-scheme="dark"] .mg .card .picture{background:#98a1ab;isolation:isolate}
+[data-mantine-color-scheme="dark"] .mg .card img{background:none;mix-blend-mode:multiply}
 </style>"""
 
 

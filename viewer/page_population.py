@@ -87,7 +87,7 @@ def _show_population(
     """Draw the robots in a grid at home, add the controls, and apply the address."""
     client, state, n = session.client, session.address.state, len(population)
     session.set_status("sending the shapes to the browser")
-    layout = population_layout.grid(n, population_layout.cell_size(population.home_bounds))
+    layout = population_layout.grid(population.home_bounds)
     scene = scene_population.add_population(client, population, layout.positions, population.home)
     client.gui.add_html(markup.framed(_summary(source, population, faults)))
     arrange, axes = _add_arrangement(session)

@@ -97,11 +97,11 @@ def _positions(page: PopulationPage) -> population_layout.Layout:
     cell = population_layout.cell_size(page.population.home_bounds)
     key = _arrangement(page)
     if key == "grid":
-        return population_layout.grid(len(rows), cell)
+        return population_layout.grid(page.population.home_bounds)
     if key == "scatter":
         return population_layout.scatter(rows, page.axes[0].value, page.axes[1].value, cell)
     if key != "map":
-        return population_layout.sorted_grid(rows, key, cell)
+        return population_layout.sorted_grid(rows, key, page.population.home_bounds)
 
     def progress(done: int, total: int) -> None:
         session.set_status(f"comparing {total} robots", done / total)

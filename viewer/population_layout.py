@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from morphgen.typing import Array
 from morphgen.viewer.robot_rows import Row, sort_rows
 
-ASPECT = 0.85
+ASPECT = 0.7
 """Width of an arrangement divided by its depth: seen from above the front, it fills a window."""
 UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
 """Facts by which robots can be arranged, and their units."""
@@ -22,6 +22,8 @@ _NUM_TICKS, _MAX_LABELS = 5, 16
 _LOOSENESS = 1.6
 """Area of a scatter per robot, in cells: points that are spread evenly do not have to move."""
 _MAX_ROUNDS = 200
+_WORD_GAP, _LABEL_GAP = 0.2, 0.3
+"""Gap between neighbours in a row, in median widths, and between labels and rows [m]."""
 _QUANTILE, _GAP = 0.8, 1.1
 """Distance of neighbours in a grid: a factor on the size of a quantile of the robots. Tuned by
 eye; the largest robots cover their neighbours a little."""
@@ -38,7 +40,7 @@ class Layout:
 
 
 def cell_size(home_bounds: Array) -> Array:
-    """Return the distances of neighbours in a grid, at which most robots do not overlap.
+    """Return distances of neighbours at which most robots do not overlap, for scatters and maps.
 
     Args:
         home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
@@ -51,24 +53,34 @@ def cell_size(home_bounds: Array) -> Array:
     return np.maximum(_GAP * np.array([x, max(1.2 * y, 0.45 * x, 0.8 * z)]), 0.05)
 
 
-def grid(n: int, cell: Array) -> Layout:
-    """Arrange robots in rows from the far left to the near right, in their order."""
-    return Layout(_cells(n, cell))
+def grid(home_bounds: Array) -> Layout:
+    """Arrange robots in rows from the far left to the near right, in their order.
+
+    Args:
+        home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
+    """
+    return Layout(_rows_of(home_bounds)[0])
 
 
-def sorted_grid(rows: Sequence[Row], fact: str, cell: Array) -> Layout:
-    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots."""
+def sorted_grid(rows: Sequence[Row], fact: str, home_bounds: Array) -> Layout:
+    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots.
+
+    Args:
+        rows: The robots.
+        fact: The fact.
+        home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
+    """
     index = {row.uri: i for i, row in enumerate(rows)}
-    ordered = sort_rows(rows, fact)
-    cells, positions = _cells(len(rows), cell), np.zeros((len(rows), 2))
-    positions[[index[row.uri] for row in ordered]] = cells
+    order = [index[row.uri] for row in sort_rows(rows, fact)]
+    places, firsts = _rows_of(home_bounds[order])
+    positions = np.zeros((len(rows), 2))
+    positions[order] = places
+    edge = float((places[:, 0] + home_bounds[order, 0, 0]).min()) - _LABEL_GAP
     labels = []
-    columns = _columns(len(rows), cell)
-    step = math.ceil(math.ceil(len(rows) / columns) / _MAX_LABELS)
-    for i in range(0, len(rows), step * columns):
-        value = getattr(ordered[i], fact)
+    for i in firsts[:: math.ceil(len(firsts) / _MAX_LABELS)]:
+        value = getattr(rows[order[i]], fact)
         text = "unknown" if value is None else f"{value:.3g} {UNITS[fact]}"
-        labels.append((text, (float(cells[i, 0] - cell[0]), float(cells[i, 1]))))
+        labels.append((text, (edge, float(places[i, 1]))))
     return Layout(positions, tuple(labels))
 
 
@@ -87,7 +99,7 @@ def scatter(rows: Sequence[Row], x_fact: str, y_fact: str, cell: Array) -> Layou
     ).reshape(len(rows), 2)
     known = np.asarray(~np.isnan(points).any(axis=1))
     if not known.any():
-        return grid(len(rows), cell)
+        return Layout(_cells(len(rows), cell))
     low, high = points[known].min(axis=0), points[known].max(axis=0)
     size = _area(int(known.sum()), cell)
     labels = []
@@ -112,7 +124,7 @@ def similarity_map(points: Array, cell: Array) -> Layout:
     """
     known = np.asarray(~np.isnan(points).any(axis=1))
     if not known.any():
-        return grid(len(points), cell)
+        return Layout(_cells(len(points), cell))
     low, high = points[known].min(axis=0), points[known].max(axis=0)
     span = max(float((high - low).max()), 1e-9)
     side = math.sqrt(_LOOSENESS * ASPECT * float(known.sum() * cell.prod()))
@@ -150,6 +162,37 @@ def _place(shares: Array, known: NDArray[np.bool_], size: Array, cell: Array) ->
         front -= [0.0, front[:, 1].max() - positions[known, 1].min() + 2 * cell[1]]
         positions[~known] = front
     return positions
+
+
+def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
+    """Return a place for each robot, row by row like words of a text, and each row's first robot.
+
+    A robot takes its own width, and a row the depth of most of its robots, so that few large
+    robots do not make the others small.
+
+    Args:
+        bounds: Bounding boxes of the robots around their roots, shape (n, 2, 3) [m].
+
+    Returns:
+        Positions of the roots, shape (n, 2) [m], and indices into them.
+    """
+    size = np.maximum(bounds[:, 1] - bounds[:, 0], 0.01)
+    slot = size[:, 0] + _WORD_GAP * np.median(size[:, 0])
+    # Rows also need room for their height, by which they hide what is behind them.
+    depth = np.maximum(1.2 * size[:, 1], np.maximum(0.35 * size[:, 0], 0.75 * size[:, 2]))
+    ends = np.cumsum(slot)
+    num_rows = max(round(ends[-1] / math.sqrt(ASPECT * float((slot * depth).sum()))), 1)
+    row = np.minimum((ends - slot / 2) / ends[-1] * num_rows, num_rows - 1e-9).astype(int)
+    positions, firsts, y = np.zeros((len(bounds), 2)), [], 0.0
+    for k in np.unique(row):
+        members = np.flatnonzero(row == k)
+        firsts.append(int(members[0]))
+        right = np.cumsum(slot[members])
+        left = right - slot[members] - right[-1] / 2
+        y -= float(np.quantile(depth[members], _QUANTILE))
+        positions[members] = np.stack([left - bounds[members, 0, 0], np.full(len(left), y)], axis=1)
+    positions[:, 1] -= y / 2
+    return positions, firsts
 
 
 def _area(n: int, cell: Array) -> Array:

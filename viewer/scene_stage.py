@@ -143,17 +143,33 @@ def look_at(
     forward = -np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    axes = np.stack([right, forward, np.cross(right, forward)])
-    across, ahead, up = (corners @ axes.T).T
-    middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
+    axes = np.stack([right, np.cross(right, forward), forward])
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T @ axes.T
     tangent = _MARGIN * math.tan(_FOV / 2)
     aspect = min(client.camera.aspect, _MAX_ASPECT)
-    distances = np.maximum(
-        np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
-    )
-    distance = max(float((distances - (ahead - middle[1])).max()), 0.15)
-    target = middle @ axes
+    camera = fit_camera(corners, np.array([tangent * aspect, tangent]))
+    distance = max(float(corners[:, 2].mean() - camera[2]), 0.15)
+    position = camera @ axes
     client.camera.fov = _FOV
-    client.camera.position, client.camera.look_at = target - distance * forward, target
+    client.camera.position, client.camera.look_at = position, position + distance * forward
     client.camera.near = min(0.01, distance / 50)
+
+
+def fit_camera(points: Array, tangents: Array) -> Array:
+    """Return the foremost camera, centred on points, that has all of them in its picture.
+
+    A point is in the picture if its offset from the camera across and up is at most its distance
+    times a tangent. Each axis of the picture gives two such bounds, on the farthest points to both
+    sides; the camera's offset is between them, and the stricter axis decides its distance.
+
+    Args:
+        points: Points in the camera's axes: right, up, forward, shape (n, 3) [m].
+        tangents: Largest offset per distance to the right and up, shape (2,).
+
+    Returns:
+        Position of the camera in its axes, shape (3,) [m].
+    """
+    after = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    forward = float((-(after + before) / (2 * tangents)).min())
+    return np.array([*((after - before) / 2), forward])

@@ -36,6 +36,7 @@ from morphgen.viewer.robot_uri import FileAccess, UriError, owned_set, read_robo
 from morphgen.viewer.scene_population import quaternions, world_poses
 from morphgen.viewer.scene_robot import robot_bounds as one_robot_bounds
 from morphgen.viewer.scene_shapes import batch_colours
+from morphgen.viewer.scene_stage import fit_camera
 
 
 @pytest.fixture
@@ -110,11 +111,35 @@ def test_rows_are_sorted_and_labelled_by_their_first_robot():
     rows = [
         Row(name, name, reach=reach) for name, reach in zip("abcd", (3, 1, None, 2), strict=True)
     ]
-    cell = np.array([1.0, 1.0])
-    sorted_rows = layout.sorted_grid(rows, "reach", cell)
+    bounds = np.tile([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]], (4, 1, 1))
+    sorted_rows = layout.sorted_grid(rows, "reach", bounds)
     order = np.lexsort((sorted_rows.positions[:, 0], -sorted_rows.positions[:, 1]))
     assert [rows[i].name for i in order] == ["b", "d", "a", "c"]
     assert [text for text, _ in sorted_rows.labels] == ["1 m", "3 m"]
+
+
+def test_robots_in_rows_take_their_own_width_so_that_a_large_one_does_not_spread_the_others():
+    size = np.tile([0.3, 0.1, 0.2], (1000, 1))
+    size[::50] = [3.0, 0.1, 0.2]
+    bounds = np.stack([np.zeros_like(size), size], axis=1)
+    places = layout.grid(bounds).positions
+    left, right = places[:, 0], places[:, 0] + size[:, 0]
+    for y in np.unique(places[:, 1]):
+        row = places[:, 1] == y
+        assert (left[row][1:] > right[row][:-1]).all()
+    assert np.ptp(left) * np.ptp(places[:, 1]) < 1.6 * (size[:, 0] * 0.15).sum()
+
+
+def test_a_camera_has_all_points_in_its_picture_and_touches_the_strictest_sides():
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    tangents = np.array([0.5, 0.3])
+    camera = fit_camera(points, tangents)
+    offset = points - camera
+    share = offset[:, :2] / (tangents * offset[:, 2:])
+    assert np.abs(share).max() == pytest.approx(1)
+    low, high = share.min(axis=0), share.max(axis=0)
+    strictest = int(np.argmax(high - low))
+    assert (low[strictest], high[strictest]) == pytest.approx((-1, 1))
 
 
 def test_points_at_one_place_are_spread():
