@@ -108,6 +108,7 @@ class Renderer:
         light.ambient[:], light.diffuse[:], light.specular[:] = 0.35, 0.35, 0.1
         self._data = mujoco.MjData(model)
         self._camera = _camera(self._model.points, size[0] / size[1])
+        self._view = (self._camera.lookat.copy(), model.light_pos.copy(), model.light_dir.copy())
         self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 100)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._context = gl_context(*size)
@@ -129,8 +130,13 @@ class Renderer:
         points = np.concatenate([task.points_in_view(spec.goals), *corners])
         return cls(spec.scene, markers, configurations, points, size)
 
-    def frame(self, state: RenderState) -> Frame:
+    def frame(self, state: RenderState, turn: float = 0.0) -> Frame:
         """Render a state.
+
+        Args:
+            state: The state.
+            turn: Angle by which the camera and the light have gone around the middle of the points
+                in view [degrees]: the scene is on a turntable in front of a fixed camera.
 
         Returns:
             Shape (height, width, 3).
@@ -151,6 +157,7 @@ class Renderer:
         if state.obstacles is not None:
             for index, pose in zip(self._model.obstacles, state.obstacles, strict=True):
                 data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
+        self._turn_view(turn)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -165,6 +172,16 @@ class Renderer:
             self._context.make_current()
             self._gpu.free()
             self._context.free()
+
+    def _turn_view(self, turn: float) -> None:
+        """Turn camera and light around the vertical through the middle of the points in view."""
+        model = self._model.model
+        rotation, middle = Rotation.from_euler("Z", turn, degrees=True), model.stat.center
+        look_at, light_position, light_direction = self._view
+        self._camera.lookat[:] = middle + rotation.apply(look_at - middle)
+        self._camera.azimuth = _AZIMUTH + turn
+        model.light_pos[:] = middle + rotation.apply(light_position - middle)
+        model.light_dir[:] = rotation.apply(light_direction)
 
     def _pixels(self) -> Frame:
         """Render the scene; return its pixels with the top row first."""

@@ -1,4 +1,4 @@
-"""Videos of episodes, and recordings of their scenes. Runs in worker processes."""
+"""Videos of episodes, recordings of their scenes, and web pages. Runs in worker processes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import viser
+from viser.infra import StateSerializer
 
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, write_video
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.viewer.access import AccessPolicy
 from morphgen.viewer.episode import Episode, Track
 from morphgen.viewer.scene_rollout import add_episode, show_step
-from morphgen.viewer.server import start_server, stop_server
+from morphgen.viewer.scene_stage import place_camera, set_stage
+from morphgen.viewer.web_page import scene_server, web_page
 
 STRIDE = 2
 """Control steps between two frames."""
@@ -41,17 +43,20 @@ def record_scene(episode: Episode) -> bytes:
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    # viser records only scenes of a server. This one accepts no request, under no name.
-    server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
-    try:
-        scene = add_episode(server.scene, episode)
-        serializer = server.get_scene_serializer()
-        for step in _frame_steps(episode):
-            show_step(scene, step)
-            serializer.insert_sleep(STRIDE * episode.period)
-        return serializer.serialize()
-    finally:
-        stop_server(server)
+    with scene_server() as server:
+        return _record(server, episode).serialize()
+
+
+def episode_page(episode: Episode, dark: bool) -> bytes:
+    """Return a web page that plays an episode without a server or a network.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    with scene_server() as server:
+        set_stage(server.scene, dark=dark)
+        recording = _record(server, episode)
+        return web_page(recording, f"{episode.task}: {episode.tracks[0].robot.name}", dark=dark)
 
 
 def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
@@ -66,6 +71,17 @@ def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
     margin = 0.0 if track.block_size is None else max(track.block_size) / 2
     points = np.concatenate([points - margin, points + margin])
     return Renderer(scene, track.markers, configurations, points, size)
+
+
+def _record(server: viser.ViserServer, episode: Episode) -> StateSerializer:
+    """Draw an episode in a server's scene and return its recording."""
+    scene = add_episode(server.scene, episode)
+    place_camera(server.initial_camera, scene.low, scene.high)
+    recording = server.get_scene_serializer()
+    for step in _frame_steps(episode):
+        show_step(scene, step)
+        recording.insert_sleep(STRIDE * episode.period)
+    return recording
 
 
 def _render_frames(episode: Episode) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.episode_export import record_scene, render_video
+from morphgen.viewer.episode_export import episode_page, record_scene, render_video
 from morphgen.viewer.page_play_controls import (
     RolloutControls,
     add_rollout_controls,
@@ -187,6 +187,11 @@ def _add_downloads(page: PlayPage) -> None:
     downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
         (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
         ("Film (.mp4)", ".mp4", functools.partial(session.run_in_worker, render_video)),
+        (
+            "Web page (.html)",
+            ".html",
+            lambda episode: session.run_in_worker(episode_page, episode, session.dark),
+        ),
         ("Scene (.viser)", ".viser", functools.partial(session.run_in_worker, record_scene)),
     )
     for label, suffix, make in downloads:

@@ -45,7 +45,11 @@ from morphgen.viewer.robot_uri import (
 )
 from morphgen.viewer.scene_overlays import Overlays
 from morphgen.viewer.session import Session, set_value
+from morphgen.viewer.turntable import turntable
+from morphgen.viewer.web_page import robot_page
 
+WEB_PAGE = "robot.html"
+"""Name of the web page in a bundle."""
 PANEL_WIDTH = 390.0
 """Width of the panel [pixels]."""
 RENDER_TIMEOUT = 60.0
@@ -185,12 +189,18 @@ def _show_findings(page: RobotPage, findings: list[Finding]) -> None:
 def _add_downloads_tab(page: RobotPage) -> None:
     """Add buttons for the bundle, its files and a screenshot, and the command for the robot."""
     gui, session = page.session.client.gui, page.session
+    dark = session.dark
     downloads: tuple[tuple[str, Callable[[], object]], ...] = (
-        ("Bundle (.zip)", lambda: _send_bundle(page)),
+        ("Bundle (.zip)", lambda: _send_bundle(page, with_page=with_page.value)),
         ("URDF", lambda: _send_file(page, URDF, ".urdf")),
         ("MJCF", lambda: _send_file(page, MJCF, ".xml")),
         ("Screenshot", lambda: _send_screenshot(page)),
+        ("Web page (.html)", lambda: _send_made(page, ".html", robot_page, dark)),
+        ("Turntable (.mp4)", lambda: _send_made(page, ".mp4", turntable, ".mp4")),
+        ("Turntable (.gif)", lambda: _send_made(page, ".gif", turntable, ".gif")),
     )
+    hint = "adds robot.html, which shows the robot in 3D without a server or a network"
+    with_page = gui.add_checkbox("bundle with a web page", initial_value=False, hint=hint)
     for label, send in downloads:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
         session.on_change(button, functools.partial(session.run_in_background, send))
@@ -210,9 +220,18 @@ def _command(page: RobotPage) -> str:
     return comment
 
 
-def _send_bundle(page: RobotPage) -> None:
+def _send_made(page: RobotPage, suffix: str, make: Callable[..., bytes], option: object) -> None:
+    """Send a file that a worker makes of the robot."""
+    page.session.set_status(f"making the {suffix}")
+    _send(page, suffix, page.session.run_in_worker(make, page.robot, option))
+    page.session.set_status("")
+
+
+def _send_bundle(page: RobotPage, *, with_page: bool) -> None:
     page.session.set_status("packing the bundle")
     files = page.session.run_in_worker(bundle_files, page.uri, page.session.files)
+    if with_page:
+        files[WEB_PAGE] = page.session.run_in_worker(robot_page, page.robot, page.session.dark)
     name = page.robot.name or "robot"
     _send(page, ".zip", zip_files(name, files))
     page.session.set_status("")

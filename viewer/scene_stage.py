@@ -140,19 +140,38 @@ def look_at(
     direction: tuple[float, float, float] = CAMERA_DIRECTION,
 ) -> None:
     """Point a browser's camera at a box, from a direction and so near that it just is in view."""
+    aspect = min(client.camera.aspect, _MAX_ASPECT)
+    place_camera(client.camera, low, high, direction, aspect)
+
+
+def place_camera(
+    camera: viser.CameraHandle | viser.InitialCameraConfig,
+    low: Array,
+    high: Array,
+    direction: tuple[float, float, float] = CAMERA_DIRECTION,
+    aspect: float = _MAX_ASPECT,
+) -> None:
+    """Point a camera at a box; see ``look_at``.
+
+    Args:
+        camera: Camera of a browser, or the initial one of a recorded scene.
+        low: Lowest corner of the box, shape (3,) [m].
+        high: Highest corner of the box, shape (3,) [m].
+        direction: From the box to the camera.
+        aspect: Width of the picture divided by its height.
+    """
     forward = -np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, forward), forward])
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T @ axes.T
     tangent = _MARGIN * math.tan(_FOV / 2)
-    aspect = min(client.camera.aspect, _MAX_ASPECT)
-    camera = fit_camera(corners, np.array([tangent * aspect, tangent]))
-    distance = max(float(corners[:, 2].mean() - camera[2]), 0.15)
-    position = camera @ axes
-    client.camera.fov = _FOV
-    client.camera.position, client.camera.look_at = position, position + distance * forward
-    client.camera.near = min(0.01, distance / 50)
+    offset = fit_camera(corners, np.array([tangent * aspect, tangent]))
+    distance = max(float(corners[:, 2].mean() - offset[2]), 0.15)
+    position = offset @ axes
+    camera.fov = _FOV
+    camera.position, camera.look_at = position, position + distance * forward
+    camera.near = min(0.01, distance / 50)
 
 
 def fit_camera(points: Array, tangents: Array) -> Array:

@@ -20,7 +20,7 @@ from morphgen.rl.training import train
 from morphgen.viewer.address import Address
 from morphgen.viewer.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.episode_export import make_renderer, record_scene
+from morphgen.viewer.episode_export import episode_page, make_renderer, record_scene
 from morphgen.viewer.page_play_controls import parse_rollout, rollout_address
 from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess
 from morphgen.viewer.rollout import RecordedEpisode, Rollout, RolloutConfig, simulators
@@ -267,6 +267,13 @@ def test_a_recording_has_all_shown_steps(episode):
     assert content_info["durationSeconds"] == pytest.approx((150 + 1) * 2 * episode.period)
     kinds = {message["type"] for _, message in content_info["messages"]}
     assert {"SetPositionMessage", "SetOrientationMessage", "MeshMessage"} <= kinds
+
+
+def test_a_web_page_plays_the_episode(episode):
+    page = episode_page(episode, True)
+    assert b"__VISER_EMBED_DATA__" in page
+    assert b"darkMode:true" in page
+    assert episode.tracks[0].robot.name.encode() in page
 
 
 def test_video_camera_frames_the_whole_episode(episode):

@@ -1,0 +1,83 @@
+"""Web pages and turntables of robots."""
+
+import base64
+import re
+from dataclasses import replace
+
+import imageio.v2 as imageio
+import msgspec
+import pytest
+import zstandard
+
+from helpers.robots import arm
+from morphgen.tasks.renderer import Renderer, RenderState
+from morphgen.tasks.sim.base import Scene
+from morphgen.viewer import turntable as turntable_module
+from morphgen.viewer.turntable import NUM_FRAMES, turntable
+from morphgen.viewer.web_page import robot_page
+
+ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
+
+
+def recorded_messages(page):
+    """Return the messages of the scene that a web page holds."""
+    data = base64.b64decode(re.search(rb'__VISER_EMBED_DATA__="([^"]+)"', page).group(1))
+    payload = zstandard.ZstdDecompressor().decompressobj().decompress(data[8:])
+    length = int.from_bytes(payload[:8], "little")
+    return [m for _, m in msgspec.msgpack.decode(payload[8 : 8 + length])["messages"]]
+
+
+@pytest.fixture(scope="module")
+def page():
+    return robot_page(replace(arm(), name="an <arm>"))
+
+
+def test_a_page_has_the_robot_the_stage_and_the_camera(page):
+    messages = recorded_messages(page)
+    names = {message.get("name") for message in messages}
+    assert {"/robot/1/visual0", "/ground", "/scale", "/light"} <= names
+    kinds = {message["type"] for message in messages}
+    assert {"EnvironmentMapMessage", "SetCameraPositionMessage"} <= kinds
+    assert b"<title>an &lt;arm&gt;</title>" in page
+
+
+def test_a_page_loads_nothing_else(page):
+    assert ADDRESS.findall(page) == []
+
+
+def test_a_turn_of_the_camera_ends_where_it_began():
+    robot = arm()
+    home = turntable_module.np.array([robot.home])
+    renderer = Renderer(Scene(robot), (), home, turntable_module._ring(robot), (64, 48))
+    state = RenderState(home[0])
+    start, side, end = (renderer.frame(state, turn).astype(int) for turn in (0, 90, 360))
+    renderer.close()
+    assert abs(start - side).mean() > 3
+    assert abs(start - end).mean() < 0.5
+
+
+def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
+    monkeypatch.setattr(turntable_module, "SIZE", (64, 48))
+    path = tmp_path / "turn.gif"
+    path.write_bytes(turntable(arm(), ".gif"))
+    frames = imageio.mimread(path)
+    assert len(frames) == NUM_FRAMES
+    assert frames[0].shape[:2] == (48, 64)
+
+
+@pytest.mark.slow
+def test_a_page_opens_without_a_network(chromium, page, tmp_path, picture):
+    path = tmp_path / "robot.html"
+    path.write_bytes(page)
+    context = chromium.new_context(viewport={"width": 1024, "height": 700}, offline=True)
+    opened = context.new_page()
+    failures, requests = [], []
+    opened.on("pageerror", lambda error: failures.append(str(error)))
+    opened.on("request", lambda request: requests.append(request.url))
+    opened.goto(path.as_uri())
+    opened.locator("canvas").first.wait_for()
+    opened.get_by_text("20 cm").or_(opened.get_by_text("10 cm")).first.wait_for()
+    picture(opened, "web-page")
+    context.close()
+    assert failures == []
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
