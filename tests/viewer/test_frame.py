@@ -106,7 +106,7 @@ def test_a_script_opens_another_page_in_place(viewer):
         client.shows("Grammars")
         (first,) = on.sessions.values()
         assert script.send("open", f"?robot={A}", visit=1) == 200
-        client.control("Slider", "opacity")
+        client.control("Checkbox", "x-ray")
         client.until(lambda: (1, "?robot=words:arm=ur5%20ee=plane") in script.addresses())
         (second,) = on.sessions.values()
         assert first.closed.is_set()
