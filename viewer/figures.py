@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Sequence
 from html import escape
@@ -14,11 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from morphgen.benchmark.token_layout import LAYOUT
 from morphgen.typing import Array
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 
 TOKEN_TOLERANCE = 1e-6
 """Difference up to which two numbers of tokens count as equal."""
 _SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
+_CHOSEN, _NOT_CHOSEN = "#339af0", "#adb5bd88"
+"""Colours of the bars inside and outside a range."""
+_NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60
+"""Bars of a histogram, and its height in units of the SVG."""
 _WIDTH = 480
 """Width of an SVG in its own units."""
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
@@ -92,6 +98,31 @@ def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, la
     return _svg(n * cell + 4, "".join(parts))
 
 
+def histogram_svg(
+    values: Sequence[float], limits: tuple[float, float], chosen: tuple[float, float]
+) -> str:
+    """Draw how many values are where, as bars; bars outside a chosen range are grey.
+
+    Args:
+        values: The values.
+        limits: Range that the picture shows; the slider below it has the same.
+        chosen: Range of the slider.
+    """
+    counts, edges = np.histogram(values, _NUM_BARS, limits)
+    width, tallest = _WIDTH / _NUM_BARS, max(int(counts.max()), 1)
+    parts = []
+    for count, start, end in zip(counts.tolist(), edges[:-1], edges[1:], strict=True):
+        inside = end >= chosen[0] and start <= chosen[1]
+        height = _HISTOGRAM_HEIGHT * count / tallest
+        x = (start - limits[0]) / (limits[1] - limits[0]) * _WIDTH
+        parts.append(
+            f'<rect x="{x:.1f}" y="{_HISTOGRAM_HEIGHT - height:.1f}" width="{width - 1:.1f}" '
+            f'height="{height:.1f}" fill="{_CHOSEN if inside else _NOT_CHOSEN}">'
+            f"<title>{count} robots from {start:.3g} to {end:.3g}</title></rect>"
+        )
+    return _svg(_HISTOGRAM_HEIGHT, "".join(parts))
+
+
 def token_differences(tables: Sequence[Array]) -> list[NDArray[np.bool_]]:
     """Return which tokens of each robot differ from those of the first robot.
 
@@ -141,6 +172,18 @@ def tokens_png(
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def tokens_html(png: bytes) -> str:
+    """Return the picture of ``tokens_png`` with its legend, as HTML."""
+    url = base64.b64encode(png).decode()
+    return (
+        markup.dim(
+            "48 numbers per link at home; blue is negative, red positive; a dot marks a difference "
+            "from the first robot"
+        )
+        + f'<img alt="tokens" style="width:100%" src="data:image/png;base64,{url}">'
+    )
 
 
 def _draw_tokens(

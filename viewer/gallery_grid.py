@@ -14,7 +14,7 @@ from typing import Any
 import viser
 
 from morphgen.formats.bundle import PICTURE
-from morphgen.viewer import markup, robot_rows
+from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.address import Address, parse_count
 from morphgen.viewer.robot_files import (
     Thumbnail,
@@ -67,6 +67,8 @@ class Gallery:
     """Errors of robots that cannot be read, by URI."""
     controls: dict[str, Any] = field(default_factory=dict)
     """Controls by their key in the address."""
+    histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+    """Distributions of the facts above their sliders."""
     grid: viser.GuiHtmlHandle | None = None
     summary: str = ""
     """Number of robots that pass the filter, and of the page."""
@@ -218,6 +220,7 @@ def show_page(gallery: Gallery, number: int) -> None:
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     gallery.summary = f"{len(rows)}{total} robots · page {gallery.page_number} of {count}"
     _load_bundle_pictures(gallery, gallery.page_rows)
+    _show_histograms(gallery)
     _draw_grid(gallery)
     session.run_in_background(lambda: _draw_missing(gallery), "thumbnails")
 
@@ -338,9 +341,20 @@ def _add_range(gallery: Gallery, fact: str) -> None:
     step = 1.0 if fact == "dof" else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
     text = gallery.session.address.state.get(fact, "")
+    gallery.histograms[fact] = gallery.session.client.gui.add_html("")
     gallery.controls[fact] = gallery.session.client.gui.add_multi_slider(
         _RANGE_LABELS[fact], low, high, step, _parse_range(text, low, high)
     )
+
+
+def _show_histograms(gallery: Gallery) -> None:
+    """Show how many robots have each value of a fact; those that the slider lets pass stand out."""
+    for fact, handle in gallery.histograms.items():
+        values = [float(v) for row in gallery.rows if (v := getattr(row, fact)) is not None]
+        control = gallery.controls[fact]
+        low, high = control.value
+        svg = figures.histogram_svg(values, (control.min, control.max), (low, high))
+        handle.content = markup.framed(svg)
 
 
 def _parse_range(text: str, low: float, high: float) -> tuple[float, float]:

@@ -59,6 +59,7 @@ margin:4px 0 8px 0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}
 [data-mantine-color-scheme="dark"] .mg a.card{background:#2c3036;color:inherit}
 [data-mantine-color-scheme="dark"] .mg .card .picture{background:#98a1ab;isolation:isolate}
+[data-mantine-color-scheme="dark"] .mg .card .empty{background:#343a40}
 [data-mantine-color-scheme="dark"] .mg .card img{background:none;mix-blend-mode:multiply}
 </style>"""
 

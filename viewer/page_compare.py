@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -15,7 +14,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup, scene_robot, scene_stage
 from morphgen.viewer.address import MAX_COMPARED, Address
-from morphgen.viewer.figures import tokens_png
+from morphgen.viewer.figures import tokens_html, tokens_png
 from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.session import Session, set_value
@@ -253,15 +252,10 @@ def _compare(page: ComparePage) -> None:
         session.set_status("")
         return
     links = [[link.name for link in robot.links] for robot in page.robots]
-    picture = base64.b64encode(tokens_png(names, links, result.tables)).decode()
     page.texts["similarity"].content = markup.framed(
         "<h3>Similarity</h3>", comparison.similarity_table(names, result)
     )
     page.texts["tokens"].content = markup.framed(
-        markup.dim(
-            "48 numbers per link at home; blue is negative, red positive; a dot marks a difference "
-            "from the first robot"
-        ),
-        f'<img alt="tokens" style="width:100%" src="data:image/png;base64,{picture}">',
+        tokens_html(tokens_png(names, links, result.tables))
     )
     session.set_status("")

@@ -22,6 +22,13 @@ from morphgen.viewer.page_play_controls import (
     parse_rollout,
     rollout_address,
 )
+from morphgen.viewer.page_play_plots import (
+    EpisodePlots,
+    add_plots,
+    clear_plots,
+    show_plots,
+    start_plots,
+)
 from morphgen.viewer.player import SPEEDS, Player
 from morphgen.viewer.robot_uri import EPISODE_SUFFIX, uri_name
 from morphgen.viewer.rollout import EpisodeSource, RecordedEpisode, Rollout, RolloutConfig
@@ -43,6 +50,7 @@ class PlayPage:
     time: viser.GuiSliderHandle[float]
     fault: viser.GuiHtmlHandle
     score: viser.GuiHtmlHandle
+    plots: EpisodePlots
     source: EpisodeSource | None = None
     scene: RolloutScene | None = None
     framed: tuple[str, ...] = ()
@@ -64,6 +72,7 @@ class PlayPage:
         if uris != self.framed:  # the next episode of the same robots keeps the user's camera
             self.framed = uris
             look_at(client, self.scene.low, self.scene.high)
+        start_plots(self.plots, source.episode)
         self.time.max = max(source.max_steps, 1) * source.episode.period
         self._show_faults(source.faults.values())
         self.is_planning = isinstance(source, Rollout) and source.episode.policy in PLANNERS
@@ -81,6 +90,7 @@ class PlayPage:
             self.session.set_status("")
         set_value(self.time, step * episode.period)
         self.score.content = markup.framed(score_table(episode, step))
+        show_plots(self.plots, episode, step)
 
     def show_stopped(self) -> None:
         """Show errors that ended robots' episodes early."""
@@ -93,6 +103,7 @@ class PlayPage:
         self.session.set_status("")
         self._show_faults([reason])
         self.score.content = ""
+        clear_plots(self.plots)
         if self.scene is not None:
             self.scene.root.remove()
             self.scene = None
@@ -161,7 +172,7 @@ def _add_player(session: Session) -> tuple[PlayPage, Player]:
     speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
     speed = gui.add_dropdown("speed", speeds, initial_value="1x")
     time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint="as far as it was simulated")
-    page = PlayPage(session, time, fault, gui.add_html(""))
+    page = PlayPage(session, time, fault, gui.add_html(""), add_plots(session))
     player = Player(page)
     session.on_close(player.stop)
     commands: dict[str, Callable[[], None]] = {

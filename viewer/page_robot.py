@@ -20,8 +20,9 @@ from morphgen.model.findings import Finding
 from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer import markup, robot_tables, scene_robot, scene_stage
+from morphgen.viewer import comparison, markup, robot_tables, scene_robot, scene_stage
 from morphgen.viewer.address import Address
+from morphgen.viewer.figures import tokens_html, tokens_png
 from morphgen.viewer.page_robot_move import ANGLES, add_move_tab, set_angles
 from morphgen.viewer.page_robot_select import NO_LINK, connect_links, select_link, show_card
 from morphgen.viewer.page_robot_show import (
@@ -84,6 +85,10 @@ def show(session: Session) -> None:
         _add_links_tab(page)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.texts["findings"] = gui.add_html("")
+    with tabs.add_tab("Tokens", viser.Icon.TABLE):
+        button = gui.add_button("Show the tokens", hint="48 numbers per link, as policies see them")
+        page.texts["tokens"] = gui.add_html("")
+        session.on_change(button, lambda: session.run_in_background(lambda: _show_tokens(page)))
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
         _add_downloads_tab(page)
     session.set_status("")
@@ -179,6 +184,23 @@ def _check_robot(page: RobotPage) -> None:
         page.texts["collisions"].content = markup.framed(markup.dim(text))
         return
     session.enqueue(lambda: update_scene(page), "move")
+
+
+def _show_tokens(page: RobotPage) -> None:
+    """Show the robot's tokens as a heat map, or why it has none."""
+    session, robot = page.session, page.robot
+    try:
+        session.set_status("computing the tokens")
+        result = session.run_in_worker(
+            comparison.compare_robots, [robot], session.files.library_folders
+        )
+    except MorphgenError as error:
+        content = f"{markup.tag('no tokens', 'warning')} {escape(session.files.redact(error))}"
+    else:
+        links = [[link.name for link in robot.links]]
+        content = tokens_html(tokens_png([robot.name], links, result.tables))
+    session.set_status("")
+    page.texts["tokens"].content = markup.framed(content)
 
 
 def _show_findings(page: RobotPage, findings: list[Finding]) -> None:
