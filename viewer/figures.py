@@ -174,14 +174,16 @@ def tokens_png(
     return buffer.getvalue()
 
 
-def tokens_html(png: bytes) -> str:
+def tokens_html(
+    names: Sequence[str], links: Sequence[Sequence[str]], tables: Sequence[Array]
+) -> str:
     """Return the picture of ``tokens_png`` with its legend, as HTML."""
-    url = base64.b64encode(png).decode()
+    url = base64.b64encode(tokens_png(names, links, tables)).decode()
+    legend = "48 numbers per link at home; blue is negative, red positive"
+    if len(names) > 1:
+        legend += "; a dot marks a difference from the first robot"
     return (
-        markup.dim(
-            "48 numbers per link at home; blue is negative, red positive; a dot marks a difference "
-            "from the first robot"
-        )
+        markup.dim(legend)
         + f'<img alt="tokens" style="width:100%" src="data:image/png;base64,{url}">'
     )
 

@@ -14,7 +14,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup, scene_robot, scene_stage
 from morphgen.viewer.address import MAX_COMPARED, Address
-from morphgen.viewer.figures import tokens_html, tokens_png
+from morphgen.viewer.figures import tokens_html
 from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.session import Session, set_value
@@ -255,7 +255,5 @@ def _compare(page: ComparePage) -> None:
     page.texts["similarity"].content = markup.framed(
         "<h3>Similarity</h3>", comparison.similarity_table(names, result)
     )
-    page.texts["tokens"].content = markup.framed(
-        tokens_html(tokens_png(names, links, result.tables))
-    )
+    page.texts["tokens"].content = markup.framed(tokens_html(names, links, result.tables))
     session.set_status("")

@@ -22,7 +22,7 @@ from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import comparison, markup, robot_tables, scene_robot, scene_stage
 from morphgen.viewer.address import Address
-from morphgen.viewer.figures import tokens_html, tokens_png
+from morphgen.viewer.figures import tokens_html
 from morphgen.viewer.page_robot_move import ANGLES, add_move_tab, set_angles
 from morphgen.viewer.page_robot_select import NO_LINK, connect_links, select_link, show_card
 from morphgen.viewer.page_robot_show import (
@@ -85,10 +85,6 @@ def show(session: Session) -> None:
         _add_links_tab(page)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.texts["findings"] = gui.add_html("")
-    with tabs.add_tab("Tokens", viser.Icon.TABLE):
-        button = gui.add_button("Show the tokens", hint="48 numbers per link, as policies see them")
-        page.texts["tokens"] = gui.add_html("")
-        session.on_change(button, lambda: session.run_in_background(lambda: _show_tokens(page)))
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
         _add_downloads_tab(page)
     session.set_status("")
@@ -154,13 +150,17 @@ def _apply_address(page: RobotPage) -> None:
 
 
 def _add_links_tab(page: RobotPage) -> None:
-    """Add a dropdown that selects a link with all its properties, and the table of links."""
+    """Add a dropdown that selects a link with all its properties, the links, and their tokens."""
     gui = page.session.client.gui
     page.link_choice = gui.add_dropdown(
         "Link", (NO_LINK, *(link.name for link in page.robot.links))
     )
     page.texts["details"] = gui.add_html("")
     gui.add_html(markup.framed(robot_tables.link_table(page.robot)))
+    button = gui.add_button("Show the tokens", hint="48 numbers per link, as policies see them")
+    page.texts["tokens"] = gui.add_html("")
+    session = page.session
+    session.on_change(button, lambda: session.run_in_background(lambda: _show_tokens(page)))
     choice = page.link_choice
     page.session.on_change(
         choice, lambda: select_link(page, "" if choice.value == NO_LINK else choice.value)
@@ -198,7 +198,7 @@ def _show_tokens(page: RobotPage) -> None:
         content = f"{markup.tag('no tokens', 'warning')} {escape(session.files.redact(error))}"
     else:
         links = [[link.name for link in robot.links]]
-        content = tokens_html(tokens_png([robot.name], links, result.tables))
+        content = tokens_html([robot.name], links, result.tables)
     session.set_status("")
     page.texts["tokens"].content = markup.framed(content)
 

@@ -70,7 +70,7 @@ def test_a_gallery_shows_the_distributions_of_its_facts(viewer):
 def test_tokens_are_shown_beside_the_robot(see, picture):
     page = see("?robot=robots/some-arm")
     page.get_by_text("no self-collision").wait_for()
-    page.get_by_role("tab", name="Tokens").click()
+    page.get_by_role("tab", name="Links").click()
     page.get_by_role("button", name="Show the tokens").click()
     page.locator('img[alt="tokens"]').wait_for()
     picture(page, "tokens")
