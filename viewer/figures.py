@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from html import escape
 
 import matplotlib
@@ -17,6 +18,7 @@ from morphgen.benchmark.token_layout import LAYOUT
 from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
+from morphgen.viewer.population_layout import spread
 
 TOKEN_TOLERANCE = 1e-6
 """Difference up to which two numbers of tokens count as equal."""
@@ -27,6 +29,8 @@ _NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60
 """Bars of a histogram, and its height in units of the SVG."""
 _WIDTH = 480
 """Width of an SVG in its own units."""
+_MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
+"""Width of a map, width and height of a robot with its name, and letters of a name that fit."""
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
 """White to dark blue."""
 _ROW_HEIGHT, _PNG_WIDTH, _DPI = 0.14, 5.4, 200
@@ -41,30 +45,50 @@ def blend(stops: ArrayLike, share: float) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def map_svg(points: Array, names: Sequence[str], sides: Sequence[str], uris: Sequence[str]) -> str:
-    """Return a map of robots in the plane; a click on a point opens the robot.
+def map_svg(
+    points: Array,
+    names: Sequence[str],
+    sides: Sequence[str],
+    uris: Sequence[str],
+    pictures: Mapping[str, str],
+) -> str:
+    """Return a map of robots in the plane; a click on a picture opens the robot.
+
+    Robots move apart where they would cover each other. Their frame and name show their side.
 
     Args:
         points: Shape (n, 2).
         names: Names of the robots.
-        sides: ``train`` or ``test`` for each robot, shown by colour.
+        sides: ``train`` or ``test`` for each robot.
         uris: URIs of the robots.
+        pictures: Pictures as ``data:`` URLs by URI; other robots have an empty frame.
     """
     low, high = points.min(axis=0), points.max(axis=0)
-    scale = (_WIDTH - 130) / max(float((high - low).max()), 1e-9)
-    height = float((high - low)[1]) * scale + 60
+    span = np.maximum(high - low, 1e-9)
+    columns = max(_MAP_WIDTH / _MAP_CELL[0] - 1, math.sqrt(2.5 * len(points)))
+    scale = columns / max(float(span[0]), float(span[1]) / 2)  # at most half as many rows
+    cells = spread((points - low) * scale * np.array([1.0, -1.0]))
+    cells -= cells.min(axis=0)
+    # Many robots make the pictures smaller, never the map larger.
+    unit = _MAP_WIDTH / (float(cells[:, 0].max()) + 1)
+    width, height = unit, unit * _MAP_CELL[1] / _MAP_CELL[0]
+    inner, label = 0.94 * width, min(13.0, 0.13 * unit)
     marks = []
-    labels: list[tuple[float, float, float]] = []
-    for (x, y), name, side, uri in zip(points.tolist(), names, sides, uris, strict=True):
-        px, py = 20 + (x - low[0]) * scale, 30 + (high[1] - y) * scale
-        query = escape(Address("robot", (uri,)).query)
+    for (x, y), name, side, uri in zip(cells.tolist(), names, sides, uris, strict=True):
+        query, colour = escape(Address("robot", (uri,)).query), _SIDE_COLOURS[side]
+        box = f'width="{inner:.1f}" height="{0.75 * inner:.1f}"'
+        at = f'x="{x * width:.1f}" y="{y * height:.1f}"'
+        picture = f'<image {at} {box} href="{pictures[uri]}"/>' if pictures.get(uri) else ""
         marks.append(
             f'<a href="{query}"><g><title>{escape(name)} ({side})</title>'
-            f'<circle cx="{px:.1f}" cy="{py:.1f}" r="6" fill="{_SIDE_COLOURS[side]}" '
-            f'fill-opacity="0.8" stroke="#fff"/>'
-            f"{_map_label(px, py, name, labels)}</g></a>"
+            f'<rect class="point" {at} {box} rx="4" fill="#fff"/>{picture}'
+            f'<rect {at} {box} rx="4" fill="none" stroke="{colour}" stroke-width="2"/>'
+            f'<text x="{x * width + inner / 2:.1f}" text-anchor="middle" font-size="{label:.1f}" '
+            f'y="{y * height + 0.75 * inner + 1.1 * label:.1f}" fill="{colour}">'
+            f"{escape(name[:_MAP_LABEL])}</text></g></a>"
         )
-    return _svg(height, "".join(marks))
+    rows = float(cells[:, 1].max()) + 1
+    return _svg(rows * height + label, "".join(marks), _MAP_WIDTH)
 
 
 def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:
@@ -209,29 +233,8 @@ def _draw_tokens(
     ax.set_xlabel(name, fontsize=7.5, loc="left", labelpad=2, parse_math=False)
 
 
-def _map_label(x: float, y: float, name: str, labels: list[tuple[float, float, float]]) -> str:
-    """Return a name beside its point, at the first of a few heights where it covers no other name.
-
-    Args:
-        x: Position of the point.
-        y: Position of the point.
-        name: The name.
-        labels: Left end, right end and height of the earlier labels; this one is appended.
-    """
-    width = 5.6 * len(name)
-    for shift in (3.5, 14.5, -7.5, 25.5, -18.5):
-        row = y + shift
-        if all(abs(row - r) > 10 or x > right or x + width < left for left, right, r in labels):
-            labels.append((x, x + width, row))
-            return (
-                f'<text x="{x + 9:.1f}" y="{row:.1f}" font-size="10" fill="currentColor">'
-                f"{escape(name)}</text>"
-            )
-    return ""
-
-
-def _svg(height: float, content: str) -> str:
+def _svg(height: float, content: str, width: float = _WIDTH) -> str:
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {height:.0f}" width="100%" '
+        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" width="100%" '
         f'style="font-family:inherit">{content}</svg>'
     )

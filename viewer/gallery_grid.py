@@ -79,7 +79,7 @@ class Gallery:
 
 def open_panels(
     gallery: Gallery, breadcrumbs: str, header: str, width: float = CONTROLS_WIDTH
-) -> None:
+) -> viser.PanelHandle:
     """Open the panel of thumbnails at the left and the panel of controls at the right.
 
     Args:
@@ -87,6 +87,9 @@ def open_panels(
         breadcrumbs: HTML of the path to the page.
         header: HTML above the controls.
         width: Width of the controls [pixels].
+
+    Returns:
+        The panel at the left.
     """
     client = gallery.session.client
     gui = client.gui
@@ -96,6 +99,7 @@ def open_panels(
         gallery.grid = gui.add_html("")
     panel.dock_left()
     panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, 400.0))
+    return panel
 
 
 def add_controls(gallery: Gallery) -> None:

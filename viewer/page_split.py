@@ -17,6 +17,7 @@ from morphgen.viewer.figures import heatmap_svg, map_svg
 from morphgen.viewer.gallery_grid import (
     Gallery,
     add_controls,
+    load_pictures,
     open_panels,
     passing_rows,
     show_saved,
@@ -62,16 +63,18 @@ def show(session: Session) -> None:
     gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")
     gui = session.client.gui
     header = _description(split) + _rollout_link(name, split)
-    open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
+    panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         add_controls(gallery)
         add_sheet_buttons(gallery)
         _add_split_form(gallery, split)
     texts = {}
-    with tabs.add_tab("Map", viser.Icon.MAP):
+    with panel.add_tab("Map", viser.Icon.MAP):
+        texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
+    with tabs.add_tab("Similarity", viser.Icon.GRID_DOTS):
         measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
-        texts["map"], texts["heatmap"] = gui.add_html(""), gui.add_html("")
+        texts["heatmap"] = gui.add_html("")
     with tabs.add_tab("Statistics", viser.Icon.TABLE):
         texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
     with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
@@ -157,6 +160,9 @@ def _study(page: SplitPage) -> None:
         page.texts["statistics"].content = markup.framed(table)
     page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
     _draw_map(page)
+    uris = {member_uri(page.name, side, member) for side, member in page.study.members}
+    load_pictures(page.gallery, [row for row in page.gallery.rows if row.uri in uris])
+    _draw_map(page)
 
 
 def _draw_map(page: SplitPage) -> None:
@@ -173,9 +179,9 @@ def _draw_map(page: SplitPage) -> None:
     page.texts["map"].content = markup.framed(
         markup.dim(
             f"{measure.meaning}; {plane.kept:.0%} of the variation shown; "
-            f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a point"
+            f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a robot"
         ),
-        map_svg(plane.points, names, sides, uris),
+        map_svg(plane.points, names, sides, uris, page.gallery.thumbnails),
     )
     larger = measure.larger_is_more_alike
     direction = "larger" if larger else "smaller"

@@ -1,6 +1,7 @@
 """Robots are compared joint by joint, token by token and shape by shape."""
 
 import io
+import re
 
 import numpy as np
 import pytest
@@ -112,7 +113,8 @@ def test_moves_of_roles_are_kept_in_an_address():
 
 def test_figures_link_to_robots_and_escape_names():
     names, sides = ["<a>", "b"], ["train", "test"]
-    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"])
+    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"], {"z": "data:,"})
+    assert text.count("<image") == 1
     assert 'href="?robot=x%20y"' in text
     assert "&lt;a&gt;" in text
     assert "<a>" not in text.replace("<a href", "")
@@ -122,6 +124,19 @@ def test_figures_link_to_robots_and_escape_names():
 
 
 def test_coincident_points_are_drawn():
-    text = map_svg(np.zeros((3, 2)), list("abc"), ["train"] * 3, list("abc"))
-    assert text.count("<circle") == 3
+    text = map_svg(np.zeros((3, 2)), list("abc"), ["train"] * 3, list("abc"), {})
+    assert text.count('class="point"') == 3
     assert "nan" not in text
+
+
+def test_pictures_of_a_map_do_not_cover_each_other():
+    points = np.random.default_rng(0).normal(size=(60, 2))
+    names = [str(i) for i in range(60)]
+    text = map_svg(points, names, ["test"] * 60, names, {})
+    pattern = r'class="point" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"'
+    boxes = np.array(re.findall(pattern, text), dtype=float)
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    overlap = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    shared = np.maximum(overlap, 0).prod(axis=2)[~np.eye(60, dtype=bool)]
+    assert len(boxes) == 60
+    assert shared.max() < 0.35 * boxes[0, 2] * boxes[0, 3]

@@ -32,12 +32,15 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
     page.get_by_text("Cosine of test to train").wait_for()
     page.get_by_role("tab", name="Audit").click()
     page.get_by_text("Nearest train robots").wait_for()
+    page.get_by_role("tab", name="Similarity").click()
+    page.locator("svg rect:has(> title)").first.wait_for()
+    assert page.locator("svg rect:has(> title)").count() == 144
     page.get_by_role("tab", name="Map").click()
     point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
     point.first.wait_for()
-    assert page.locator("svg rect").count() == 144
+    page.locator("svg image").nth(11).wait_for()
     picture(page, "split-map")
-    point.first.locator("circle").click()
+    point.first.locator("image").click()
     page.wait_for_url(re.compile(r"robot=split:.*chain-000001"))
     page.get_by_text("chain-000001").first.wait_for()
     assert page.failures == []
