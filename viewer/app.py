@@ -35,7 +35,7 @@ from morphgen.viewer.tray import change_tray
 from morphgen.viewer.viser_internals import clear_page
 from morphgen.viewer.workers import Workers
 
-NOTHING = "There is nothing to see here"
+NOTHING = "This address cannot be shown"
 """Title of the page for an address that cannot be shown."""
 FAULT_WIDTH = 760.0
 """Width of that page's panel [pixels]."""

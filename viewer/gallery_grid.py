@@ -267,6 +267,8 @@ def _draw_grid(gallery: Gallery) -> None:
     ]
     scale = "" if math.isnan(height) else f" · a card is {height:.2g} m high"
     summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}{scale}</div>'
+    if not gallery.page_rows:
+        html = [markup.dim("No robot passes the filter: change the search, or widen the ranges.")]
     gallery.grid.content = markup.framed(summary, f'<div class="columns">{"".join(html)}</div>')
 
 

@@ -54,6 +54,9 @@ margin:4px 0 8px 0}
 .mg .selected th{color:inherit}
 .mg .scale{height:10px;border-radius:2px;margin-top:4px}
 .mg .ends{display:flex;justify-content:space-between;font-size:11.5px}
+.mg .offspring{display:grid;grid-template-columns:repeat(3,1fr);gap:8px;margin-top:.5em}
+.mg .offspring>div{border:1px solid #8883;border-radius:6px;padding:5px 8px;overflow-wrap:anywhere}
+.mg [data-do]{cursor:pointer}
 .mg .dim{color:#868e96;font-size:11.5px}.mg .bar{height:3px;background:#8882;margin-top:3px}
 .mg .bar div{height:3px;background:#339af0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}

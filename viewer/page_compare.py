@@ -25,6 +25,7 @@ EMPTY = (
     "<h2>Compare two to four robots</h2>Pick them here, or tick the box of cards in a gallery and "
     "press <i>compare</i> in the tray."
 )
+ONE_ROBOT = "Add a second robot to see how similar they are."
 PRIMITIVES = "primitives"
 """Value of ``show`` in the address when primitives are drawn."""
 ADDRESS_DELAY = 0.5
@@ -193,7 +194,9 @@ def _add_move_tab(page: ComparePage) -> None:
             robot.name for robot in page.robots if role in comparison.joint_roles(robot)
         )
         value = _home_value(page, role)
-        slider = gui.add_slider(role, -1.0, 1.0, 0.01, value, hint=f"of {names}")
+        slider = gui.add_slider(
+            role, -1.0, 1.0, 0.01, value, hint=f"-1 is the lower limit, 1 the upper; of {names}"
+        )
         page.sliders[role] = slider
         session.on_change(slider, read_sliders, "move")
 
@@ -241,6 +244,8 @@ def _compare(page: ComparePage) -> None:
     """Show tokens and similarity, or why the robots cannot be compared."""
     session = page.session
     names = [robot.name for robot in page.robots]
+    if len(names) == 1:
+        page.texts["similarity"].content = markup.framed(markup.dim(ONE_ROBOT))
     session.set_status("comparing")
     try:
         folders = session.files.library_folders
@@ -252,8 +257,8 @@ def _compare(page: ComparePage) -> None:
         session.set_status("")
         return
     links = [[link.name for link in robot.links] for robot in page.robots]
-    page.texts["similarity"].content = markup.framed(
-        "<h3>Similarity</h3>", comparison.similarity_table(names, result)
-    )
+    if len(names) > 1:
+        table = comparison.similarity_table(names, result)
+        page.texts["similarity"].content = markup.framed("<h3>Similarity</h3>", table)
     page.texts["tokens"].content = markup.framed(tokens_html(names, links, result.tables))
     session.set_status("")

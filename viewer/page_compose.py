@@ -5,24 +5,28 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from html import escape
 
 import viser
 
 from morphgen.checks import check
-from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
+from morphgen.errors import CompositionError
+from morphgen.grammar.choosers import Choices
 from morphgen.grammar.derivation import Derivation, parse_derivation
-from morphgen.grammar.grammar_file import SUFFIX
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
 from morphgen.grammar.request import known_grammars
+from morphgen.grammar.robot_set import GRAMMAR, INDEX, read_index, read_settings
 from morphgen.model.robot import Robot
-from morphgen.viewer import markup, part_choice
+from morphgen.viewer import compose_view, markup, part_choice
 from morphgen.viewer.address import Address
+from morphgen.viewer.compose_output import ROBOTS, send_robot, write_robot
+from morphgen.viewer.evolution import Individual
+from morphgen.viewer.page_compose_evolve import EvolveTab, add_evolve_tab, leave_parent, set_parent
 from morphgen.viewer.page_compose_grammar import add_grammar_tab, show_grammar
 from morphgen.viewer.page_compose_parameters import add_parameters_tab
 from morphgen.viewer.page_compose_parts import add_parts_tab
 from morphgen.viewer.page_robot import PANEL_WIDTH, summary
 from morphgen.viewer.part_choice import choice_of
-from morphgen.viewer.robot_files import new_bundle_files, zip_files
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
@@ -31,17 +35,15 @@ from morphgen.viewer.robot_uri import (
     UPLOAD,
     FileAccess,
     UriError,
+    parent_folder,
     read_robot_uri,
     resolve_derivation,
     resolve_grammar,
     shorten,
+    uri_name,
 )
-from morphgen.viewer.scene_robot import RobotView, add_robot, robot_bounds
-from morphgen.viewer.scene_stage import add_ground, look_at
 from morphgen.viewer.session import Session
 
-ROBOTS = "robots"
-"""Folder in which bundles are written."""
 DEFAULT_GRAMMAR = "arm3"
 
 
@@ -50,11 +52,12 @@ class ComposePage:
     """The composed robot in one browser, and the texts about it."""
 
     session: Session
+    view: compose_view.ComposeView
     summary: viser.GuiHtmlHandle
     findings: viser.GuiHtmlHandle | None = None
     command: viser.GuiHtmlHandle | None = None
     robot: Robot | None = None
-    view: RobotView | None = None
+    evolve: EvolveTab | None = None
 
 
 def show(session: Session) -> None:
@@ -70,14 +73,16 @@ def show(session: Session) -> None:
     grammar_name = DEFAULT_GRAMMAR
     if is_grammar := not derivation and "=" not in subject.split()[0]:
         grammar_name, words = subject.split()[0], DEFAULT_WORDS
+    drawn = drawn_in_set(subject, files) if derivation else None
+    if drawn is not None:
+        grammar_name = drawn[0]
     choice = choice_of(derivation, files.library) if derivation else None
     is_tree = derivation is not None and choice is None
     choice = choice or part_choice.parse_choice(words.split(), files.library)
     grammar = resolve_grammar(grammar_name, files)
     session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
     gui = session.client.gui
-    page = ComposePage(session, gui.add_html(""))
-    add_ground(session.client.scene, 2.0)
+    page = ComposePage(session, compose_view.ComposeView(session), gui.add_html(""))
     tabs = gui.add_tab_group()
     show_in_page = functools.partial(show_robot, page)
     start: Callable[[], None]
@@ -85,19 +90,42 @@ def show(session: Session) -> None:
     if is_grammar:
         grammar_tab = add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
         add_parts_tab(session, tabs, choice, show_in_page)
-        drawn = "number" in session.address.state
-        start = functools.partial(show_grammar, grammar_tab, drawn=drawn)
+        start = functools.partial(show_grammar, grammar_tab, grammar_tab.mode)
     else:
         if derivation and is_tree:
             start = add_parameters_tab(session, tabs, derivation, show_in_page)
         else:
             start = add_parts_tab(session, tabs, choice, show_in_page)
-        add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
+        grammar_tab = add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
+    page.evolve = add_evolve_tab(session, tabs, grammar_tab)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.findings = gui.add_html("")
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
         _add_downloads_tab(page)
     start()
+    if derivation and drawn is not None and page.robot is not None:
+        grammar_tab.choices, grammar_tab.mode = drawn[1], "chosen"
+        set_parent(page.evolve, Individual(page.robot, derivation, drawn[1]))
+
+
+def drawn_in_set(subject: str, files: FileAccess) -> tuple[str, Choices] | None:
+    """Return the grammar and the choices that gave a robot of a set; None for other robots.
+
+    Raises:
+        FormatError: If the files of the set are invalid.
+    """
+    folder = parent_folder(subject)
+    if not folder or not (path := files.path(folder)).joinpath(INDEX).is_file():
+        return None
+    records = {record["name"]: record["choices"] for record in read_index(path)}
+    choices = records.get(uri_name(subject))
+    if choices is None or not (path / GRAMMAR).is_file():
+        return None
+    name = str(read_settings(path)["grammar"])
+    text = (path / GRAMMAR).read_text(encoding="utf-8")
+    if name in grammar_names() and grammar_text(resolve_grammar(name, files)) == text:
+        return name, choices
+    return f"{folder}/{GRAMMAR}", choices
 
 
 def subject_derivation(subject: str, files: FileAccess) -> Derivation | None:
@@ -140,22 +168,20 @@ def show_robot(
         command: Command that makes the same robot.
         uri: URI of the robot, for the link to its own page.
     """
-    client, is_first = page.session.client, page.view is None
-    robot = split_colours(robot)
-    with client.atomic():
-        if page.view is not None:
-            page.view.base.remove()
-        page.view = add_robot(client.scene, robot, "/robot")
+    change = compose_view.show(page.view, robot)
     page.robot = robot
-    if is_first:  # later robots keep the camera of the user
-        look_at(client, *robot_bounds(robot))
     page.summary.content = summary(
-        robot, " · " + markup.link(Address("robot", (uri,)), "open its page")
+        robot,
+        f" · {markup.link(Address('robot', (uri,)), 'open its page')} · "
+        + markup.choose_box(uri, "choose")
+        + (f"<br>changed: {escape(change)}" if change else ""),
     )
     if page.command is not None:
         page.command.content = markup.framed(
             markup.command(command), "<h3>Derivation</h3>", markup.code(str(derivation))
         )
+    if page.evolve is not None:
+        leave_parent(page.evolve)
     page.session.run_in_background(lambda: _check(page), "check")
 
 
@@ -185,28 +211,22 @@ def _add_downloads_tab(page: ComposePage) -> None:
     )
 
 
+def _shown_robot(page: ComposePage) -> Robot:
+    """Return the robot that the page shows.
+
+    Raises:
+        CompositionError: If there is none.
+    """
+    if page.robot is None:
+        raise CompositionError("no robot is shown: choose parts that fit, or draw one")
+    return page.robot
+
+
 def _write_bundle(page: ComposePage, name: str) -> None:
-    robot, session = page.robot, page.session
-    if robot is None:
-        return
-    folder = bundle_folder(session.files.roots[0] / ROBOTS, name or robot.name)
-    session.set_status(f"writing {ROBOTS}/{folder.name}")
-    session.run_in_worker(_write_checked, robot, folder)
-    session.set_status("")
-    session.notify("Written", f"{ROBOTS}/{folder.name}")
-
-
-def _write_checked(robot: Robot, folder: Path) -> None:
-    """Write a bundle with findings and picture. Runs in a worker, which may use OpenGL."""
-    write_bundle(robot, folder, check(robot))
+    robot = _shown_robot(page)
+    write_robot(page.session, robot, name or robot.name)
 
 
 def _send_bundle(page: ComposePage, name: str) -> None:
-    robot, session = page.robot, page.session
-    if robot is None:
-        return
-    session.set_status("packing the bundle")
-    files = session.run_in_worker(new_bundle_files, robot)
-    name = bundle_folder(Path(), name or robot.name or "robot").name  # validates the name
-    session.client.send_file_download(f"{name}.zip", zip_files(name, files), save_immediately=True)
-    session.set_status("")
+    robot = _shown_robot(page)
+    send_robot(page.session, robot, name or robot.name or "robot")

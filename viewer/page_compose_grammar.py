@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from typing import Literal
 
 import viser
 
-from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import FirstChooser
+from morphgen.errors import MorphgenError
+from morphgen.grammar.choosers import Choices
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, outline
-from morphgen.grammar.derive import derive
 from morphgen.grammar.grammar_file import (
     SUFFIX,
     Grammar,
@@ -26,10 +27,16 @@ from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address, AddressError, pack_text, parse_count, unpack_text
+from morphgen.viewer.evolution import Individual, make_individual, pack_choices, unpack_choices
+from morphgen.viewer.frame import call
 from morphgen.viewer.part_choice import first_parts
 from morphgen.viewer.robot_uri import DERIVATION, resolve_grammar
 from morphgen.viewer.session import Session, set_value
 
+Mode = Literal["typical", "drawn", "chosen"]
+"""The typical robot, one that is drawn by seed and number, or the one that choices give."""
+_PLACE = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
+"""Beginning of an error that names a place in a grammar."""
 ShowRobot = Callable[[Robot, Derivation, str, str], None]
 """Shows a robot, given its derivation, the command that makes it, and its URI."""
 
@@ -54,6 +61,12 @@ class GrammarTab:
     tree: viser.GuiHtmlHandle
     derivation: Derivation | None = None
     """Derivation of the whole robot; fewer of its parts may be shown."""
+    choices: Choices = field(default_factory=dict)
+    """Choices that gave the robot."""
+    mode: Mode = "typical"
+    """Which robot of the grammar is shown."""
+    on_shown: Callable[[Individual], object] | None = None
+    """Called after a whole robot of the grammar was shown."""
 
     @property
     def name(self) -> str:
@@ -117,40 +130,73 @@ def add_grammar_tab(
         num_parts,
         tree,
     )
+    if "choices" in state:
+        tab.choices, tab.mode = unpack_choices(state["choices"]), "chosen"
+    elif "number" in state:
+        tab.mode = "drawn"
     session.on_change(dropdown, lambda: _load(tab, dropdown.value))
-    session.on_change(text_field, lambda: _check_edited(tab), "grammar")
+    session.on_change(text_field, lambda: show_grammar(tab, tab.mode), "grammar")
     session.on_change(buttons, lambda: _draw(tab, buttons.value))
     session.on_change(num_parts, lambda: _show_parts(tab), "parts")
     return tab
 
 
-def show_grammar(tab: GrammarTab, *, drawn: bool) -> None:
-    """Show a robot of the edited grammar: sampled by seed and number, or the typical one."""
-    session, library = tab.session, tab.session.files.library
-    if not _check_grammar(tab):
-        return
-    grammar = grammar_from_text(tab.text.value, tab.name)
-    name = shlex.quote(f"{tab.name}{SUFFIX}" if tab.is_edited else tab.source)
-    note = f"# with the text of the tab Grammar in {name}\n" if tab.is_edited else ""
-    command = f"{note}morphgen compose {name}"
-    state = {}
-    if drawn:
-        seed, number = tab.seed.value, tab.number.value
-        session.set_status(f"drawing robot {number} of seed {seed}")
-        sample = sample_robot(grammar, library, number, seed=seed)
+def edited_grammar(tab: GrammarTab) -> Grammar:
+    """Return the grammar of the text.
+
+    Raises:
+        GrammarError: If it is invalid.
+    """
+    return grammar_from_text(tab.text.value, tab.name)
+
+
+def show_grammar(tab: GrammarTab, mode: Mode) -> None:
+    """Show a robot of the edited grammar, or what is wrong with the text; then the last stays."""
+    session = tab.session
+    tab.mode = mode
+    try:
+        grammar = edited_grammar(tab)
+        individual, command, state = _make_robot(tab, grammar)
+    except (MorphgenError, RecursionError) as error:
         session.set_status("")
-        robot, tab.derivation = sample.robot, sample.derivation
-        command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
-        state = {"seed": str(seed), "number": str(number)}
-    else:
-        tab.derivation = derive(grammar, library, FirstChooser())
-        robot = compose(tab.derivation, library, tab.name)
+        _update_address(tab, {})
+        _show_fault(tab, error)
+        return
+    _show_fault(tab, None)
+    tab.choices, tab.derivation = individual.choices, individual.derivation
     n = sum(1 for _ in tab.derivation.walk())
     tab.num_parts.max = max(n, 2)  # a slider needs a range
     set_value(tab.num_parts, n)
     _update_address(tab, state)
     _show_tree(tab, tab.derivation, n)
-    tab.show_robot(robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
+    tab.show_robot(individual.robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
+    if tab.on_shown is not None:
+        tab.on_shown(individual)
+
+
+def _make_robot(tab: GrammarTab, grammar: Grammar) -> tuple[Individual, str, dict[str, str]]:
+    """Return the robot of the tab's mode, the command that makes it, and its address's state.
+
+    Raises:
+        MorphgenError: If the grammar gives no such robot.
+    """
+    session, library = tab.session, tab.session.files.library
+    name = shlex.quote(f"{tab.name}{SUFFIX}" if tab.is_edited else tab.source)
+    note = f"# with the text of the tab Grammar in {name}\n" if tab.is_edited else ""
+    if tab.mode == "drawn":
+        seed, number = tab.seed.value, tab.number.value
+        session.set_status(f"drawing robot {number} of seed {seed}")
+        sample = sample_robot(grammar, library, number, seed=seed)
+        session.set_status("")
+        command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
+        individual = Individual(sample.robot, sample.derivation, sample.choices)
+        return individual, command, {"seed": str(seed), "number": str(number)}
+    if tab.mode == "typical":
+        individual = make_individual(grammar, library, {}, tab.name)
+        return individual, f"{note}morphgen compose {name}", {}
+    individual = make_individual(grammar, library, tab.choices)
+    state = {"choices": pack_choices(individual.choices)}
+    return individual, f"# {individual.derivation}", state
 
 
 def _load(tab: GrammarTab, source: str) -> None:
@@ -158,13 +204,7 @@ def _load(tab: GrammarTab, source: str) -> None:
     tab.source = source
     tab.original = grammar_text(resolve_grammar(source, tab.session.files))
     set_value(tab.text, tab.original)
-    show_grammar(tab, drawn=False)
-
-
-def _check_edited(tab: GrammarTab) -> None:
-    """Check the edited text, and keep it in the address."""
-    _update_address(tab, {})
-    _check_grammar(tab)
+    show_grammar(tab, "typical")
 
 
 def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
@@ -179,23 +219,21 @@ def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
     tab.session.show_address(f"compose {tab.source}")
 
 
-def _check_grammar(tab: GrammarTab) -> bool:
-    """Return whether the text is a grammar that derives a robot; show the error if not."""
-    try:
-        grammar = grammar_from_text(tab.text.value, tab.name)
-        derive(grammar, tab.session.files.library, FirstChooser())
-    except GrammarError as error:
-        tab.fault.content = markup.error(tab.session.files.redact(error))
-        return False
-    tab.fault.content = ""
-    return True
+def _show_fault(tab: GrammarTab, error: Exception | None) -> None:
+    """Show what is wrong with the grammar, below the text and at its place in the text."""
+    text = "" if error is None else tab.session.files.redact(error)
+    tab.fault.content = markup.error(text) if text else ""
+    place = _PLACE.match(text)
+    is_here = place is not None and place["origin"] == tab.name
+    line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
+    tab.session.run_script(call("mark", line, column))
 
 
 def _draw(tab: GrammarTab, action: str) -> None:
     """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
     if action == "next":
         set_value(tab.number, tab.number.value + 1)
-    show_grammar(tab, drawn=action != "typical")
+    show_grammar(tab, "typical" if action == "typical" else "drawn")
 
 
 def _show_parts(tab: GrammarTab) -> None:

@@ -15,6 +15,7 @@ from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_compose_grammar import ShowRobot
 from morphgen.viewer.part_choice import Control, node_controls
+from morphgen.viewer.robot_tables import part_title
 from morphgen.viewer.robot_uri import DERIVATION
 from morphgen.viewer.session import Session
 
@@ -52,8 +53,7 @@ def add_parameters_tab(
         for node in derivation.walk():
             controls = node_controls(node, session.files.library, is_root=node is derivation)
             if controls:
-                title = node.label if node.label == node.part else f"{node.label} ({node.part})"
-                with gui.add_folder(title):
+                with gui.add_folder(part_title(node.label, node.part)):
                     for control in controls:
                         _add_slider(tab, node, control)
     return lambda: _show(tab)

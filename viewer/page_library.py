@@ -28,7 +28,7 @@ def show(session: Session) -> None:
     header = INTRODUCTION + section_links(library_sections(session.files))
     open_panels(gallery, "", header)
     upload = session.client.gui.add_upload_button(
-        "Look at a URDF or a zipped bundle", icon=viser.Icon.UPLOAD
+        "Open a URDF or a zipped bundle", icon=viser.Icon.UPLOAD
     )
 
     async def uploaded(event: viser.GuiEvent[viser.GuiUploadButtonHandle]) -> None:

@@ -57,9 +57,7 @@ def add_picker(session: Session, lists: RobotLists, current: Callable[[], str]) 
     gui = session.client.gui
     source = gui.add_dropdown("from", tuple(lists))
     robot = gui.add_dropdown("robot", ("",), hint="type to search")
-    words = gui.add_text(
-        "or words", "", hint="such as arm=ur5 ee=plane, or a bundle's folder; then Enter"
-    )
+    words = gui.add_text("or words", "", hint="such as arm=ur5 ee=plane, or the folder of a bundle")
     picker = RobotPicker(session, lists, current, source, robot, words, {})
     session.on_change(source, lambda: list_robots(picker))
     list_robots(picker)

@@ -25,8 +25,10 @@ _ROTATION_UNITS = ("rad", "N m", "rad/s")
 class JointGroup:
     """Independent joints that came with the same part."""
 
+    label: str
+    """Label of the part, which begins the names of its joints; empty for unknown parts."""
     title: str
-    """Label and name of the part, such as ``left.arm: ur5``."""
+    """Label and name of the part, such as ``left_arm (ur5)``; the label alone if both are equal."""
     rows: tuple[int, ...]
     """Indices of the joints in q."""
 
@@ -39,20 +41,28 @@ def has_tool(robot: Robot) -> bool:
 def joint_groups(robot: Robot) -> list[JointGroup]:
     """Return the independent joints by part; a robot of unknown parts has one group."""
     parts = cast(Sequence[Mapping[str, Any]], robot.provenance.get("parts", ()))
-    titles = {str(part["label"]): f"{part['label']}: {part['part']}" for part in parts}
+    names = {str(part["label"]): str(part["part"]) for part in parts}
     # The longest label first: a joint of "left_arm" does not belong to "left".
-    labels = sorted(titles, key=len, reverse=True)
+    labels = sorted(names, key=len, reverse=True)
     groups: dict[str, list[int]] = {}
     for row, k in enumerate(robot.independent_joints):
         name = robot.joints[k].name
         label = next((label for label in labels if name.startswith(f"{label}_")), "")
-        groups.setdefault(titles.get(label, "joints"), []).append(row)
-    return [JointGroup(title, tuple(rows)) for title, rows in groups.items()]
+        groups.setdefault(label, []).append(row)
+    return [
+        JointGroup(label, part_title(label, names[label]) if label else "joints", tuple(rows))
+        for label, rows in groups.items()
+    ]
+
+
+def part_title(label: str, part: str) -> str:
+    """Return the label of a part with its name, or once what both are."""
+    return label if label == part else f"{label} ({part})"
 
 
 def short_name(joint: Joint, group: JointGroup) -> str:
     """Return a joint's name without the label of its group."""
-    return joint.name.removeprefix(group.title.partition(":")[0] + "_")
+    return joint.name.removeprefix(f"{group.label}_")
 
 
 def joint_hint(joint: Joint) -> str:

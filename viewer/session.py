@@ -81,6 +81,9 @@ class Session:
     """Line of the page that shows the current activity."""
     title: str = "morphgen"
     """Title of the browser's tab."""
+    actions: dict[str, Callable[[str], object]] = field(default_factory=dict)
+    """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
+    called with the element's ``data-value``."""
     on_choice: Work | None = None
     """Called after the user has chosen other robots."""
 
@@ -174,6 +177,14 @@ class Session:
 
         attach = getattr(handle, "on_click", None) or handle.on_update
         attach(changed)
+
+    def on_command(self, command: viser.CommandHandle, work: Work) -> None:
+        """Enqueue work whenever the user runs a command, or presses its keys."""
+
+        async def triggered(event: viser.CommandEvent) -> None:
+            self.enqueue(work)
+
+        command.on_trigger(triggered)
 
     def on_close(self, work: Work) -> None:
         """Call quick work when the browser leaves the page; immediately if it already has."""

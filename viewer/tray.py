@@ -18,17 +18,20 @@ _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
 
 def change_tray(session: Session, action: str, uri: str) -> None:
-    """Do what a page's script asks for.
+    """Do what a page's script asks for: an action of the page, or one of the tray.
 
     Args:
         session: The page.
-        action: ``choose`` or ``drop`` a robot, ``clear`` the tray, or ``download`` its robots.
-        uri: URI of the robot.
+        action: One of ``session.actions``, or ``choose`` or ``drop`` a robot, ``clear`` the tray,
+            or ``download`` its robots.
+        uri: Value of the action: URI of the robot.
 
     Raises:
         AddressError: If there is no such action, or the tray is full.
     """
-    if action == "choose":
+    if action in session.actions:
+        session.actions[action](uri)
+    elif action == "choose":
         session.choose((*session.chosen, uri))
     elif action == "drop":
         session.choose([other for other in session.chosen if other != uri])

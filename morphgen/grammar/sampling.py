@@ -30,7 +30,7 @@ MAX_ATTEMPTS = 500
 TOO_LARGE = f"more than {MAX_PARTS} parts"
 """Reason for rejecting a draw whose recursion exceeds the part limit."""
 UNCHANGED = "nothing changed"
-"""Reason for rejecting a neighbour that equals the original robot."""
+"""Reason for rejecting a neighbour or child that equals an original robot."""
 
 
 class SamplingError(MorphgenError):
@@ -147,11 +147,53 @@ def mutate(
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
         choosers = islice(_with_one_redrawn(rng, choices, keys), MAX_ATTEMPTS)
         result = _first_valid(
-            choosers, grammar, library, grammar.wheres, f"{name}-m{index:04d}", index, origin
+            choosers, grammar, library, grammar.wheres, f"{name}-m{index:04d}", index, (origin,)
         )
         if not isinstance(result, Sample):
             raise SamplingError(
                 f"no neighbour of {name!r} in {MAX_ATTEMPTS} draws: "
+                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
+            )
+        yield result
+
+
+def cross(
+    grammar: Grammar,
+    library: Library,
+    parents: tuple[Choices, Choices],
+    n: int,
+    *,
+    seed: int = 0,
+    name: str,
+) -> Iterator[Sample]:
+    """Draw children of two robots: each random choice is that of one of the parents.
+
+    Choices that neither parent made, because their robots have no such part, are drawn.
+
+    Args:
+        grammar: The grammar of both robots.
+        library: Library of the grammar's parts.
+        parents: The robots' choices, as in ``Sample.choices``.
+        n: Number of children.
+        seed: Seed; child i does not depend on n.
+        name: Name of the children, which are called ``<name>-x0000`` and so on.
+
+    Raises:
+        SamplingError: If ``MAX_ATTEMPTS`` draws give no valid robot that differs from both parents.
+    """
+    random = RandomChooser(np.random.default_rng(seed))
+    origins = tuple(
+        derive(grammar, library, RecordedChooser(random, choices)) for choices in parents
+    )
+    for index in range(n):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        choosers = islice(_with_mixed_choices(rng, parents), MAX_ATTEMPTS)
+        result = _first_valid(
+            choosers, grammar, library, grammar.wheres, f"{name}-x{index:04d}", index, origins
+        )
+        if not isinstance(result, Sample):
+            raise SamplingError(
+                f"no child of two robots of {grammar.name!r} in {MAX_ATTEMPTS} draws: "
                 + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
             )
         yield result
@@ -172,6 +214,20 @@ def _with_one_redrawn(
         yield RecordedChooser(RandomChooser(rng), kept)
 
 
+def _with_mixed_choices(
+    rng: np.random.Generator, parents: tuple[Choices, Choices]
+) -> Iterator[RecordedChooser]:
+    """Yield choosers that take each choice from one of two robots."""
+    keys = sorted({*parents[0], *parents[1]})
+    while True:
+        picks = rng.integers(2, size=len(keys))
+        mixed = {}
+        for key, pick in zip(keys, picks, strict=True):
+            first, second = parents[pick], parents[1 - pick]
+            mixed[key] = first[key] if key in first else second[key]
+        yield RecordedChooser(RandomChooser(rng), mixed)
+
+
 def _first_valid(
     choosers: Iterable[RecordedChooser],
     grammar: Grammar,
@@ -179,9 +235,9 @@ def _first_valid(
     where: Sequence[Expression],
     name: str,
     index: int,
-    origin: Derivation | None = None,
+    origins: tuple[Derivation, ...] = (),
 ) -> Sample | Counter[str]:
-    """Return the first valid robot other than ``origin``, or the reasons for all rejections."""
+    """Return the first valid robot other than ``origins``, or the reasons for all rejections."""
     conditions = [clause for condition in where for clause in clauses(condition)]
     rejected: Counter[str] = Counter()
     for chooser in choosers:
@@ -190,7 +246,7 @@ def _first_valid(
         except TooManyPartsError:
             rejected[TOO_LARGE] += 1
             continue
-        if derivation == origin:
+        if derivation in origins:
             rejected[UNCHANGED] += 1
             continue
         result = _build_if_valid(derivation, library, conditions, name, chooser.choices)

@@ -14,7 +14,7 @@ from morphgen.viewer import rollout
 
 WORD = "tellnobody"
 DEEP = "a=b[c:" * 1000 + "a=b" + "]" * 1000
-NOTHING = "There is nothing to see here"
+NOTHING = "This address cannot be shown"
 
 
 @pytest.fixture

@@ -252,7 +252,7 @@ def test_killed_browser_leaves_no_resources(see, viewer, browser_command, tmp_pa
 )
 def test_invalid_upload_shows_the_reason(see, tmp_path, name, content, message):
     page = see("?library=")
-    button = page.get_by_role("button", name="Look at a URDF")
+    button = page.get_by_role("button", name="Open a URDF")
     button.wait_for()
     (tmp_path / name).write_bytes(content)
     with page.expect_file_chooser() as chooser:
@@ -264,7 +264,7 @@ def test_invalid_upload_shows_the_reason(see, tmp_path, name, content, message):
 @pytest.mark.slow
 def test_an_upload_is_shown(see, tmp_path):
     page = see("?library=")
-    button = page.get_by_role("button", name="Look at a URDF")
+    button = page.get_by_role("button", name="Open a URDF")
     button.wait_for()
     (tmp_path / "some.urdf").write_text(
         '<robot name="sent"><link name="a"><visual><geometry><box size="1 1 1"/></geometry>'

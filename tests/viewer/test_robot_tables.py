@@ -34,8 +34,8 @@ def test_joints_are_grouped_by_their_part():
     parts = [{"label": "arm", "part": "x"}, {"label": "ee", "part": "y"}]
     named = replace(robot, joints=renamed, home=(0,) * 5, provenance={"parts": parts})
     assert [(c.title, c.rows) for c in joint_groups(named)] == [
-        ("arm: x", (0, 1, 2)),
-        ("ee: y", (3, 4)),
+        ("arm (x)", (0, 1, 2)),
+        ("ee (y)", (3, 4)),
     ]
 
 

@@ -1,0 +1,110 @@
+"""Generations of robots on the compose page, and their history."""
+
+import numpy as np
+import pytest
+
+from helpers.viser_client import PlainClient
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
+from morphgen.grammar.library import default_library
+from morphgen.grammar.sampling import sample_robot
+from morphgen.viewer.address import AddressError, pack_text
+from morphgen.viewer.compose_view import Facts, change_text
+from morphgen.viewer.evolution import (
+    NUM_OFFSPRING,
+    History,
+    change_lines,
+    make_individual,
+    offspring,
+    pack_choices,
+    unpack_choices,
+)
+from morphgen.viewer.scene_offspring import hit_robot
+
+LIBRARY = default_library()
+
+
+@pytest.fixture(scope="module")
+def planar_arm():
+    return load_grammar(find_grammar("planar_arm", LIBRARY.folders), LIBRARY.folders)
+
+
+def test_packed_choices_give_the_same_robot(planar_arm):
+    sample = sample_robot(planar_arm, LIBRARY, 1)
+    choices = unpack_choices(pack_choices(sample.choices))
+    individual = make_individual(planar_arm, LIBRARY, choices)
+    assert individual.derivation == sample.derivation
+    again = make_individual(planar_arm, LIBRARY, individual.choices)
+    assert again.robot.name == individual.robot.name
+
+
+def test_a_generation_has_mutants_of_one_robot_or_children_of_two(planar_arm):
+    a, b = (sample_robot(planar_arm, LIBRARY, i) for i in (1, 2))
+    mutants = offspring(planar_arm, LIBRARY.folders, [a.choices], 3)
+    children = offspring(planar_arm, LIBRARY.folders, [a.choices, b.choices], 3)
+    assert len(mutants) == len(children) == NUM_OFFSPRING
+    assert all(mutant.derivation != a.derivation for mutant in mutants)
+    for child in children:
+        shared = child.choices.keys() & a.choices.keys() & b.choices.keys()
+        assert all(child.choices[key] in (a.choices[key], b.choices[key]) for key in shared)
+
+
+@pytest.mark.parametrize(
+    "text", ["!", pack_text("[1]"), pack_text('{"a": "b"}'), pack_text('{"a": Infinity}')]
+)
+def test_invalid_choices_of_an_address_are_refused(text):
+    with pytest.raises(AddressError, match="readable"):
+        unpack_choices(text)
+
+
+def test_the_history_forgets_what_was_undone(planar_arm):
+    individuals = [make_individual(planar_arm, LIBRARY, {}) for _ in range(4)]
+    history = History()
+    for individual in individuals[:3]:
+        history.add(individual)
+    assert history.go_to(3) is None
+    assert history.go_to(-1) is None
+    assert history.go_to(0) is individuals[0]
+    history.add(individuals[3])
+    assert history.individuals == [individuals[0], individuals[3]]
+    assert history.position == 1
+
+
+def test_changes_are_said_in_one_line():
+    before, after = Facts(5, 1.0, 1.084), Facts(6, 1.24, 1.678)
+    assert change_text(before, after) == "5 to 6 DoF, reach 1.08 to 1.68 m, mass +0.24 kg"
+    assert change_text(before, Facts(5, 1.001, None)) == ""
+
+
+def test_changes_of_a_derivation_are_lines():
+    before = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.1971947)]")
+    after = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.3)]")
+    assert change_lines(before, after) == ["beam1.length 0.197 to 0.3"]
+    longer = parse_derivation(
+        "post=post(height=0.05)[top: beam1=beam(length=0.3)[end: beam2=beam(length=0.1)]]"
+    )
+    assert change_lines(after, longer) == ["+ beam2 (beam on beam1:end)"]
+
+
+def test_a_ray_hits_the_nearest_box():
+    boxes = np.array([[[0, 0, 0], [1, 1, 1]], [[2, 0, 0], [3, 1, 1]]], dtype=float)
+    inside = np.array([-1.0, 0.5, 0.5])
+    assert hit_robot(boxes, inside, np.array([1.0, 0, 0])) == 0
+    assert hit_robot(boxes, np.array([9.0, 0.5, 0.5]), np.array([-1.0, 0, 0])) == 1
+    assert hit_robot(boxes, inside, np.array([-1.0, 0, 0])) is None
+    assert hit_robot(boxes, inside, np.array([0, 0, 1.0])) is None
+
+
+def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(viewer):
+    with PlainClient(viewer().port, "?compose=robots/prims/prims-000001") as client:
+        client.control("Number", "generation")
+        buttons = client.control("ButtonGroup", "show")
+        client.shows("Tick two to cross them")
+        client.change(buttons, "mutants")
+        client.shows('data-do="adopt" data-value="8"')
+        client.until(lambda: "evolve=1" in client.text)
+
+
+def test_robots_of_parts_do_not_evolve(viewer):
+    with PlainClient(viewer().port, "?compose=arm=ur5 ee=plane") as client:
+        client.shows("Only robots of a grammar evolve")
