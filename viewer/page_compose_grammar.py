@@ -108,11 +108,11 @@ def add_grammar_tab(
     with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
         dropdown = gui.add_dropdown("start from", names, initial_value=source)
         text = unpack_text(state["text"]) if "text" in state else original
-        text_field = gui.add_text("text", text, multiline=True)
+        text_field = gui.add_text("grammar", text, multiline=True)
         fault, too_long = gui.add_html(""), gui.add_html("")
         seed = gui.add_number("seed", count("seed"), min=0, step=1)
         number = gui.add_number("robot number", count("number"), min=0, step=1)
-        buttons = gui.add_button_group("draw", ("typical", "this", "next"))
+        buttons = gui.add_button_group("robot", ("typical", "this", "next"))
         num_parts = gui.add_slider(
             "parts shown", 1, 2, 1, 1, hint="how much of the derivation is shown"
         )
@@ -156,13 +156,13 @@ def show_grammar(tab: GrammarTab, mode: Mode) -> None:
     tab.mode = mode
     try:
         grammar = edited_grammar(tab)
-        individual, command, state = _make_robot(tab, grammar)
+        typical = make_individual(grammar, session.files.library, {}, tab.name)
+        individual, command, state = _make_robot(tab, grammar, typical)
     except (MorphgenError, RecursionError) as error:
         session.set_status("")
         _update_address(tab, {})
         _show_fault(tab, error)
         return
-    _show_fault(tab, None)
     tab.choices, tab.derivation = individual.choices, individual.derivation
     n = sum(1 for _ in tab.derivation.walk())
     tab.num_parts.max = max(n, 2)  # a slider needs a range
@@ -170,11 +170,14 @@ def show_grammar(tab: GrammarTab, mode: Mode) -> None:
     _update_address(tab, state)
     _show_tree(tab, tab.derivation, n)
     tab.show_robot(individual.robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
+    _show_fault(tab, None)
     if tab.on_shown is not None:
         tab.on_shown(individual)
 
 
-def _make_robot(tab: GrammarTab, grammar: Grammar) -> tuple[Individual, str, dict[str, str]]:
+def _make_robot(
+    tab: GrammarTab, grammar: Grammar, typical: Individual
+) -> tuple[Individual, str, dict[str, str]]:
     """Return the robot of the tab's mode, the command that makes it, and its address's state.
 
     Raises:
@@ -192,8 +195,7 @@ def _make_robot(tab: GrammarTab, grammar: Grammar) -> tuple[Individual, str, dic
         individual = Individual(sample.robot, sample.derivation, sample.choices)
         return individual, command, {"seed": str(seed), "number": str(number)}
     if tab.mode == "typical":
-        individual = make_individual(grammar, library, {}, tab.name)
-        return individual, f"{note}morphgen compose {name}", {}
+        return typical, f"{note}morphgen compose {name}", {}
     individual = make_individual(grammar, library, tab.choices)
     state = {"choices": pack_choices(individual.choices)}
     return individual, f"# {individual.derivation}", state

@@ -27,6 +27,8 @@ from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
 """Draws for one robot before its conditions are considered unsatisfiable."""
+MUTATED_SHARE = 0.5
+"""Share of the children of two robots of which one choice is drawn again, as of a neighbour."""
 TOO_LARGE = f"more than {MAX_PARTS} parts"
 """Reason for rejecting a draw whose recursion exceeds the part limit."""
 UNCHANGED = "nothing changed"
@@ -166,9 +168,12 @@ def cross(
     seed: int = 0,
     name: str,
 ) -> Iterator[Sample]:
-    """Draw children of two robots: each random choice is that of one of the parents.
+    """Draw children of two robots: a choice is that of one parent, or a value between both.
 
-    Choices that neither parent made, because their robots have no such part, are drawn.
+    Alternatives and counts are those of one of the parents; other values are uniform between those
+    of both (arithmetic crossover). Choices that only one parent made are kept, and choices that
+    neither made, because their robots have no such part, are drawn. ``MUTATED_SHARE`` of the
+    children are mutated, too: similar parents have few other children.
 
     Args:
         grammar: The grammar of both robots.
@@ -217,15 +222,20 @@ def _with_one_redrawn(
 def _with_mixed_choices(
     rng: np.random.Generator, parents: tuple[Choices, Choices]
 ) -> Iterator[RecordedChooser]:
-    """Yield choosers that take each choice from one of two robots."""
+    """Yield choosers that repeat mixtures of the choices of two robots."""
     keys = sorted({*parents[0], *parents[1]})
     while True:
-        picks = rng.integers(2, size=len(keys))
-        mixed = {}
-        for key, pick in zip(keys, picks, strict=True):
-            first, second = parents[pick], parents[1 - pick]
-            mixed[key] = first[key] if key in first else second[key]
+        mixed = {key: _mixed_choice(rng, [p[key] for p in parents if key in p]) for key in keys}
+        if keys and rng.random() < MUTATED_SHARE:
+            del mixed[keys[int(rng.integers(len(keys)))]]
         yield RecordedChooser(RandomChooser(rng), mixed)
+
+
+def _mixed_choice(rng: np.random.Generator, values: Sequence[float]) -> float:
+    """Return one of two values, or if one of them is no whole number, a value between them."""
+    if all(float(value).is_integer() for value in values):
+        return values[int(rng.integers(len(values)))]
+    return float(rng.uniform(min(values), max(values)))
 
 
 def _first_valid(

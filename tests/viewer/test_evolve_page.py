@@ -84,7 +84,7 @@ def test_robots_are_mutated_adopted_crossed_undone_and_kept(see, viewer, folder,
     assert re.fullmatch(r"planar_arm-[0-9a-f]{8}", adopted)
     page.locator("[data-do=pick]").nth(1).click()
     page.locator("[data-do=pick]").nth(6).click()
-    page.locator("[data-do=pick]:checked").nth(1).wait_for()
+    page.locator("[data-do=pick][checked]").nth(1).wait_for()
     page.get_by_role("button", name="cross", exact=True).click()
     page.wait_for_url(re.compile(r"evolve=3&with=[\w-]+$"))
     page.reload()
