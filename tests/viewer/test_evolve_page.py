@@ -103,7 +103,7 @@ def test_robots_are_mutated_adopted_crossed_undone_and_kept(see, viewer, folder,
     page.get_by_role("heading", name=first).wait_for(state="detached")
     name = page.locator("h3").first.inner_text()
     page.get_by_role("button", name="Add to set").click()
-    page.get_by_text(f"robots/planar_arm-evolved/{name}").wait_for()
+    page.get_by_text("Written", exact=True).wait_for()
     assert read_bundle(folder / "robots" / "planar_arm-evolved" / name).name == name
     assert page.failures == []
 
