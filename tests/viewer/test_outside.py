@@ -120,7 +120,7 @@ def test_grammar_file_cannot_include_outside_files(viewer, folder, secret):
 
 def test_grammar_text_cannot_include_files(viewer, secret):
     with PlainClient(viewer().port, "?compose=arm3") as client:
-        text = client.control("Text", "text")
+        text = client.control("Text", "grammar")
         client.change(text, f'include "{secret}/a.grammar"\nrobot -> ur5\n')
         client.shows("a grammar given as text cannot include others")
         assert WORD not in client.text
