@@ -217,6 +217,7 @@ def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
             state = state | {"text": pack_text(tab.text.value)}
         except AddressError as error:
             tab.too_long.content = markup.framed(markup.dim(str(error)))
+            state = {}  # without the text it would name another robot
     tab.session.address = Address("compose", (tab.source,), state)
     tab.session.show_address(f"compose {tab.source}")
 
