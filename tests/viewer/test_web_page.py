@@ -56,6 +56,7 @@ def test_a_page_loads_nothing_else(page):
     assert ADDRESS.findall(page) == []
 
 
+@pytest.mark.slow
 def test_a_turn_of_the_camera_ends_where_it_began():
     robot = arm()
     home = np.array([robot.home])
