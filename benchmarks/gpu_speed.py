@@ -135,8 +135,12 @@ def _physics(split: str, envs: int, geometry: CollisionGeometry, device: str) ->
         act(step)
         targets.append(batch.targets[:, : simulation.q.shape[1]].clone())
     batch.reset(seed=0)
-    row: Row = {"split": split, "geometry": geometry, "environments": envs}
-    row["structures"] = len(simulation.counts)
+    row: Row = {
+        "split": split,
+        "geometry": geometry,
+        "environments": envs,
+        "structures": len(simulation.counts),
+    }
     everything = torch.ones(envs, dtype=torch.bool, device=device)
     found = {"batch": _steps_per_second(act, envs)}
     counts = simulation.counts.sum(dim=0).tolist()

@@ -201,6 +201,7 @@ def batch_from_specs(
     require_seed(seed)
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
+    require_geometry(geometry)
     simulator = SIMULATORS[sim or default_simulator()]
     require_simulator_device(simulator.name, device)
     _require_contacts(simulator, specs, geometry)
@@ -232,10 +233,9 @@ def _require_contacts(
     """Require a simulator with contacts if a scene has something to touch.
 
     Raises:
-        TaskError: If the geometry is unknown, or if a scene has a block or obstacles, or a geometry
-            was chosen, that the simulator would ignore.
+        TaskError: If a scene has a block or obstacles, or a geometry was chosen, that the simulator
+            would ignore.
     """
-    require_geometry(geometry)
     if simulator.simulates_contacts:
         return
     if geometry != "primitive":

@@ -1,4 +1,4 @@
-"""What becomes of a composed robot: a bundle below ``robots/``, or a download."""
+"""Write a composed robot to a bundle below ``robots/``, or send it to the browser as a zip."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morphgen.formats.bundle import split_colours
+from morphgen.model.inertia import box_corners
 from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
@@ -112,8 +113,7 @@ def change_text(before: Facts, after: Facts) -> str:
 def _is_in_picture(view: ComposeView, low: Array, high: Array) -> bool:
     """Return whether the camera sees all corners of a box."""
     picture = camera_view(view.session.client)
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    points, depths = project_points(picture, corners)
+    points, depths = project_points(picture, box_corners(low, high))
     shares = points / (picture.aspect, 1.0)
     return bool((depths > 0).all() and (abs(shares - 0.5) <= 0.5 - _EDGE).all())
 

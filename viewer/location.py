@@ -1,4 +1,4 @@
-"""What a browser reports when it connects: its URL, its theme, and the width of its window."""
+"""Read the URL, the theme and the width of the window from a browser that connects."""
 
 from __future__ import annotations
 

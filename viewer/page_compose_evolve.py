@@ -12,7 +12,6 @@ import viser
 
 from morphgen.errors import CompositionError
 from morphgen.grammar.choosers import Choices
-from morphgen.model.robot import Robot
 from morphgen.viewer import markup
 from morphgen.viewer.address import parse_count
 from morphgen.viewer.compose_output import ROBOTS, send_robot, write_robot
@@ -122,7 +121,7 @@ def add_evolve_tab(
 def show_parent(tab: EvolveTab) -> None:
     """Show the history and the generation, or that the robot cannot evolve."""
     if tab.parent is None:
-        tab.strip.content = tab.grid.content = ""
+        tab.strip.content = ""
         tab.grid.content = markup.framed(markup.dim(NO_PARENT))
         return
     chips = []
@@ -178,17 +177,16 @@ def _start(tab: EvolveTab, individual: Individual) -> None:
     _breed(tab)
 
 
-def _next_generation(tab: EvolveTab) -> None:
-    """Show other mutants of the parent."""
-    tab.partner = None
+def _next_generation(tab: EvolveTab, partner: Choices | None = None) -> None:
+    """Show other mutants of the parent, or children of it and a partner."""
+    tab.partner = partner
     set_value(tab.seed, tab.seed.value + 1)
     _breed(tab)
 
 
 def _breed(tab: EvolveTab) -> None:
     """Make the offspring in a worker process, and show it."""
-    if (parent := tab.parent) is None:
-        raise CompositionError("no robot of a grammar is shown: draw one on the tab Grammar")
+    parent = _require_parent(tab)
     session, seed = tab.session, tab.seed.value
     parents = [parent.choices, *([tab.partner] if tab.partner else [])]
     grammar = edited_grammar(tab.grammar)
@@ -271,9 +269,7 @@ def _cross(tab: EvolveTab) -> None:
         raise CompositionError(f"{len(tab.picked)} robots are picked to cross; expected 2")
     first, second = (tab.generation[i] for i in tab.picked)
     _show_individual(tab, first)
-    tab.partner = second.choices
-    set_value(tab.seed, tab.seed.value + 1)
-    _breed(tab)
+    _next_generation(tab, second.choices)
 
 
 def _step(tab: EvolveTab, step: int) -> None:
@@ -291,17 +287,22 @@ def _click(tab: EvolveTab, event: viser.SceneClickEvent, *, adopt: bool) -> None
         (_adopt if adopt else _pick)(tab, i)
 
 
-def _require_parent(tab: EvolveTab) -> Robot:
+def _require_parent(tab: EvolveTab) -> Individual:
+    """Return the robot that evolves.
+
+    Raises:
+        CompositionError: If there is none.
+    """
     if tab.parent is None:
         raise CompositionError("no robot of a grammar is shown: draw one on the tab Grammar")
-    return tab.parent.robot
+    return tab.parent
 
 
 def _add_to_set(tab: EvolveTab) -> None:
-    robot = _require_parent(tab)
+    robot = _require_parent(tab).robot
     write_robot(tab.session, robot, robot.name, tab.set_name.value)
 
 
 def _export(tab: EvolveTab) -> None:
-    robot = _require_parent(tab)
+    robot = _require_parent(tab).robot
     send_robot(tab.session, robot, robot.name)

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 
 import viser
 
-from morphgen.errors import MorphgenError
-from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.request import default_name
-from morphgen.viewer import markup
-from morphgen.viewer.address import Address
 from morphgen.viewer.page_compose_grammar import ShowRobot
+from morphgen.viewer.page_compose_parts import show_composed
 from morphgen.viewer.part_choice import Control, node_controls
 from morphgen.viewer.robot_tables import part_title
 from morphgen.viewer.robot_uri import DERIVATION
@@ -89,15 +86,13 @@ def _add_slider(tab: ParametersTab, node: Derivation, control: Control) -> None:
 
 
 def _show(tab: ParametersTab) -> None:
-    """Show the robot, or why its values do not fit; then the last robot stays."""
-    session, uri = tab.session, f"{DERIVATION}{tab.derivation}"
-    try:
-        name = default_name(tab.derivation, session.files.library)
-        robot = compose(tab.derivation, session.files.library, name)
-    except MorphgenError as error:
-        tab.fault.content = markup.error(session.files.redact(error))
-        return
-    tab.fault.content = ""
-    session.address = Address("compose", (uri,))
-    session.show_address(f"compose {name}")
-    tab.show_robot(robot, tab.derivation, f"# {tab.derivation}", uri)
+    """Show the robot, or why its values do not fit."""
+    derivation, library = tab.derivation, tab.session.files.library
+    uri = f"{DERIVATION}{derivation}"
+    show_composed(
+        tab.session,
+        tab.fault,
+        uri,
+        lambda: (derivation, default_name(derivation, library)),
+        lambda robot, _: tab.show_robot(robot, derivation, f"# {derivation}", uri),
+    )

@@ -10,6 +10,8 @@ import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation
+from morphgen.model.robot import Robot
 from morphgen.viewer import markup, part_choice
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_compose_grammar import ShowRobot
@@ -52,20 +54,45 @@ def add_parts_tab(
     return lambda: _show_choice(tab)
 
 
-def _show_choice(tab: PartsTab) -> None:
-    """Show the robot of the chosen parts, or why they do not fit; then the last robot stays."""
-    session, words = tab.session, tab.choice.words
+def show_composed(
+    session: Session,
+    fault: viser.GuiHtmlHandle,
+    subject: str,
+    resolve: Callable[[], tuple[Derivation, str]],
+    show: Callable[[Robot, Derivation], None],
+) -> None:
+    """Show a robot and its address, or why it cannot be composed; then the last robot stays.
+
+    Args:
+        session: The browser.
+        fault: Text that says what is wrong.
+        subject: Subject of the page's address.
+        resolve: Returns the derivation and the name of the robot, or raises a MorphgenError.
+        show: Shows the robot on the page.
+    """
     try:
-        derivation, name = resolve_words(words, session.files)
+        derivation, name = resolve()
         robot = compose(derivation, session.files.library, name)
     except MorphgenError as error:
-        tab.fault.content = markup.error(session.files.redact(error))
+        fault.content = markup.error(session.files.redact(error))
         return
-    tab.fault.content = ""
-    session.address = Address("compose", (words,))
+    fault.content = ""
+    session.address = Address("compose", (subject,))
     session.show_address(f"compose {name}")
+    show(robot, derivation)
+
+
+def _show_choice(tab: PartsTab) -> None:
+    """Show the robot of the chosen parts, or why they do not fit."""
+    session, words = tab.session, tab.choice.words
     command = shlex.join(["morphgen", "compose", *words.split()])
-    tab.show_robot(robot, derivation, command, WORDS + words)
+    show_composed(
+        session,
+        tab.fault,
+        words,
+        lambda: resolve_words(words, session.files),
+        lambda robot, derivation: tab.show_robot(robot, derivation, command, WORDS + words),
+    )
 
 
 def _add_slots(tab: PartsTab) -> None:

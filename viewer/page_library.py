@@ -19,7 +19,7 @@ INTRODUCTION = (
     "<p>morphgen makes robots from a base, arms and end-effectors, and trains and tests policies "
     f"on many of them.</p><p>{markup.button_link(_COMPOSE, 'Compose a robot')}</p>"
 )
-"""What a user sees first."""
+"""Text above the gallery of parts: the purpose of morphgen, and the link to Compose."""
 
 
 def show(session: Session) -> None:

@@ -11,7 +11,7 @@ import viser
 from numpy.typing import ArrayLike
 
 from morphgen.model.geometry import Box, Pose, Shape
-from morphgen.model.inertia import bounding_box
+from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
@@ -206,8 +206,7 @@ def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
         if shapes := link.visuals or link.collisions:
-            low, high = bounding_box(shapes)
-            corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+            corners = box_corners(*bounding_box(shapes))
             points.append(corners @ T[:3, :3].T + T[:3, 3])
     stacked = np.concatenate(points)
     return stacked.min(axis=0), stacked.max(axis=0)

@@ -24,7 +24,6 @@ SHARP_ANGLE = np.radians(35.0)
 """Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
 _MAX_SMOOTHED_FACES = 150_000
 """Largest mesh whose sharp edges are searched; larger ones would take seconds [faces]."""
-_CYLINDER_SECTIONS = 48
 
 
 def shape_colour(shape: Shape) -> Rgb:
@@ -105,18 +104,7 @@ def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
 @lru_cache(maxsize=1024)
 def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangles:
     """Return the surface of a primitive; cached by its kind and size."""
-    match geometry:
-        case Box(size):
-            mesh = trimesh.creation.box(size)
-        case Sphere(radius):
-            mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-        case Cylinder(radius, length):
-            mesh = trimesh.creation.cylinder(
-                radius=radius, height=length, sections=_CYLINDER_SECTIONS
-            )
-        case Capsule(radius, length):
-            mesh = trimesh.creation.capsule(radius=radius, height=length)
-            mesh.apply_translation(-mesh.bounds.mean(axis=0))  # trimesh's starts at the origin
+    mesh = solid_mesh(geometry)
     if isinstance(geometry, Box | Cylinder):
         mesh = trimesh.graph.smooth_shade(mesh, angle=SHARP_ANGLE)
     return _triangles(mesh.vertices, mesh.faces)

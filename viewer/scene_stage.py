@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from morphgen.model.geometry import Box
+from morphgen.model.inertia import box_corners
 from morphgen.typing import Array
 from morphgen.viewer.scene_shapes import Rgb, batch_colours, triangles
 
@@ -164,7 +165,7 @@ def place_camera(
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, forward), forward])
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T @ axes.T
+    corners = box_corners(low, high) @ axes.T
     tangent = _MARGIN * math.tan(_FOV / 2)
     offset = fit_camera(corners, np.array([tangent * aspect, tangent]))
     distance = max(float(corners[:, 2].mean() - offset[2]), 0.15)

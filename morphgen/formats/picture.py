@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from morphgen.errors import MissingDependencyError
 from morphgen.formats.quiet import log_mujoco_warnings, quiet
-from morphgen.model.inertia import bounding_box
+from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
 
@@ -87,8 +87,7 @@ def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
         if link.visuals or link.collisions:
-            low, high = bounding_box(link.visuals or link.collisions)
-            corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+            corners = box_corners(*bounding_box(link.visuals or link.collisions))
             points.append(corners @ T[:3, :3].T + T[:3, 3])
     axes = Rotation.from_euler("ZX", [_YAW, _PITCH], degrees=True).as_matrix()
     across, ahead, up = (np.concatenate(points) @ axes).T

@@ -6,12 +6,10 @@ import operator
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 
-import numpy as np
-
 from morphgen.errors import GrammarError
 from morphgen.grammar.syntax import Expression, unknown
 from morphgen.grammar.values import Scope, evaluate, typical_value
-from morphgen.model.inertia import bounding_box
+from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, reach
 from morphgen.model.robot import TOOL, Robot
 
@@ -73,8 +71,7 @@ class RobotProperties:
         top = 0.0
         for T, link in zip(T_root_link, robot.links, strict=True):
             if shapes := link.collisions or link.visuals:
-                low, high = bounding_box(shapes)
-                corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1)
+                corners = box_corners(*bounding_box(shapes)).T
                 top = max(top, float((T[2, :3] @ corners + T[2, 3]).max()))
         return top
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -144,19 +145,16 @@ def mutate(
     origin = derive(grammar, library, RecordedChooser(random, choices))
     if not choices:
         raise GrammarError(f"grammar {grammar.name!r} leaves nothing to choose: no neighbours")
-    keys = sorted(choices)
-    for index in range(n):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-        choosers = islice(_with_one_redrawn(rng, choices, keys), MAX_ATTEMPTS)
-        result = _first_valid(
-            choosers, grammar, library, grammar.wheres, f"{name}-m{index:04d}", index, (origin,)
-        )
-        if not isinstance(result, Sample):
-            raise SamplingError(
-                f"no neighbour of {name!r} in {MAX_ATTEMPTS} draws: "
-                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
-            )
-        yield result
+    yield from _others(
+        partial(_with_one_redrawn, choices=choices),
+        grammar,
+        library,
+        n,
+        seed,
+        f"{name}-m",
+        (origin,),
+        f"neighbour of {name!r}",
+    )
 
 
 def cross(
@@ -190,18 +188,16 @@ def cross(
     origins = tuple(
         derive(grammar, library, RecordedChooser(random, choices)) for choices in parents
     )
-    for index in range(n):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-        choosers = islice(_with_mixed_choices(rng, parents), MAX_ATTEMPTS)
-        result = _first_valid(
-            choosers, grammar, library, grammar.wheres, f"{name}-x{index:04d}", index, origins
-        )
-        if not isinstance(result, Sample):
-            raise SamplingError(
-                f"no child of two robots of {grammar.name!r} in {MAX_ATTEMPTS} draws: "
-                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
-            )
-        yield result
+    yield from _others(
+        partial(_with_mixed_choices, parents=parents),
+        grammar,
+        library,
+        n,
+        seed,
+        f"{name}-x",
+        origins,
+        f"child of two robots of {grammar.name!r}",
+    )
 
 
 def robot_name(grammar: Grammar, index: int) -> str:
@@ -209,10 +205,48 @@ def robot_name(grammar: Grammar, index: int) -> str:
     return f"{grammar.name}-{index:06d}"
 
 
-def _with_one_redrawn(
-    rng: np.random.Generator, choices: Choices, keys: Sequence[str]
-) -> Iterator[RecordedChooser]:
+def _others(
+    choosers_of: Callable[[np.random.Generator], Iterator[RecordedChooser]],
+    grammar: Grammar,
+    library: Library,
+    n: int,
+    seed: int,
+    prefix: str,
+    origins: tuple[Derivation, ...],
+    what: str,
+) -> Iterator[Sample]:
+    """Yield n valid robots other than ``origins``, the one of an index independent of n.
+
+    Args:
+        choosers_of: Returns endless choosers that draw with a generator.
+        grammar: The grammar.
+        library: Library of the grammar's parts.
+        n: Number of robots.
+        seed: Seed.
+        prefix: Names of the robots without their number.
+        origins: Derivations that do not count.
+        what: What is drawn, for the error.
+
+    Raises:
+        SamplingError: If ``MAX_ATTEMPTS`` draws give no such robot.
+    """
+    for index in range(n):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        choosers = islice(choosers_of(rng), MAX_ATTEMPTS)
+        result = _first_valid(
+            choosers, grammar, library, grammar.wheres, f"{prefix}{index:04d}", index, origins
+        )
+        if not isinstance(result, Sample):
+            raise SamplingError(
+                f"no {what} in {MAX_ATTEMPTS} draws: "
+                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
+            )
+        yield result
+
+
+def _with_one_redrawn(rng: np.random.Generator, choices: Choices) -> Iterator[RecordedChooser]:
     """Yield choosers that each forget one random choice and draw it again."""
+    keys = sorted(choices)
     while True:
         forgotten = keys[int(rng.integers(len(keys)))]
         kept = {key: value for key, value in choices.items() if key != forgotten}

@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
 from morphgen.model.geometry import (
@@ -171,6 +172,17 @@ def bounding_box(shapes: Sequence[Shape]) -> Array:
     Cached until a mesh file changes; read-only.
     """
     return _bounding_box(*_cache_key(shapes))
+
+
+def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
+    """Return the corners of an axis-aligned box, shape (8, 3) [m].
+
+    Args:
+        low: Lowest corner, shape (3,) [m].
+        high: Highest corner, shape (3,) [m].
+    """
+    sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
+    return np.array(np.meshgrid(*sides)).reshape(3, -1).T
 
 
 @lru_cache(maxsize=4096)
