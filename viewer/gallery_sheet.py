@@ -8,7 +8,9 @@ import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.viewer.contact_sheet import Cell, contact_sheet
-from morphgen.viewer.gallery_grid import Gallery, load_pictures, shares, shown_rows
+from morphgen.viewer.gallery_cards import Gallery, shares
+from morphgen.viewer.gallery_filter import shown_rows
+from morphgen.viewer.gallery_pictures import load_pictures
 from morphgen.viewer.robot_rows import facts_line
 
 MAX_ROBOTS = 240

@@ -8,7 +8,8 @@ from morphgen.benchmark.split import SIDES
 from morphgen.errors import MorphgenError
 from morphgen.viewer import markup
 from morphgen.viewer.address import parse_count
-from morphgen.viewer.gallery_grid import Gallery, add_controls, open_panels, show_page
+from morphgen.viewer.gallery_cards import Gallery
+from morphgen.viewer.gallery_grid import add_controls, open_panels, show_page
 from morphgen.viewer.robot_rows import Row, uri_rows
 from morphgen.viewer.session import Session
 from morphgen.viewer.split_form import ChooseSides, add_split_form

@@ -6,12 +6,9 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.robot_set import INDEX
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.gallery_grid import (
-    Gallery,
-    add_controls,
-    open_panels,
-    passing_rows,
-)
+from morphgen.viewer.gallery_cards import Gallery
+from morphgen.viewer.gallery_filter import passing_rows
+from morphgen.viewer.gallery_grid import add_controls, open_panels
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.page_index import show_index
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders

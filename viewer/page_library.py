@@ -6,7 +6,8 @@ import viser
 
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.gallery_grid import Gallery, add_controls, open_panels
+from morphgen.viewer.gallery_cards import Gallery
+from morphgen.viewer.gallery_grid import add_controls, open_panels
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.page_index import library_sections, section_links
 from morphgen.viewer.robot_rows import part_rows

@@ -14,19 +14,16 @@ from morphgen.benchmark.split import SIDES, Member, Split, split_id
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.figures import heatmap_svg, map_svg
-from morphgen.viewer.gallery_grid import (
-    Gallery,
-    add_controls,
-    load_pictures,
-    open_panels,
-    passing_rows,
-    show_saved,
-)
+from morphgen.viewer.gallery_cards import Gallery
+from morphgen.viewer.gallery_filter import passing_rows
+from morphgen.viewer.gallery_grid import add_controls, open_panels
+from morphgen.viewer.gallery_pictures import load_pictures
 from morphgen.viewer.gallery_sheet import add_sheet_buttons
 from morphgen.viewer.page_index import show_index
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.session import Session
+from morphgen.viewer.split_form import show_saved
 from morphgen.viewer.splits import SAVED_REGIMES, SplitStudy, save_split, study_split
 
 PANEL_WIDTH = 520.0

@@ -131,11 +131,9 @@ def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int
 
 
 def fact_range(rows: Iterable[Row], fact: str) -> tuple[float, float] | None:
-    """Return smallest and largest value of a fact; None if it is unknown or constant."""
+    """Return smallest and largest value of a fact; None if it is unknown of all rows."""
     values = [float(value) for row in rows if (value := getattr(row, fact)) is not None]
-    if not values or min(values) == max(values):
-        return None
-    return min(values), max(values)
+    return (min(values), max(values)) if values else None
 
 
 def fact_choices(rows: Iterable[Row], fact: str) -> list[str]:

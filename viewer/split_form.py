@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
+from pathlib import Path
 
 import viser
 
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
-from morphgen.viewer.gallery_grid import show_saved
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.session import Session
 from morphgen.viewer.splits import SAVED_REGIMES, make_members, save_split
@@ -62,3 +63,10 @@ def add_split_form(
         show_saved(session, path, text)
 
     session.on_change(button, lambda: session.run_in_background(save))
+
+
+def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
+    """Show that a split was written, and the command that audits it."""
+    name = str(path.relative_to(session.files.roots[0]))
+    text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(name)}"))
+    session.notify("Saved", name)

@@ -13,7 +13,7 @@ from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_gramm
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.viewer.contact_sheet import Cell, contact_sheet
-from morphgen.viewer.gallery_grid import card
+from morphgen.viewer.gallery_cards import card
 from morphgen.viewer.robot_rows import Row
 
 

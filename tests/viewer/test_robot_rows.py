@@ -87,7 +87,8 @@ def test_zero_rows_give_one_empty_page():
 
 def test_ranges_and_choices_of_facts():
     assert fact_range(ROWS, "reach") == (0.9, 1.2)
-    assert fact_range(ROWS[:1], "reach") is None
+    assert fact_range(ROWS[:1], "reach") == (0.9, 0.9)
+    assert fact_range(ROWS[1:2], "reach") is None
     assert fact_choices([*ROWS, Row("d", "d")], "category") == ["arms", "hands"]
 
 
