@@ -1,27 +1,18 @@
-"""Figures of pages: maps and heatmaps of robots as SVG, token matrices as PNG."""
+"""Figures of pages as SVG: maps and heat maps of robots, histograms."""
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from morphgen.benchmark.token_layout import LAYOUT
 from morphgen.typing import Array
-from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.population_layout import spread
 
-TOKEN_TOLERANCE = 1e-6
-"""Difference up to which two numbers of tokens count as equal."""
 _SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
 _CHOSEN, _NOT_CHOSEN = "#339af0", "#adb5bd88"
 """Colours of the bars inside and outside a range."""
@@ -33,8 +24,6 @@ _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
 """White to dark blue."""
-_ROW_HEIGHT, _PNG_WIDTH, _DPI = 0.14, 5.4, 200
-"""Height of a link's row and width of the picture of tokens [inches], and its resolution."""
 
 
 def blend(stops: ArrayLike, share: float) -> tuple[int, int, int]:
@@ -145,92 +134,6 @@ def histogram_svg(
             f"<title>{count} robots from {start:.3g} to {end:.3g}</title></rect>"
         )
     return _svg(_HISTOGRAM_HEIGHT, "".join(parts))
-
-
-def token_differences(tables: Sequence[Array]) -> list[NDArray[np.bool_]]:
-    """Return which tokens of each robot differ from those of the first robot.
-
-    Args:
-        tables: Tokens by robot, shape (n_links, 48) each.
-
-    Returns:
-        By robot, shape (n_links, 48); links that the first robot does not have differ throughout.
-    """
-    first = tables[0]
-    differences = []
-    for table in tables:
-        different = np.ones(table.shape, dtype=bool)
-        n = min(len(table), len(first))
-        different[:n] = np.abs(table[:n] - first[:n]) > TOKEN_TOLERANCE
-        differences.append(different)
-    return differences
-
-
-def tokens_png(
-    names: Sequence[str], links: Sequence[Sequence[str]], tables: Sequence[Array]
-) -> bytes:
-    """Draw the tokens of robots below each other; return a PNG.
-
-    Blue is negative, red positive, saturated at -1 and 1. A black dot marks a difference from the
-    first robot. Vertical lines separate the fields of a token.
-
-    Args:
-        names: Names of the robots.
-        links: Names of their links.
-        tables: Their tokens, shape (n_links, 48) each.
-    """
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # the same bytes whatever the user has configured
-        heights = [max(len(table), 3) for table in tables]
-        size = (_PNG_WIDTH, _ROW_HEIGHT * sum(heights) + 0.45 * len(tables) + 1.0)
-        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-        axes = figure.subplots(len(tables), 1, squeeze=False, height_ratios=heights)[:, 0]
-        differences = token_differences(tables)
-        for i, ax in enumerate(axes):
-            _draw_tokens(ax, names[i], links[i], tables[i], differences[i] if i else None)
-        top = axes[0].secondary_xaxis("top")
-        centres = [field.start + (field.size - 1) / 2 for field in LAYOUT]
-        labels = [field.name for field in LAYOUT]
-        top.set_xticks(centres, labels, fontsize=6.5, rotation=55, ha="left")
-        top.tick_params(length=2)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def tokens_html(
-    names: Sequence[str], links: Sequence[Sequence[str]], tables: Sequence[Array]
-) -> str:
-    """Return the picture of ``tokens_png`` with its legend, as HTML."""
-    url = base64.b64encode(tokens_png(names, links, tables)).decode()
-    legend = "48 numbers per link at home; blue is negative, red positive"
-    if len(names) > 1:
-        legend += "; a dot marks a difference from the first robot"
-    return (
-        markup.dim(legend)
-        + f'<img alt="tokens" style="width:100%" src="data:image/png;base64,{url}">'
-    )
-
-
-def _draw_tokens(
-    ax: Axes,
-    name: str,
-    links: Sequence[str],
-    table: Array,
-    different: NDArray[np.bool_] | None,
-) -> None:
-    """Draw a robot's tokens, with a dot at each number that differs from the first robot's."""
-    ax.imshow(table, "RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
-    for field in LAYOUT[1:]:
-        ax.axvline(field.start - 0.5, color="0.45", linewidth=0.6)
-    if different is not None:
-        rows, columns = np.nonzero(different)
-        ax.scatter(columns, rows, s=1.2, color="black", linewidths=0)
-        name = f"{name}: {different.sum()} of {different.size} numbers differ"
-    ax.set_yticks(range(len(links)), links, fontsize=6, parse_math=False)
-    ax.set_xticks([])
-    ax.tick_params(length=0)
-    ax.set_xlabel(name, fontsize=7.5, loc="left", labelpad=2, parse_math=False)
 
 
 def _svg(height: float, content: str, width: float = _WIDTH) -> str:

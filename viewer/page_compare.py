@@ -14,10 +14,10 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup, scene_robot, scene_stage
 from morphgen.viewer.address import MAX_COMPARED, Address
-from morphgen.viewer.figures import tokens_html
 from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.session import Session, set_value
+from morphgen.viewer.token_picture import tokens_html
 
 PANEL_WIDTH = 520.0
 """Width of the panel [pixels]."""
@@ -260,5 +260,7 @@ def _compare(page: ComparePage) -> None:
     if len(names) > 1:
         table = comparison.similarity_table(names, result)
         page.texts["similarity"].content = markup.framed("<h3>Similarity</h3>", table)
-    page.texts["tokens"].content = markup.framed(tokens_html(names, links, result.tables))
+    page.texts["tokens"].content = markup.framed(
+        tokens_html(names, links, result.tables, dark=session.dark)
+    )
     session.set_status("")

@@ -22,7 +22,6 @@ from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import comparison, markup, robot_tables, scene_robot, scene_stage
 from morphgen.viewer.address import Address
-from morphgen.viewer.figures import tokens_html
 from morphgen.viewer.page_robot_move import ANGLES, add_move_tab, set_angles
 from morphgen.viewer.page_robot_select import NO_LINK, connect_links, select_link, show_card
 from morphgen.viewer.page_robot_show import (
@@ -46,6 +45,7 @@ from morphgen.viewer.robot_uri import (
 )
 from morphgen.viewer.scene_overlays import Overlays
 from morphgen.viewer.session import Session, set_value
+from morphgen.viewer.token_picture import tokens_html
 from morphgen.viewer.turntable import turntable
 from morphgen.viewer.web_page import robot_page
 
@@ -198,7 +198,7 @@ def _show_tokens(page: RobotPage) -> None:
         content = f"{markup.tag('no tokens', 'warning')} {escape(session.files.redact(error))}"
     else:
         links = [[link.name for link in robot.links]]
-        content = tokens_html([robot.name], links, result.tables)
+        content = tokens_html([robot.name], links, result.tables, dark=session.dark)
     session.set_status("")
     page.texts["tokens"].content = markup.framed(content)
 

@@ -25,7 +25,8 @@ from morphgen.viewer.comparison import (
     similarity_table,
     with_roles,
 )
-from morphgen.viewer.figures import heatmap_svg, map_svg, token_differences, tokens_png
+from morphgen.viewer.figures import heatmap_svg, map_svg
+from morphgen.viewer.token_picture import token_differences, tokens_png
 
 LIBRARY = default_library()
 
@@ -73,6 +74,20 @@ def test_token_picture_is_reproducible():
     width, height = Image.open(io.BytesIO(first)).size
     assert width > 800
     assert height > 200
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_token_picture_is_as_bright_as_its_page(dark):
+    links, tables = [["a", "b", "c"]], [np.zeros((3, 48))]
+    content = tokens_png(["one"], links, tables, dark=dark)
+    pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA")).astype(int)
+    assert pixels[0, 0, 3] == 0
+    solid = pixels[pixels[..., 3] == 255][:, :3]
+    colours, counts = np.unique(solid, axis=0, return_counts=True)
+    zero = colours[counts.argmax()]  # most of the picture
+    assert zero.max() < 70 if dark else zero.min() > 240
+    ink = solid.max() if dark else solid.min()
+    assert abs(ink - zero.mean()) > 150
 
 
 def test_robot_compared_with_itself_is_identical():
