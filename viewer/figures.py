@@ -13,8 +13,8 @@ from morphgen.typing import Array
 from morphgen.viewer.address import Address
 from morphgen.viewer.population_layout import spread
 
-_SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
-_CHOSEN, _NOT_CHOSEN = "#339af0", "#adb5bd88"
+SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
+CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"
 """Colours of the bars inside and outside a range."""
 _NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60
 """Bars of a histogram, and its height in units of the SVG."""
@@ -64,7 +64,7 @@ def map_svg(
     inner, label = 0.94 * width, min(13.0, 0.13 * unit)
     marks = []
     for (x, y), name, side, uri in zip(cells.tolist(), names, sides, uris, strict=True):
-        query, colour = escape(Address("robot", (uri,)).query), _SIDE_COLOURS[side]
+        query, colour = escape(Address("robot", (uri,)).query), SIDE_COLOURS[side]
         box = f'width="{inner:.1f}" height="{0.75 * inner:.1f}"'
         at = f'x="{x * width:.1f}" y="{y * height:.1f}"'
         picture = f'<image {at} {box} href="{pictures[uri]}"/>' if pictures.get(uri) else ""
@@ -98,7 +98,7 @@ def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, la
     for i, (name, side) in enumerate(zip(names, sides, strict=True)):
         parts.append(
             f'<text x="{left - 4}" y="{(i + 0.65) * cell:.1f}" font-size="{min(10.0, cell):.1f}" '
-            f'text-anchor="end" fill="{_SIDE_COLOURS[side]}">{escape(name[:22])}</text>'
+            f'text-anchor="end" fill="{SIDE_COLOURS[side]}">{escape(name[:22])}</text>'
         )
         for j, other in enumerate(names):
             share = (values[i, j] - low) / (high - low) if high > low else 1.0
@@ -130,7 +130,7 @@ def histogram_svg(
         x = (start - limits[0]) / (limits[1] - limits[0]) * _WIDTH
         parts.append(
             f'<rect x="{x:.1f}" y="{_HISTOGRAM_HEIGHT - height:.1f}" width="{width - 1:.1f}" '
-            f'height="{height:.1f}" fill="{_CHOSEN if inside else _NOT_CHOSEN}">'
+            f'height="{height:.1f}" fill="{CHOSEN if inside else NOT_CHOSEN}">'
             f"<title>{count} robots from {start:.3g} to {end:.3g}</title></rect>"
         )
     return _svg(_HISTOGRAM_HEIGHT, "".join(parts))

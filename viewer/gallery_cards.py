@@ -38,6 +38,10 @@ class Gallery:
     """Controls by their key in the address."""
     histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     """Distributions of the facts above their sliders."""
+    panel_width: float = 0.0
+    """Width of the panel of thumbnails [pixels]."""
+    coordinates: viser.GuiHtmlHandle | None = None
+    """Parallel coordinates, if at least two facts vary."""
     notices: list[str] = field(default_factory=list)
     """What the address asks for and cannot be done, until the user changes a control."""
     empty: str = ""

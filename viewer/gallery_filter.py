@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from morphgen.viewer import figures, markup, robot_rows
+from morphgen.viewer import figures, markup, parallel_coordinates, robot_rows
 from morphgen.viewer.address import AddressError
 from morphgen.viewer.gallery_cards import SCALES, Gallery
 from morphgen.viewer.population_layout import UNITS
@@ -13,7 +13,9 @@ from morphgen.viewer.population_layout import UNITS
 FILTERS = ("search", "category", "role", "findings", *robot_rows.NUMBERS)
 """Keys of the filter's controls, in the address, too."""
 _ALL = "all"
-_LABELS = {"dof": "DoF", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_LABELS = {"dof": "DoF", "links": "Links", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_COUNTS = ("dof", "links")
+"""Facts that are integers."""
 _SORT_KEYS = {
     label: key
     for name in robot_rows.SORTS
@@ -111,6 +113,33 @@ def show_histograms(gallery: Gallery) -> None:
         handle.content = markup.framed(svg)
 
 
+def show_coordinates(gallery: Gallery) -> None:
+    """Show the facts that vary as parallel coordinates."""
+    if gallery.coordinates is None:
+        return
+    passing = {row.uri for row in passing_rows(gallery)}
+    svg = parallel_coordinates.parallel_svg(
+        gallery.rows, _axes(gallery), passing, gallery.panel_width
+    )
+    hint = (
+        f"{len(passing)} of {len(gallery.rows)} robots pass the filter. Drag along an axis to "
+        "choose a range, click it to clear the range, click a line to open its robot."
+    )
+    gallery.coordinates.content = markup.framed(markup.dim(hint), svg)
+
+
+def brush(gallery: Gallery, text: str) -> None:
+    """Set a range as the pointer has chosen it at an axis; see ``parse_brush``.
+
+    Raises:
+        AddressError: If the text is invalid.
+    """
+    fact, (low, high) = parallel_coordinates.parse_brush(text, _axes(gallery))
+    control = gallery.controls[fact]
+    low, high = (round(value / control.step) * control.step for value in (low, high))
+    control.value = (max(low, control.min), min(high, control.max))
+
+
 def parse_range(
     fact: str, text: str, limits: tuple[float, float] | None
 ) -> tuple[float, float] | None:
@@ -142,6 +171,20 @@ def parse_range(
             f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
         )
     return max(low, limits[0]), min(high, limits[1])
+
+
+def _axes(gallery: Gallery) -> dict[str, parallel_coordinates.Axis]:
+    """Return the axes of the facts that have a slider, with the range of the slider."""
+    return {
+        fact: parallel_coordinates.Axis(
+            _LABELS[fact],
+            (control.min, control.max),
+            fact in _COUNTS,
+            tuple(control.value) if _range_text(gallery, fact) else None,
+        )
+        for fact, control in gallery.controls.items()
+        if fact in robot_rows.NUMBERS
+    }
 
 
 def _current_filter(gallery: Gallery) -> robot_rows.Filter:
@@ -195,7 +238,7 @@ def _add_range(gallery: Gallery, fact: str) -> None:
         ends = limits
     if limits is None or ends is None or limits[0] == limits[1]:
         return
-    step = 1.0 if fact == "dof" else 0.001
+    step = 1.0 if fact in _COUNTS else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
     initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
     gui = gallery.session.client.gui

@@ -11,9 +11,11 @@ from morphgen.viewer.address import parse_count
 from morphgen.viewer.gallery_cards import Gallery, draw_cards
 from morphgen.viewer.gallery_filter import (
     add_filter,
+    brush,
     clear_filter,
     control_state,
     empty_text,
+    show_coordinates,
     show_histograms,
     shown_rows,
 )
@@ -52,14 +54,23 @@ def open_panels(
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
     panel.dock_left()
-    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, 400.0))
+    gallery.panel_width = max(gallery.session.width - width - CANVAS_WIDTH, 400.0)
+    panel.set_width(gallery.panel_width)
     return panel
 
 
-def add_controls(gallery: Gallery) -> None:
-    """Add the controls, in the state that the address gives, and show the first robots."""
+def add_controls(gallery: Gallery, panel: viser.PanelHandle) -> None:
+    """Add the controls, in the state that the address gives, and show the first robots.
+
+    Args:
+        gallery: The gallery.
+        panel: Panel of the thumbnails, which gets a tab for the parallel coordinates.
+    """
     session = gallery.session
     add_filter(gallery)
+    if len(gallery.histograms) > 1:
+        with panel.add_tab("Parallel coordinates", viser.Icon.CHART_LINE):
+            gallery.coordinates = session.client.gui.add_html("")
     gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
     buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
 
@@ -74,10 +85,14 @@ def add_controls(gallery: Gallery) -> None:
         clear_filter(gallery, key)
         changed()
 
+    def choose_range(text: str) -> None:
+        brush(gallery, text)
+        changed()
+
     for control in gallery.controls.values():
         session.on_change(control, changed, "filter")
     session.on_change(buttons, turn_page)
-    session.actions["clear filter"] = clear
+    session.actions |= {"clear filter": clear, "brush": choose_range}
     show_page(gallery, gallery.page_number)
 
 
@@ -93,5 +108,6 @@ def show_page(gallery: Gallery, number: int) -> None:
     gallery.empty = "" if rows else empty_text(gallery)
     load_bundle_pictures(gallery, gallery.page_rows)
     show_histograms(gallery)
+    show_coordinates(gallery)
     draw_cards(gallery)
     session.run_in_background(lambda: draw_missing(gallery), "thumbnails")

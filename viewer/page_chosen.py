@@ -28,7 +28,7 @@ def show(session: Session) -> None:
     rows = uri_rows(session.chosen, session.files)
     gallery = Gallery(session, "Chosen robots", rows, SIDES, "common")
     header = "The first robots that you chose are to train on, the others to test on."
-    open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
+    panel = open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
     gui, n = session.client.gui, len(rows)
     initial = min(parse_count(session.address.state.get("train", ""), max(n - 1, 1)), n)
     num_train = gui.add_slider("to train on", 0, n, 1, initial)
@@ -50,7 +50,7 @@ def show(session: Session) -> None:
         )
 
     gallery.rows[:] = with_sides(rows, initial)
-    add_controls(gallery)
+    add_controls(gallery, panel)
     add_split_form(session, add_choice, expanded=True)
     session.on_change(num_train, divide, "sides")
     session.on_choice = leave_out

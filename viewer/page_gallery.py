@@ -34,8 +34,8 @@ def show(session: Session) -> None:
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
     population = markup.link(Address("population", (folder,)), "see all on one ground")
     header = population + (f"<br>{links}" if links else "")
-    open_panels(gallery, markup.breadcrumbs((folder, None)), header)
-    add_controls(gallery)
+    panel = open_panels(gallery, markup.breadcrumbs((folder, None)), header)
+    add_controls(gallery, panel)
     add_sheet_buttons(gallery)
     hint = "train: pass the filter; test: do not"
     add_split_form(session, lambda: _add_choice(gallery), hint)

@@ -27,7 +27,7 @@ def show(session: Session) -> None:
     """Build the page."""
     gallery = Gallery(session, "Parts", part_rows(session.files.library))
     header = INTRODUCTION + section_links(library_sections(session.files))
-    open_panels(gallery, "", header)
+    panel = open_panels(gallery, "", header)
     upload = session.client.gui.add_upload_button(
         "Open a URDF or a zipped bundle", icon=viser.Icon.UPLOAD
     )
@@ -42,5 +42,5 @@ def show(session: Session) -> None:
         session.enqueue(open_upload)
 
     upload.on_upload(uploaded)
-    add_controls(gallery)
+    add_controls(gallery, panel)
     add_sheet_buttons(gallery)

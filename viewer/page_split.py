@@ -63,7 +63,7 @@ def show(session: Session) -> None:
     panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
-        add_controls(gallery)
+        add_controls(gallery, panel)
         add_sheet_buttons(gallery)
         _add_split_form(gallery, split)
     texts = {}

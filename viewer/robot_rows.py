@@ -34,7 +34,7 @@ T = TypeVar("T")
 PAGE_SIZES = (24, 48, 96)
 SORTS = ("order", "name", "category", "dof", "links", "reach", "mass", "role", "findings")
 """Keys by which rows can be sorted; ``order`` is the order of the set."""
-NUMBERS = ("dof", "reach", "mass")
+NUMBERS = ("dof", "links", "reach", "mass")
 """Facts by whose range rows can be filtered."""
 UNREADABLE = "unreadable"
 """Finding of a bundle whose card cannot be read."""

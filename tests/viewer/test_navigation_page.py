@@ -112,7 +112,7 @@ def test_a_robot_of_a_set_is_edited_in_compose(same, control):
 
 def test_the_theme_changes_without_a_new_page(same):
     page = same("?compare=robots/some-arm&joint1=0.5")
-    page.get_by_text("Similarity").wait_for()
+    page.get_by_text("Add a second robot").wait_for()
     bar(page, "dark").click()
     page.locator('html[data-mantine-color-scheme="dark"]').wait_for(state="attached")
     page.wait_for_url(re.compile(r"compare=robots/some-arm&joint1=0\.5$"))
