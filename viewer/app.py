@@ -216,10 +216,14 @@ def open_page(session: Session, find_address: Callable[[], object]) -> None:
         address = session.address
         if address.page == CHOSEN:
             session.chosen = tuple(filter(None, address.subjects))
-        session.address = replace(address, chosen=()).with_state(theme="")
+        session.tabs = address.state.get("tab", "")
+        session.address = replace(address, chosen=()).with_state(theme="", tab="")
+        session.actions["tab"] = session.keep_tabs
         session.show_address(session.title)
         session.show_tray()
         load_page(address.page)(session)
+        if session.tabs:
+            session.run_script(call("openTabs", session.tabs.split(",")))
     except UnsoundError as error:
         _show_fault(session, redact(error.origin), markup.findings_table(error.findings, redact))
     except (MorphgenError, TimeoutError) as error:

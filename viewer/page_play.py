@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from html import escape
@@ -12,7 +13,7 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import Address, AddressError
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.episode_export import episode_page, record_scene, render_video
 from morphgen.viewer.page_play_controls import (
@@ -40,6 +41,8 @@ PANEL_WIDTH = 400.0
 """Width of the panel [pixels]."""
 PLANNERS = ("ik", "scripted")
 """Policies whose first step takes seconds, because they plan a path."""
+ADDRESS_DELAY = 0.5
+"""Delay of URL updates after a move of the time slider [s]."""
 
 
 @dataclass(eq=False)
@@ -57,6 +60,8 @@ class PlayPage:
     """URIs of the robots that the camera was pointed at."""
     is_planning: bool = False
     """Whether the policy is still planning its first step."""
+    position: int | None = None
+    """Step at which the user paused; None while the episode plays."""
 
     def show_start(self, source: EpisodeSource) -> None:
         """Show a new episode at its start."""
@@ -98,6 +103,17 @@ class PlayPage:
         if faults := [track.fault for track in tracks if track.fault]:
             self._show_faults(faults)
 
+    def show_position(self, step: int | None) -> None:
+        """Show in the address where the user paused."""
+        self.position = step
+        self.session.call_later(ADDRESS_DELAY, self._show_in_address, "address")
+
+    def _show_in_address(self) -> None:
+        step, source = self.position, self.source
+        text = "" if step is None or source is None else f"{step * source.episode.period:.4g}"
+        if text != self.session.address.state.get("t", ""):
+            self.session.update_address(self.session.title, t=text)
+
     def show_failure(self, reason: str) -> None:
         """Show why there is no episode."""
         self.session.set_status("")
@@ -121,29 +137,47 @@ def show(session: Session) -> None:
         MorphgenError: If the address names an unknown task, policy or robot, or an invalid episode.
     """
     gui, subject = session.client.gui, session.address.subject
+    paused_at = parse_time(session.address.state.get("t", ""))
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
     if subject.endswith(EPISODE_SUFFIX):
         episode = read_episode(session.files.path(subject), session.files)
         page, player = _add_player(session)
         gui.add_html(markup.framed(_description(episode)))
-        player.load(lambda: RecordedEpisode(episode))
+        player.load(lambda: RecordedEpisode(episode), start=paused_at)
         session.show_address(f"play {uri_name(subject)}")
     else:
         trained_on = complete_address(session)
         config = parse_rollout(session.address, trained_on)
         page, player = _add_player(session)
 
-        def start(config: RolloutConfig) -> None:
+        def start(config: RolloutConfig, paused_at: float | None = None) -> None:
             """Show a rollout's address, and let the player simulate it."""
             session.address = rollout_address(config)
             session.show_address(f"{config.task} {uri_name(config.robots[0])}")
-            player.load(lambda: Rollout(config, session.files, session.set_status))
+            player.load(lambda: Rollout(config, session.files, session.set_status), start=paused_at)
 
         add_rollout_controls(RolloutControls(session, config, trained_on, start))
-        start(config)
+        start(config, paused_at)
     with gui.add_folder("Get"):
         _add_downloads(page)
+
+
+def parse_time(text: str) -> float | None:
+    """Return the time at which an address shows an episode [s]; None if the text is empty.
+
+    Raises:
+        AddressError: If the text is no time.
+    """
+    if not text:
+        return None
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not 0 <= time < math.inf:
+        raise AddressError(f"t={text[:40]} is no time; expected seconds, 0 or more")
+    return time
 
 
 def score_table(episode: Episode, step: int) -> str:

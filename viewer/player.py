@@ -31,6 +31,9 @@ class Display(Protocol):
     def show_stopped(self) -> None:
         """Show that the episode has ended or is paused."""
 
+    def show_position(self, step: int | None) -> None:
+        """Remember the step at which the user paused; None while the episode plays."""
+
     def show_failure(self, reason: str) -> None:
         """Show why a command has failed."""
 
@@ -51,9 +54,14 @@ class Player:
         self._thread = threading.Thread(target=self._run, name="morphgen-player", daemon=True)
         self._thread.start()
 
-    def load(self, make_source: Callable[[], EpisodeSource], *, play: bool = True) -> None:
-        """Show another episode; of several that are requested meanwhile, the last."""
-        self._command("load", lambda: self._load(make_source, play))
+    def load(self, make_source: Callable[[], EpisodeSource], *, start: float | None = None) -> None:
+        """Show another episode; of several that are requested meanwhile, the last.
+
+        Args:
+            make_source: Makes the episode.
+            start: Time at which it is paused [s]; by default it plays from its beginning.
+        """
+        self._command("load", lambda: self._load(make_source, start))
 
     def play(self) -> None:
         """Continue; restart an episode that was shown to its end."""
@@ -124,7 +132,7 @@ class Player:
             if not self._ended:  # expected from a browser that has disconnected
                 raise
 
-    def _load(self, make_source: Callable[[], EpisodeSource], play: bool) -> None:
+    def _load(self, make_source: Callable[[], EpisodeSource], start: float | None) -> None:
         """Replace the episode by a new one, and show its start."""
         self.is_playing = False
         previous, self._source = self._source, None
@@ -134,8 +142,10 @@ class Player:
         self.step = 0
         self._display.show_start(self._source)
         self._display.show_step(0)
-        if play:
+        if start is None:
             self._play()
+        else:
+            self._go_by(round(start / self._source.episode.period))
 
     def _play(self) -> None:
         if self._source is None:
@@ -143,10 +153,12 @@ class Player:
         if self.step >= self._source.episode.num_steps and not self._source.advance():
             self.step = 0
         self.is_playing = True
+        self._display.show_position(None)
         self._restart_clock()
 
     def _pause(self) -> None:
         self.is_playing = False
+        self._display.show_position(self.step)
         self._display.show_stopped()
 
     def _go_to(self, step: int) -> None:
@@ -155,13 +167,14 @@ class Player:
         self.step = max(0, min(step, self._source.episode.num_steps))
         self.is_playing = False
         self._display.show_step(self.step)
+        self._display.show_position(self.step)
         self._display.show_stopped()
 
     def _go_by(self, num_steps: int) -> None:
         source, target = self._source, self.step + num_steps
         if source is None:
             return
-        while source.episode.num_steps < target and source.advance():
+        while source.episode.num_steps < target and not self._ended and source.advance():
             pass
         self._go_to(target)
 

@@ -81,6 +81,8 @@ class Session:
     """Line of the page that shows the current activity."""
     title: str = "morphgen"
     """Title of the browser's tab."""
+    tabs: str = ""
+    """Titles of the open tabs, separated by commas; those that are open at first are left out."""
     actions: dict[str, Callable[[str], object]] = field(default_factory=dict)
     """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
     called with the element's ``data-value``."""
@@ -251,8 +253,8 @@ class Session:
     def show_address(self, title: str) -> None:
         """Show the address in the browser's URL and top bar, and a title in its tab."""
         self.title = title
-        address = shown_address(self.address, self.chosen)
-        bar = bar_html(self.address, self.chosen, dark=self.dark)
+        address = shown_address(self.address, self.chosen).with_state(tab=self.tabs)
+        bar = bar_html(self.address.with_state(tab=self.tabs), self.chosen, dark=self.dark)
         self.run_script(
             call("address", self.visit, address.query, title) + call("bar", bar, self.dark)
         )
@@ -261,6 +263,11 @@ class Session:
         """Change the page's state in the URL; see ``Address.with_state``."""
         self.address = self.address.with_state(**state)
         self.show_address(title)
+
+    def keep_tabs(self, titles: str) -> None:
+        """Keep the open tabs in the address; see ``tabs``."""
+        self.tabs = titles
+        self.show_address(self.title)
 
     def open_address(self, address: Address, *, instead: bool = False) -> None:
         """Open another page, as a link would; ``instead``: Back will not lead to this one."""

@@ -178,3 +178,14 @@ def test_chosen_robots_become_the_sides_of_a_split(viewer):
     with PlainClient(viewer().port, query) as client:
         client.shows("train (1)")
         client.shows("test (2)")
+
+
+def test_a_page_opens_the_tabs_of_its_address(viewer):
+    with PlainClient(viewer().port, "?gallery=robots/prims&tab=A,B") as client:
+
+        def orders():
+            sources = [m["source"] for m in client.messages if m["type"] == "RunJavascriptMessage"]
+            return "".join(sources)
+
+        client.until(lambda: '?.openTabs(["A", "B"])' in orders())
+        assert "gallery=robots/prims&tab=A,B" in orders()

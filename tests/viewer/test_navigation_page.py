@@ -117,3 +117,25 @@ def test_the_theme_changes_without_a_new_page(same):
     page.locator('html[data-mantine-color-scheme="dark"]').wait_for(state="attached")
     page.wait_for_url(re.compile(r"compare=robots/some-arm&joint1=0\.5$"))
     assert page.evaluate("window.mark") is True
+
+
+def test_the_open_tab_is_in_the_address_and_back_returns_to_it(same):
+    page = same("?robot=robots/prims/prims-000001")
+    page.get_by_role("tab", name="Links").click()
+    page.wait_for_url(re.compile(r"&tab=Links$"))
+    page.get_by_role("link", name="robots/prims").click()
+    page.locator(".card").first.wait_for()
+    page.get_by_role("tab", name="Parallel coordinates").click()
+    page.wait_for_url(re.compile(r"gallery=robots/prims&tab=Parallel%20coordinates$"))
+    page.reload()
+    page.locator("svg.parallel").wait_for()
+    page.go_back()
+    page.locator('[role=tab][aria-selected=true][title="Links"]').wait_for()
+    page.get_by_role("tab", name="Move").click()
+    page.wait_for_url(re.compile(r"prims-000001$"))
+    assert page.failures == []
+
+
+def test_a_tab_that_does_not_exist_leaves_the_address(same):
+    page = same("?robot=robots/prims/prims-000001&tab=Nothing")
+    page.wait_for_url(re.compile(r"prims-000001$"))

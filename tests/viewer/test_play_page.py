@@ -168,3 +168,18 @@ def test_player_ends_when_its_browser_leaves_the_page(see, viewer, capfd):
         time.sleep(0.1)
     assert players() == []
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_the_time_of_a_paused_episode_is_in_the_address(see):
+    page = see(f"?play=reach&robot={CUBE}&policy=jacobian&t=1.5")
+    page.get_by_text("1.50 s; simulated: 1.50 s").wait_for()
+    press(page, "step")
+    page.wait_for_url(re.compile(r"&t=1\.52$"))
+    page.reload()
+    page.get_by_text("1.52 s; simulated: 1.52 s").wait_for()
+    press(page, "play")
+    page.wait_for_url(re.compile(r"seed=0$"))
+    wait_for_end(page)
+    number(page, "time (s)").fill("2")
+    page.wait_for_url(re.compile(r"&t=2$"))
+    assert page.failures == []

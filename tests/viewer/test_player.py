@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from morphgen.errors import TaskError
+from morphgen.viewer.address import AddressError
+from morphgen.viewer.page_play import parse_time
 from morphgen.viewer.player import Player
 
 WAIT = 30
@@ -37,6 +39,7 @@ class Counting:
 class Display:
     def __init__(self):
         self.steps, self.faults, self.threads = [], [], set()
+        self.positions = []
         self.changed = threading.Condition()
 
     def show_start(self, source):
@@ -48,6 +51,9 @@ class Display:
 
     def show_stopped(self):
         self._record(lambda: self.steps.append("stopped"))
+
+    def show_position(self, step):
+        self.positions.append(step)
 
     def show_failure(self, why):
         self._record(lambda: self.faults.append(why))
@@ -93,7 +99,7 @@ def test_an_episode_plays_to_its_end_and_restarts(player, display):
 
 def test_playback_is_paused_stepped_and_scrubbed(player, display):
     source = Counting()
-    player.load(lambda: source, play=False)
+    player.load(lambda: source, start=0.0)
     for _ in range(3):
         player.go_by(1)
     display.wait_for(lambda: 3 in display.steps)
@@ -105,6 +111,26 @@ def test_playback_is_paused_stepped_and_scrubbed(player, display):
     assert source.episode.num_steps == 3
     player.go_by(-9)
     display.wait_for(lambda: display.steps[-2:] == [0, "stopped"])
+
+
+def test_an_episode_is_loaded_at_a_time_and_simulated_until_then(player, display):
+    source = Counting()
+    player.load(lambda: source, start=0.5)
+    display.wait_for(lambda: display.steps[-2:] == [25, "stopped"])
+    assert source.episode.num_steps == 25
+    assert display.positions == [25]
+    player.play()
+    display.wait_for(lambda: 27 in display.steps)
+    player.pause()
+    display.wait_for(lambda: display.positions[-1:] != [None])
+    assert display.positions[:2] == [25, None]
+    assert display.positions[2] >= 27
+
+
+def test_an_episode_is_loaded_at_its_end_if_the_time_is_later(player, display):
+    player.load(lambda: Counting(steps=10), start=99.0)
+    display.wait_for(lambda: display.steps[-2:] == [10, "stopped"])
+    assert display.positions == [10]
 
 
 @pytest.mark.slow
@@ -119,7 +145,7 @@ def test_slow_steps_are_shown_as_they_arrive(player, display):
 def test_another_episode_frees_the_previous_one(player, display):
     sources = [Counting(), Counting()]
     for source in sources:
-        player.load(lambda source=source: source, play=False)
+        player.load(lambda source=source: source, start=0.0)
         display.wait_for(lambda: "start" in display.steps)
         display.steps.clear()
     assert [source.closed for source in sources] == [True, False]
@@ -138,8 +164,8 @@ def test_a_failure_is_shown_and_the_next_episode_can_play(player, display):
     player.go_by(1)
     player.load(lambda: Counting(fault=TaskError("unstable")))
     display.wait_for(lambda: display.faults == ["no such body", "unstable"])
-    player.load(Counting, play=False)
-    display.wait_for(lambda: display.steps[-2:] == ["start", 0])
+    player.load(Counting, start=0.0)
+    display.wait_for(lambda: display.steps[-4:] == ["start", 0, 0, "stopped"])
 
 
 def test_a_player_stops_while_it_loads(display):
@@ -156,3 +182,11 @@ def test_a_player_stops_while_it_loads(display):
     player.stop()
     assert player.join(WAIT)
     assert source.closed
+
+
+def test_times_of_addresses():
+    assert parse_time("") is None
+    assert parse_time("1.5") == 1.5
+    for text in ("-1", "soon", "nan", "inf"):
+        with pytest.raises(AddressError, match=f"t={text} is no time; expected seconds, 0 or more"):
+            parse_time(text)
