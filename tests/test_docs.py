@@ -164,6 +164,7 @@ def test_generated_page_is_current(name):
     assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
 
 
+@pytest.mark.slow
 def test_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

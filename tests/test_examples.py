@@ -40,6 +40,8 @@ OUTPUTS = {
     "11_goal_set": ([], r"faults: \[\]\nfaults: \['goal 0: the tool"),
 }
 """Arguments of each example, and a pattern that its output has."""
+SLOW = ("04_fit", "08_train")
+"""Examples that take half a minute; the functions that they call have tests of their own."""
 RUN = "runs/planar-cube-follow/me-graph/seed0"
 
 
@@ -59,7 +61,9 @@ def run(monkeypatch, tmp_path, capsys):
     return run_example
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in OUTPUTS]
+)
 def test_example_prints_what_it_says(name, run):
     arguments, pattern = OUTPUTS[name]
     assert re.search(pattern, run(name, *arguments))

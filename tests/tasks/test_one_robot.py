@@ -13,7 +13,7 @@ from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
 
 WORDS = "arm=ur5 ee=stick"
-CONFIG = ReachConfig(num_goals=8)
+CONFIG = ReachConfig(num_goals=4)
 STEPS = 40
 NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of primitives", "member")
 

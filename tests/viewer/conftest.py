@@ -67,11 +67,28 @@ def folder(tmp_path_factory):
     return root
 
 
+@pytest.fixture(scope="session")
+def thumbnails(tmp_path_factory):
+    """The cache of all viewers, so that their workers draw a thumbnail once."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def shared_viewer(folder, thumbnails):
+    """A viewer in the folder for tests that ask nothing about the viewer itself."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(thumbnails))
+        viewer = serve(port=0)
+    yield viewer
+    viewer.stop()
+
+
 @pytest.fixture
-def viewer(folder, monkeypatch, tmp_path):
+def viewer(folder, monkeypatch, thumbnails):
     """Start viewers in the folder; they are stopped after the test."""
     monkeypatch.chdir(folder)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(thumbnails))
     started = []
 
     def start(*words, **options):

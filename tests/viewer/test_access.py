@@ -106,16 +106,16 @@ def test_malformed_origin_is_rejected(origin):
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:{port}"])
-def test_foreign_origin_gets_no_websocket(viewer, origin):
-    port = viewer().port
+def test_foreign_origin_gets_no_websocket(shared_viewer, origin):
+    port = shared_viewer.port
     with pytest.raises(InvalidStatus) as refused:
         PlainClient(port, origin=origin.format(port=port))
     assert refused.value.response.status_code == 403
     assert b"may not use this viewer" in refused.value.response.body
 
 
-def test_foreign_host_name_gets_no_websocket(viewer):
-    port = viewer().port
+def test_foreign_host_name_gets_no_websocket(shared_viewer):
+    port = shared_viewer.port
     host = f"evil.example:{port}"
     with pytest.raises(InvalidStatus) as refused:
         PlainClient(port, host=host, origin=f"http://{host}")

@@ -36,11 +36,11 @@ def commands(client):
         ("?compose=chain&seed=3&number=2", "morphgen sample chain -n 3 --seed 3"),
     ],
 )
-def test_commands_of_a_page_are_valid(viewer, folder, query, expected):
+def test_commands_of_a_page_are_valid(shared_viewer, folder, query, expected):
     write_bundle(arm(), folder / "robots" / "it's me", picture=False)
     (folder / "my").mkdir(exist_ok=True)
     (folder / "my" / "own.grammar").write_text("include chain\n")
-    with PlainClient(viewer().port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.until(lambda: commands(client))
         (command,) = set(commands(client))
     assert command == expected

@@ -93,8 +93,8 @@ def test_a_ray_hits_the_nearest_box():
     assert hit_robot(boxes, inside, np.array([0, 0, 1.0])) is None
 
 
-def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(viewer):
-    with PlainClient(viewer().port, "?compose=robots/prims/prims-000001") as client:
+def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_viewer):
+    with PlainClient(shared_viewer.port, "?compose=robots/prims/prims-000001") as client:
         client.control("Number", "generation")
         buttons = client.control("ButtonGroup", "show")
         client.shows("Tick two to cross them")
@@ -103,6 +103,6 @@ def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(viewer):
         client.until(lambda: "evolve=1" in client.text)
 
 
-def test_robots_of_parts_do_not_evolve(viewer):
-    with PlainClient(viewer().port, "?compose=arm=ur5 ee=plane") as client:
+def test_robots_of_parts_do_not_evolve(shared_viewer):
+    with PlainClient(shared_viewer.port, "?compose=arm=ur5 ee=plane") as client:
         client.shows("Only robots of a grammar evolve")

@@ -152,13 +152,13 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
 
 
 @pytest.mark.parametrize("page", ["gallery", "population", "split"])
-def test_pages_without_a_subject_list_what_there_is(viewer, page):
-    with PlainClient(viewer().port, f"?{page}=") as client:
+def test_pages_without_a_subject_list_what_there_is(shared_viewer, page):
+    with PlainClient(shared_viewer.port, f"?{page}=") as client:
         client.shows(f"{page}=extrapolation/arms/reach" if page != "gallery" else "robots/prims")
 
 
-def test_compare_without_robots_offers_a_picker(viewer):
-    on = viewer()
+def test_compare_without_robots_offers_a_picker(shared_viewer):
+    on = shared_viewer
     with PlainClient(on.port, "?compare=") as client:
         client.shows("Compare two to four robots")
         client.change(client.control("Text", "or words"), "arm=ur5 ee=plane")
@@ -172,10 +172,10 @@ def test_compare_without_robots_offers_a_picker(viewer):
         assert client.sent_to() == "?compare=words:arm=ur5%20ee=plane"
 
 
-def test_chosen_robots_become_the_sides_of_a_split(viewer):
+def test_chosen_robots_become_the_sides_of_a_split(shared_viewer):
     uris = [f"robots/prims/prims-00000{i}" for i in range(3)]
     query = "?" + "&".join(f"chosen={uri}" for uri in uris) + "&train=1"
-    with PlainClient(viewer().port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.shows("train (1)")
         client.shows("test (2)")
 

@@ -28,8 +28,8 @@ from morphgen.viewer.messages import message_fault
     ],
     ids=lambda message: repr(message)[:50],
 )
-def test_malformed_message_closes_only_its_connection(viewer, capfd, message):
-    on = viewer()
+def test_malformed_message_closes_only_its_connection(shared_viewer, capfd, message):
+    on = shared_viewer
     with PlainClient(on.port) as client, PlainClient(on.port) as other:
         client.shows("Grammars")
         client.send(message)
@@ -39,8 +39,8 @@ def test_malformed_message_closes_only_its_connection(viewer, capfd, message):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_text_message_closes_its_connection(viewer):
-    with PlainClient(viewer().port) as client:
+def test_a_text_message_closes_its_connection(shared_viewer):
+    with PlainClient(shared_viewer.port) as client:
         client.websocket.send("text")
         assert client.until_closed() == (1008, "expected a binary message")
 
@@ -60,8 +60,8 @@ def test_valid_messages_are_accepted():
         ("UploadButton", "Open a URDF or a zipped bundle", "x", "takes no value"),
     ],
 )
-def test_invalid_control_values_are_rejected(viewer, capfd, kind, label, value, why):
-    with PlainClient(viewer().port) as client:
+def test_invalid_control_values_are_rejected(shared_viewer, capfd, kind, label, value, why):
+    with PlainClient(shared_viewer.port) as client:
         client.change(client.control(kind, label), value)
         client.shows("That did not work")
         client.shows(why)
@@ -71,8 +71,8 @@ def test_invalid_control_values_are_rejected(viewer, capfd, kind, label, value, 
 @pytest.mark.parametrize(
     "updates", [{}, {"update_cb": []}, {"value": "x", "sync_cb": None}, {"_impl": 1}]
 )
-def test_messages_can_change_only_control_values(viewer, capfd, updates):
-    with PlainClient(viewer().port) as client:
+def test_messages_can_change_only_control_values(shared_viewer, capfd, updates):
+    with PlainClient(shared_viewer.port) as client:
         search = client.control("Text", "Search")
         client.send({"type": "GuiUpdateMessage", "uuid": search, "updates": updates})
         client.shows("the value of a control, and nothing else of it")
@@ -81,8 +81,8 @@ def test_messages_can_change_only_control_values(viewer, capfd, updates):
     assert capfd.readouterr().err == ""
 
 
-def test_slider_accepts_only_numbers_in_its_range(viewer, capfd):
-    with PlainClient(viewer().port, "?robot=robots/some-arm") as client:
+def test_slider_accepts_only_numbers_in_its_range(shared_viewer, capfd):
+    with PlainClient(shared_viewer.port, "?robot=robots/some-arm") as client:
         shoulder = client.control("Slider", "shoulder")
         for value in (float("nan"), float("inf"), "far", None, True, [1]):
             client.change(shoulder, value)

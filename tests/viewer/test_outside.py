@@ -62,8 +62,8 @@ def secret(tmp_path):
         "?compose=./../elsewhere/a.grammar",
     ],
 )
-def test_url_reveals_nothing_outside_the_folders(viewer, capfd, secret, query):
-    with PlainClient(viewer().port, query.replace("{}", str(secret))) as client:
+def test_url_reveals_nothing_outside_the_folders(shared_viewer, capfd, secret, query):
+    with PlainClient(shared_viewer.port, query.replace("{}", str(secret))) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         assert re.search("outside of the folders|no such file", client.text)
         assert WORD not in client.text
@@ -96,8 +96,8 @@ def test_url_reveals_nothing_outside_the_folders(viewer, capfd, secret, query):
     ],
     ids=lambda each: each[:30],
 )
-def test_invalid_url_shows_an_error_message(viewer, capfd, query, why):
-    with PlainClient(viewer().port, query) as client:
+def test_invalid_url_shows_an_error_message(shared_viewer, capfd, query, why):
+    with PlainClient(shared_viewer.port, query) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         shown = client.text.replace("&#x27;", "'")
         assert re.search(why, shown), shown[-600:]
@@ -105,51 +105,51 @@ def test_invalid_url_shows_an_error_message(viewer, capfd, query, why):
 
 
 @pytest.mark.parametrize("query", ["?compose=arm3&seed=²", f"?compose=arm3&number={'9' * 5000}"])
-def test_an_invalid_number_counts_as_zero(viewer, capfd, query):
-    with PlainClient(viewer().port, query) as client:
+def test_an_invalid_number_counts_as_zero(shared_viewer, capfd, query):
+    with PlainClient(shared_viewer.port, query) as client:
         client.until(lambda: "The same on the command line" in client.text)
     assert capfd.readouterr().err == ""
 
 
-def test_grammar_file_cannot_include_outside_files(viewer, folder, secret):
+def test_grammar_file_cannot_include_outside_files(shared_viewer, folder, secret):
     (folder / "mine.grammar").write_text(f'include "{secret}/a.grammar"\nrobot -> ur5\n')
-    with PlainClient(viewer().port, "?compose=mine.grammar") as client:
+    with PlainClient(shared_viewer.port, "?compose=mine.grammar") as client:
         client.shows("leads outside of")
         assert WORD not in client.text
 
 
-def test_grammar_text_cannot_include_files(viewer, secret):
-    with PlainClient(viewer().port, "?compose=arm3") as client:
+def test_grammar_text_cannot_include_files(shared_viewer, secret):
+    with PlainClient(shared_viewer.port, "?compose=arm3") as client:
         text = client.control("Text", "grammar")
         client.change(text, f'include "{secret}/a.grammar"\nrobot -> ur5\n')
         client.shows("a grammar given as text cannot include others")
         assert WORD not in client.text
 
 
-def test_checkpoint_cannot_name_an_outside_robot(viewer, folder, secret, monkeypatch):
+def test_checkpoint_cannot_name_an_outside_robot(shared_viewer, folder, secret, monkeypatch):
     (folder / "runs").mkdir(exist_ok=True)
     (folder / "runs" / "some.pt").touch()
     for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
         run = SimpleNamespace(source=RobotSource(name, task="reach"))
         monkeypatch.setattr(rollout, "read_checkpoint", lambda path, run=run: (run, None))
-        with PlainClient(viewer().port, "?play=&policy=runs/some.pt") as client:
+        with PlainClient(shared_viewer.port, "?play=&policy=runs/some.pt") as client:
             client.shows(NOTHING)
             assert "outside of the folders" in client.text
             assert WORD not in client.text
 
 
-def test_episode_cannot_name_an_outside_robot(viewer, folder, secret):
+def test_episode_cannot_name_an_outside_robot(shared_viewer, folder, secret):
     about = {"format": 1, "task": "reach", "bodies": [{"place": f"{secret}/a.urdf"}]}
     arrays = {f"0/{name}": np.zeros(1) for name in ("q", "score", "distance", "success", "goal")}
     np.savez(folder / "mine.npz", about=np.array(str(about).replace("'", '"')), **arrays)
-    with PlainClient(viewer().port, "?play=mine.npz") as client:
+    with PlainClient(shared_viewer.port, "?play=mine.npz") as client:
         client.shows("outside of the folders")
         assert WORD not in client.text
 
 
-def test_card_cannot_name_an_outside_file(viewer, folder, secret):
+def test_card_cannot_name_an_outside_file(shared_viewer, folder, secret):
     bundle = write_bundle(arm(), folder / "robots" / "nosy", picture=False)
     card = (bundle / "card.json").read_text()
     (bundle / "card.json").write_text(card.replace('"robot.xml":', f'"{secret}/a.urdf":'))
-    with PlainClient(viewer().port, "?robot=robots/nosy") as client:
+    with PlainClient(shared_viewer.port, "?robot=robots/nosy") as client:
         client.shows("leads out of the folder")

@@ -87,10 +87,10 @@ def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
         client.until(lambda: "/robot/workspace" not in nodes)
 
 
-def test_findings_about_inertia_are_written_beside_the_boxes(viewer, folder):
+def test_findings_about_inertia_are_written_beside_the_boxes(shared_viewer, folder):
     links = [replace(link, inertial=None) if link.name == "lower" else link for link in arm().links]
     write_bundle(replace(arm(), links=tuple(links)), folder / "robots" / "light", picture=False)
-    with PlainClient(viewer().port, "?robot=robots/light&show=visual,inertia") as client:
+    with PlainClient(shared_viewer.port, "?robot=robots/light&show=visual,inertia") as client:
         (found,) = client.until(
             lambda: [
                 m["props"]["text"]

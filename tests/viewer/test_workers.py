@@ -20,7 +20,7 @@ def workers():
 def test_dead_worker_is_reported_once_and_replaced(workers):
     value, first = workers.result(workers.submit(power, 2, 3))
     assert value == 9
-    dying, waiting = workers.submit(die_later, 1.0), workers.submit(power, 2, 4)
+    dying, waiting = workers.submit(die_later, 0.3), workers.submit(power, 2, 4)
     for future in (dying, waiting):
         with pytest.raises(WorkerDied, match="others were started: try again"):
             workers.result(future)
@@ -29,18 +29,9 @@ def test_dead_worker_is_reported_once_and_replaced(workers):
     assert second not in (first, os.getpid())
 
 
-def test_closing_workers_ends_their_processes():
+def test_closing_workers_interrupts_their_work_and_ends_their_processes(tmp_path):
     workers = Workers(1)
     _, process = workers.result(workers.submit(power, 2, 3))
-    workers.close()
-    until = time.monotonic() + 30
-    while alive(process) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not alive(process)
-
-
-def test_closing_workers_interrupts_their_work(tmp_path):
-    workers = Workers(1)
     started = tmp_path / "started"
     running, waiting = workers.submit(sleep_from, started), workers.submit(power, 2, 3)
     while not started.exists():
@@ -49,6 +40,10 @@ def test_closing_workers_interrupts_their_work(tmp_path):
     for future in (running, waiting):
         with pytest.raises(CancelledError):
             future.result(timeout=60)
+    until = time.monotonic() + 30
+    while alive(process) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not alive(process)
 
 
 def alive(process):
