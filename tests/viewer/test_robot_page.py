@@ -1,11 +1,13 @@
 """The robot page in a browser."""
 
+import gc
 import io
 import os
 import re
 import signal
 import subprocess
 import time
+import weakref
 import zipfile
 
 import pytest
@@ -231,7 +233,11 @@ def test_killed_browser_leaves_no_resources(see, viewer, browser_command, tmp_pa
     wait_until(lambda: not on.sessions)
     for threads in (session.events, session.background):
         threads.shutdown(wait=True)
+    freed = weakref.ref(session)
+    del session, threads
     wait_for_page(see(ARM, on=on))
+    gc.collect()
+    assert freed() is None
     assert "Traceback" not in capfd.readouterr().err
 
 
