@@ -242,17 +242,18 @@ class Learner:
             "success": (self.successes & ended).sum() / episodes,
             "episodes": episodes,
             "unstable": self.diverged.sum(),
-            **terms,
         }
         # One copy from the device instead of one for each number.
-        values = torch.cat([torch.stack([*numbers.values()]), robot_scores]).tolist()
+        means = torch.stack([*numbers.values(), *terms.values()])
+        values = torch.cat([means, robot_scores]).tolist()
         read = dict(zip(numbers, values, strict=False))
-        scores = np.array(values[len(numbers) :]) / self._envs_of_robots
+        scores = np.array(values[len(means) :]) / self._envs_of_robots
         return {
             **{name: read[name] for name in ("reward", "score", "success")},
             **{name: int(read[name]) for name in ("episodes", "unstable")},
             "scores": tuple(scores.tolist()),
-            "terms": {name: read[name] for name in terms},
+            # A term may have the name of a metric: push has a term "success".
+            "terms": dict(zip(terms, values[len(numbers) :], strict=False)),
         }
 
     @torch.no_grad()
@@ -274,7 +275,7 @@ class Learner:
 
     def _values(self, observation: Observation) -> torch.Tensor:
         """Return expected returns, shape (n,), in chunks of one shape: they compile once."""
-        count, size = len(observation["goal"]), self.minibatch_size
+        count, size = len(observation["tokens"]), self.minibatch_size
         chunks = [torch.zeros(0, device=self.device)]
         for start in range(0, count, size):
             # The last chunk repeats the last row up to the common shape.

@@ -100,8 +100,9 @@ def test_the_metrics_of_a_rollout_by_hand():
     trainer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
     trainer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
     trainer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
-    metrics = trainer._rollout_metrics({"one": torch.tensor(0.5)})
-    assert metrics["terms"] == {"one": 0.5}
+    terms = {"one": torch.tensor(0.25), "success": torch.tensor(7.0)}  # push has a term "success"
+    metrics = trainer._rollout_metrics(terms)
+    assert metrics["terms"] == {"one": 0.25, "success": 7.0}
     assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
     assert metrics["scores"] == (2.0, 2.0)
     assert (metrics["success"], metrics["episodes"], metrics["unstable"]) == (0.5, 4, 1)

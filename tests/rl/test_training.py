@@ -72,6 +72,16 @@ def test_a_run_writes_config_checkpoint_and_metrics(tmp_path):
     assert (run, learner["update"]) == (config, 6)
 
 
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf", "me-graph"])
+def test_all_agents_learn_to_push(tmp_path, agent):
+    # Networks of two of them leave out what no pushing robot has, such as the goal.
+    config = small_config(robot_source("prims", "push"), agent=agent)
+    train(tmp_path / "run", config, execution=QUIET)
+    metrics = read_metrics(tmp_path / "run")
+    assert len(metrics) == 6
+    assert {"success", "distance"} <= set(metrics[0]["terms"])
+
+
 @pytest.mark.parametrize(
     "stops", [pytest.param((1,), marks=pytest.mark.slow), (8,), (7, 13)], ids=str
 )
