@@ -12,7 +12,7 @@ from morphgen.typing import Array
 from morphgen.viewer import markup, population_layout, scene_population
 from morphgen.viewer.address import Address
 from morphgen.viewer.comparison import format_moves
-from morphgen.viewer.population import Population, move_roles
+from morphgen.viewer.population import Population, move_roles, robot_bounds, shape_poses
 from morphgen.viewer.population_hover import update_script
 from morphgen.viewer.population_pick import camera_view, project, robot_at, robots_in
 from morphgen.viewer.population_source import (
@@ -125,13 +125,16 @@ def arrange_robots(page: PopulationPage) -> None:
     for axis in page.axes:
         axis.visible = is_scatter
     layout = _positions(page)
-    bounds = page.population.home_bounds
+    q = _current_q(page)
+    bounds = robot_bounds(page.population, shape_poses(page.population, q))
     roots = np.pad(layout.positions, ((0, 0), (0, 1)))
-    low, high = (bounds[:, 0] + roots).min(axis=0), (bounds[:, 1] + roots).max(axis=0)
+    labels = np.array([(*position, 0.0) for _, position in layout.labels]).reshape(-1, 3)
+    low = np.concatenate([bounds[:, 0] + roots, labels]).min(axis=0)
+    high = np.concatenate([bounds[:, 1] + roots, labels]).max(axis=0)
     with client.atomic():
         for handle in scene.labels:
             handle.remove()
-        scene_population.move(scene, layout.positions, _current_q(page))
+        scene_population.move(scene, layout.positions, q)
         scene.labels = [
             client.scene.add_label(f"/labels/{i}", text, position=(*position, 0.0))
             for i, (text, position) in enumerate(layout.labels)

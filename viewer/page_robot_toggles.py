@@ -73,6 +73,7 @@ def apply_toggle(page: RobotPage, name: str) -> None:
         _toggle_layer(page, layer, on)
     elif name == XRAY:
         page.view.set_opacity(_XRAY_OPACITY if on else 1.0)
+        _show_visual(page)
     elif name == FRAMES:
         page.view.show_axes(on)
     elif name == GIZMO:
@@ -92,12 +93,22 @@ def _toggle_layer(page: RobotPage, layer: scene_robot.Layer, on: bool) -> None:
     elif layer == "primitives" and on and layer not in page.layer_shapes:
         page.session.run_in_background(lambda: _fit_primitives(page))
     elif layer == "visual":
-        page.view.set_visible(layer, on)
-        for other in page.layer_shapes:
-            _show_layer(page, other)
+        _show_visual(page)
     else:
         if layer == "collision":
             page.layer_shapes[layer] = [link.collisions for link in page.robot.links]
+        _show_layer(page, layer)
+
+
+def _has_visual(page: RobotPage) -> bool:
+    """Return whether visual shapes are to be seen, solid or transparent."""
+    return is_on(page, "visual") or is_on(page, XRAY)
+
+
+def _show_visual(page: RobotPage) -> None:
+    """Show or hide the visual shapes, and draw the layers beside them exact or a little grown."""
+    page.view.set_visible("visual", _has_visual(page))
+    for layer in page.layer_shapes:
         _show_layer(page, layer)
 
 
@@ -106,7 +117,7 @@ def _show_layer(page: RobotPage, layer: scene_robot.Layer) -> None:
     if not is_on(page, layer):
         page.view.remove_layer(layer)
         return
-    growth = _GROWTH * scene_robot.robot_extent(page.robot) if is_on(page, "visual") else 0.0
+    growth = _GROWTH * scene_robot.robot_extent(page.robot) if _has_visual(page) else 0.0
     page.view.show_shapes(layer, page.layer_shapes[layer], growth)
 
 

@@ -78,6 +78,10 @@ def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
         radius = np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max()
         assert 0.0205 < radius < 0.03  # the cylinder has 0.02 m
         client.change(client.control("Checkbox", "visual"), False)
+        client.shows("show=collision,inertia,x-ray")
+        assert nodes["/robot/1/visual0"].visible
+        client.change(client.control("Checkbox", "x-ray"), False)
+        client.until(lambda: not nodes["/robot/1/visual0"].visible)
         client.until(
             lambda: (
                 np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max() < 0.0201
