@@ -22,7 +22,7 @@ from morphgen.viewer.address import Address
 from morphgen.viewer.compose_output import ROBOTS, send_robot, write_robot
 from morphgen.viewer.evolution import Individual
 from morphgen.viewer.page_compose_evolve import EvolveTab, add_evolve_tab, leave_parent, set_parent
-from morphgen.viewer.page_compose_grammar import add_grammar_tab, show_grammar
+from morphgen.viewer.page_compose_grammar import add_grammar_tab, is_robot, show_grammar
 from morphgen.viewer.page_compose_parameters import add_parameters_tab
 from morphgen.viewer.page_compose_parts import add_parts_tab
 from morphgen.viewer.page_robot import PANEL_WIDTH, summary
@@ -33,6 +33,7 @@ from morphgen.viewer.robot_uri import (
     DERIVATION,
     MEMBER,
     UPLOAD,
+    WORDS,
     FileAccess,
     UriError,
     parent_folder,
@@ -45,6 +46,8 @@ from morphgen.viewer.robot_uri import (
 from morphgen.viewer.session import Session
 
 DEFAULT_GRAMMAR = "arm3"
+_OF_GRAMMARS = ("choices", "evolve", "number", "text")
+"""Keys of the address that only robots of grammars have."""
 
 
 @dataclass(eq=False)
@@ -71,7 +74,11 @@ def show(session: Session) -> None:
     derivation = subject_derivation(subject, files)
     words = DEFAULT_WORDS if derivation else subject
     grammar_name = DEFAULT_GRAMMAR
-    if is_grammar := not derivation and "=" not in subject.split()[0]:
+    # A robot with choices is one of the grammar around it.
+    is_around = is_robot(subject) and not session.address.state.keys().isdisjoint(_OF_GRAMMARS)
+    if is_around:
+        grammar_name, is_grammar = subject, True
+    elif is_grammar := not derivation and "=" not in subject.split()[0]:
         grammar_name, words = subject.split()[0], DEFAULT_WORDS
     drawn = drawn_in_set(subject, files) if derivation else None
     if drawn is not None:
@@ -79,7 +86,6 @@ def show(session: Session) -> None:
     choice = choice_of(derivation, files.library) if derivation else None
     is_tree = derivation is not None and choice is None
     choice = choice or part_choice.parse_choice(words.split(), files.library)
-    grammar = resolve_grammar(grammar_name, files)
     session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
     gui = session.client.gui
     page = ComposePage(session, compose_view.ComposeView(session), gui.add_html(""))
@@ -88,7 +94,7 @@ def show(session: Session) -> None:
     start: Callable[[], None]
     # The tab that the address asks for comes first.
     if is_grammar:
-        grammar_tab = add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
+        grammar_tab = add_grammar_tab(session, tabs, grammar_name, show_in_page)
         add_parts_tab(session, tabs, choice, show_in_page)
         start = functools.partial(show_grammar, grammar_tab, grammar_tab.mode)
     else:
@@ -96,7 +102,7 @@ def show(session: Session) -> None:
             start = add_parameters_tab(session, tabs, derivation, show_in_page)
         else:
             start = add_parts_tab(session, tabs, choice, show_in_page)
-        grammar_tab = add_grammar_tab(session, tabs, grammar, grammar_name, show_in_page)
+        grammar_tab = add_grammar_tab(session, tabs, grammar_name, show_in_page)
     page.evolve = add_evolve_tab(session, tabs, grammar_tab)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.findings = gui.add_html("")
@@ -181,7 +187,7 @@ def show_robot(
             markup.command(command), "<h3>Derivation</h3>", markup.code(str(derivation))
         )
     if page.evolve is not None:
-        leave_parent(page.evolve)
+        leave_parent(page.evolve, uri.removeprefix(WORDS))
     page.session.run_in_background(lambda: _check(page), "check")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from html import escape
 
 import numpy as np
 import viser
@@ -15,16 +14,20 @@ from morphgen.grammar.choosers import Choices
 from morphgen.viewer import markup
 from morphgen.viewer.address import parse_count
 from morphgen.viewer.compose_output import ROBOTS, send_robot, write_robot
-from morphgen.viewer.compose_view import change_text, robot_facts
 from morphgen.viewer.evolution import (
     History,
     Individual,
-    change_lines,
     offspring,
     pack_choices,
     unpack_choices,
 )
-from morphgen.viewer.page_compose_grammar import GrammarTab, edited_grammar, show_grammar
+from morphgen.viewer.evolution_html import history_html, offspring_html
+from morphgen.viewer.page_compose_grammar import (
+    GrammarTab,
+    edited_grammar,
+    load_source,
+    show_grammar,
+)
 from morphgen.viewer.scene_offspring import (
     OffspringScene,
     add_offspring,
@@ -33,10 +36,12 @@ from morphgen.viewer.scene_offspring import (
 )
 from morphgen.viewer.session import Session, set_value
 
-NO_PARENT = (
-    "Only robots of a grammar evolve: their choices are drawn again. Draw one on the tab "
-    "<i>Grammar</i>, or open a robot of a set with <i>Edit in Compose</i>."
+NO_GRAMMAR = (
+    "This robot has no grammar whose choices could be drawn again. <i>Evolve this robot</i> makes "
+    "one: parameters vary about their values, and arms and end-effectors may be replaced by "
+    "others. You can edit it on the tab <i>Grammar</i>."
 )
+NO_ROBOT = "No robot is shown: choose parts that fit, or draw a robot on the tab <i>Grammar</i>."
 HINT = (
     "Click a robot, or <i>adopt</i> here, to go on with it. Tick two to cross them. Ctrl+Z and "
     "Ctrl+Y undo and redo."
@@ -50,6 +55,8 @@ class EvolveTab:
     session: Session
     grammar: GrammarTab
     """The tab whose robot evolves."""
+    make: viser.GuiButtonHandle
+    """Makes a grammar around a robot that none has given."""
     seed: viser.GuiNumberHandle[int]
     grid: viser.GuiHtmlHandle
     strip: viser.GuiHtmlHandle
@@ -57,6 +64,8 @@ class EvolveTab:
     set_name: viser.GuiTextHandle
     parent: Individual | None = None
     """The robot that is shown, if the grammar gave it."""
+    source: str = ""
+    """Words or URI of the robot that is shown, if no grammar gave it."""
     partner: Choices | None = None
     """Choices of the other parent, if the generation was crossed."""
     generation: list[Individual] = field(default_factory=list)
@@ -74,6 +83,7 @@ def add_evolve_tab(
     """Add the tab; it shows the offspring that the address asks for with the first robot."""
     gui, state = session.client.gui, session.address.state
     with tabs.add_tab("Evolve", viser.Icon.DNA):
+        make = gui.add_button("Evolve this robot", icon=viser.Icon.DNA, visible=False)
         seed = gui.add_number("generation", parse_count(state.get("evolve", ""), 0), min=0, step=1)
         buttons = gui.add_button_group("show", ("mutants", "cross", "none"))
         steps = gui.add_button_group("history", ("undo", "redo"))
@@ -82,7 +92,7 @@ def add_evolve_tab(
             set_name = gui.add_text("set", "", hint=f"folder below {ROBOTS}/")
             keep = gui.add_button("Add to set", icon=viser.Icon.DEVICE_FLOPPY)
             export = gui.add_button("Export bundle (.zip)", icon=viser.Icon.DOWNLOAD)
-    tab = EvolveTab(session, grammar, seed, grid, strip, set_name)
+    tab = EvolveTab(session, grammar, make, seed, grid, strip, set_name)
     if "with" in state:
         tab.partner = unpack_choices(state["with"])
     is_asked = "evolve" in state
@@ -93,6 +103,7 @@ def add_evolve_tab(
         "undo": lambda: _step(tab, -1),
         "redo": lambda: _step(tab, 1),
     }
+    session.on_change(make, lambda: _make_grammar(tab))
     session.on_change(buttons, lambda: actions[buttons.value]())
     session.on_change(steps, lambda: actions[steps.value]())
     session.on_change(seed, lambda: _breed(tab), "generation")
@@ -119,41 +130,28 @@ def add_evolve_tab(
 
 
 def show_parent(tab: EvolveTab) -> None:
-    """Show the history and the generation, or that the robot cannot evolve."""
+    """Show the history and the generation, or what to do so that the robot can evolve."""
+    tab.make.visible = tab.parent is None and bool(tab.source)
     if tab.parent is None:
         tab.strip.content = ""
-        tab.grid.content = markup.framed(markup.dim(NO_PARENT))
+        tab.grid.content = markup.framed(markup.dim(NO_GRAMMAR if tab.source else NO_ROBOT))
         return
-    chips = []
-    for i, individual in enumerate(tab.history.individuals):
-        name = escape(individual.robot.name.rpartition("-")[2][:6])
-        style = "info" if i == tab.history.position else ""
-        chips.append(f'<a data-do="recall" data-value="{i}">{markup.tag(name, style)}</a>')
-    tab.strip.content = markup.framed(" ".join(chips))
-    cards = [_card(tab, i, individual) for i, individual in enumerate(tab.generation)]
-    grid = f'<div class="offspring">{"".join(cards)}</div>' if cards else ""
-    tab.grid.content = markup.framed(markup.dim(HINT), grid)
+    tab.strip.content = markup.framed(history_html(tab.history))
+    tab.grid.content = markup.framed(
+        markup.dim(HINT), offspring_html(tab.parent, tab.generation, tab.picked)
+    )
 
 
-def leave_parent(tab: EvolveTab) -> None:
-    """Forget the parent and remove its offspring: another robot is shown now."""
-    tab.parent = None
+def leave_parent(tab: EvolveTab, source: str) -> None:
+    """Forget the parent and remove its offspring: another robot is shown now.
+
+    Args:
+        tab: The tab.
+        source: Words or URI of the robot.
+    """
+    tab.parent, tab.source = None, source
     _clear_generation(tab)
     show_parent(tab)
-
-
-def _card(tab: EvolveTab, i: int, individual: Individual) -> str:
-    """Return what differs between an individual and the parent, with what can be done."""
-    assert tab.parent is not None
-    lines = change_lines(tab.parent.derivation, individual.derivation)
-    changes = "<br>".join(escape(line) for line in lines[:4]) + ("<br>..." if lines[4:] else "")
-    facts = change_text(robot_facts(tab.parent.robot), robot_facts(individual.robot))
-    checked = " checked" if i in tab.picked else ""
-    return (
-        f'<div><b>{i + 1}</b> <a data-do="adopt" data-value="{i}">adopt</a> '
-        f'<label><input type="checkbox" data-do="pick" data-value="{i}"{checked}> cross</label>'
-        f"{markup.dim(f'{escape(facts)}<br>{changes}' if facts else changes)}</div>"
-    )
 
 
 def set_parent(tab: EvolveTab, individual: Individual) -> None:
@@ -175,6 +173,12 @@ def _start(tab: EvolveTab, individual: Individual) -> None:
     tab.grammar.on_shown = lambda later: set_parent(tab, later)
     set_parent(tab, individual)
     _breed(tab)
+
+
+def _make_grammar(tab: EvolveTab) -> None:
+    """Make a grammar around the robot that is shown, and show its mutants."""
+    load_source(tab.grammar, tab.source)
+    _next_generation(tab)
 
 
 def _next_generation(tab: EvolveTab, partner: Choices | None = None) -> None:
@@ -294,7 +298,9 @@ def _require_parent(tab: EvolveTab) -> Individual:
         CompositionError: If there is none.
     """
     if tab.parent is None:
-        raise CompositionError("no robot of a grammar is shown: draw one on the tab Grammar")
+        raise CompositionError(
+            "the robot has no grammar: press 'Evolve this robot', or draw one on the tab Grammar"
+        )
     return tab.parent
 
 

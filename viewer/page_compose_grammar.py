@@ -15,7 +15,7 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.grammar.choosers import Choices
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation, outline
+from morphgen.grammar.derivation import Derivation, outline, parse_derivation
 from morphgen.grammar.grammar_file import (
     SUFFIX,
     Grammar,
@@ -23,14 +23,16 @@ from morphgen.grammar.grammar_file import (
     grammar_names,
     grammar_text,
 )
+from morphgen.grammar.request import default_name
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address, AddressError, pack_text, parse_count, unpack_text
+from morphgen.viewer.derivation_grammar import grammar_around
 from morphgen.viewer.evolution import Individual, make_individual, pack_choices, unpack_choices
 from morphgen.viewer.frame import call
 from morphgen.viewer.part_choice import first_parts
-from morphgen.viewer.robot_uri import DERIVATION, resolve_grammar
+from morphgen.viewer.robot_uri import DERIVATION, FileAccess, resolve_grammar, resolve_words
 from morphgen.viewer.session import Session, set_value
 
 Mode = Literal["typical", "drawn", "chosen"]
@@ -48,9 +50,13 @@ class GrammarTab:
     session: Session
     show_robot: ShowRobot
     source: str
-    """Name or file of the grammar."""
+    """Name or file of the grammar, or the robot that it is around; see ``source_text``."""
+    name: str
+    """Name of the grammar, from which its robots get theirs."""
     original: str
     """Text of the grammar before it was edited."""
+    start: viser.GuiDropdownHandle[str]
+    """Grammars to start from."""
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
     too_long: viser.GuiHtmlHandle
@@ -69,11 +75,6 @@ class GrammarTab:
     """Called after a whole robot of the grammar was shown."""
 
     @property
-    def name(self) -> str:
-        """Name of the grammar, from which its robots get theirs."""
-        return Path(self.source).stem if self.source.endswith(SUFFIX) else self.source
-
-    @property
     def is_edited(self) -> bool:
         """Whether the text differs from the grammar's own."""
         return self.text.value != self.original
@@ -82,7 +83,6 @@ class GrammarTab:
 def add_grammar_tab(
     session: Session,
     tabs: viser.GuiTabGroupHandle,
-    grammar: Grammar,
     source: str,
     show_robot: ShowRobot,
 ) -> GrammarTab:
@@ -91,15 +91,15 @@ def add_grammar_tab(
     Args:
         session: The browser.
         tabs: Group to which the tab is added.
-        grammar: The grammar.
-        source: Name or file of the grammar.
+        source: Source of the grammar; see ``source_text``.
         show_robot: Shows a robot on the page.
 
     Raises:
         AddressError: If the text in the address is invalid.
+        MorphgenError: If there is no such grammar or robot.
     """
     gui, state = session.client.gui, session.address.state
-    original = grammar_text(grammar)
+    name, original = source_text(source, session.files)
     names = tuple(dict.fromkeys((source, *grammar_names())))
 
     def count(key: str) -> int:
@@ -121,7 +121,9 @@ def add_grammar_tab(
         session,
         show_robot,
         source,
+        name,
         original,
+        dropdown,
         text_field,
         fault,
         too_long,
@@ -134,11 +136,37 @@ def add_grammar_tab(
         tab.choices, tab.mode = unpack_choices(state["choices"]), "chosen"
     elif "number" in state:
         tab.mode = "drawn"
-    session.on_change(dropdown, lambda: _load(tab, dropdown.value))
+    session.on_change(dropdown, lambda: load_source(tab, dropdown.value))
     session.on_change(text_field, lambda: show_grammar(tab, tab.mode), "grammar")
     session.on_change(buttons, lambda: _draw(tab, buttons.value))
     session.on_change(num_parts, lambda: _show_parts(tab), "parts")
     return tab
+
+
+def source_text(source: str, files: FileAccess) -> tuple[str, str]:
+    """Return the name and the text of a grammar.
+
+    Args:
+        source: Name or file of a grammar, or words or a URI of a robot for ``grammar_around``.
+        files: Files that the page may read.
+
+    Raises:
+        MorphgenError: If there is no such grammar or robot.
+    """
+    if not is_robot(source):
+        name = Path(source).stem if source.endswith(SUFFIX) else source
+        return name, grammar_text(resolve_grammar(source, files))
+    if source.startswith(DERIVATION):
+        derivation = parse_derivation(source.removeprefix(DERIVATION))
+        name = default_name(derivation, files.library)
+    else:
+        derivation, name = resolve_words(source, files)
+    return name, grammar_around(derivation, files.library)
+
+
+def is_robot(source: str) -> bool:
+    """Return whether the source of a grammar is a robot."""
+    return source.startswith(DERIVATION) or "=" in source.split()[0]
 
 
 def edited_grammar(tab: GrammarTab) -> Grammar:
@@ -184,8 +212,9 @@ def _make_robot(
         MorphgenError: If the grammar gives no such robot.
     """
     session, library = tab.session, tab.session.files.library
-    name = shlex.quote(f"{tab.name}{SUFFIX}" if tab.is_edited else tab.source)
-    note = f"# with the text of the tab Grammar in {name}\n" if tab.is_edited else ""
+    is_text = tab.is_edited or is_robot(tab.source)
+    name = shlex.quote(f"{tab.name}{SUFFIX}" if is_text else tab.source)
+    note = f"# with the text of the tab Grammar in {name}\n" if is_text else ""
     if tab.mode == "drawn":
         seed, number = tab.seed.value, tab.number.value
         session.set_status(f"drawing robot {number} of seed {seed}")
@@ -201,10 +230,16 @@ def _make_robot(
     return individual, f"# {individual.derivation}", state
 
 
-def _load(tab: GrammarTab, source: str) -> None:
-    """Replace the text by that of another grammar, and show its typical robot."""
+def load_source(tab: GrammarTab, source: str) -> None:
+    """Replace the text by that of another grammar, and show its typical robot.
+
+    Raises:
+        MorphgenError: If there is no such grammar or robot; see ``source_text``.
+    """
+    tab.name, tab.original = source_text(source, tab.session.files)
     tab.source = source
-    tab.original = grammar_text(resolve_grammar(source, tab.session.files))
+    tab.start.options = tuple(dict.fromkeys((source, *grammar_names())))
+    set_value(tab.start, source)
     set_value(tab.text, tab.original)
     show_grammar(tab, "typical")
 

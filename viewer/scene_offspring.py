@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
+from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.scene_robot import RobotView, add_robot, robot_bounds
@@ -48,7 +49,7 @@ def add_offspring(
             row, column = divmod(i, COLUMNS)
             position = ((column + 1.3) * step_x, (1 - row) * step_y, 0.0)
             boxes[i] = bounds[i + 1] + position
-            views.append(add_robot(client.scene, robot, f"/offspring{i}", position))
+            views.append(add_robot(client.scene, split_colours(robot), f"/offspring{i}", position))
             above = (0.0, 0.0, float(bounds[i + 1, 1, 2]) + 0.04 * step_x)
             labels.append(
                 client.scene.add_label(

@@ -103,6 +103,7 @@ def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_vie
         client.until(lambda: "evolve=1" in client.text)
 
 
-def test_robots_of_parts_do_not_evolve(shared_viewer):
+def test_robots_of_parts_evolve_by_a_grammar_around_them(shared_viewer):
     with PlainClient(shared_viewer.port, "?compose=arm=ur5 ee=plane") as client:
-        client.shows("Only robots of a grammar evolve")
+        client.shows("This robot has no grammar whose choices could be drawn again")
+        client.control("Button", "Evolve this robot")
