@@ -52,7 +52,10 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
     assert run_here(command, monkeypatch) == 0
     rows = json.loads((tmp_path / study / "results.json").read_text("utf-8"))["rows"]
     means = {
-        (row["split"], row["agent"]): {f"{group['mean']:.1f}" for group in row["groups"].values()}
+        (row["split"], row["agent"]): {
+            f"{group['mean']:{'.0%' if row['split'].endswith('push') else '.1f'}}"
+            for group in row["groups"].values()
+        }
         for row in rows
         if row["mode"] == "deterministic"
     }
@@ -76,9 +79,7 @@ def test_the_docs_have_the_constants_of_the_stored_runs(page):
         config = json.loads(path.read_text("utf-8"))
         agent, constants = config["policy"]["agent"], config | config["ppo"]
         (name,) = [
-            name
-            for name, agents, sims in RUNS
-            if re.match(agents, agent) and config["sim"] in sims
+            name for name, agents, sims in RUNS if re.match(agents, agent) and config["sim"] in sims
         ]
         values = tuple(float(constants[key]) for key in CONSTANTS)
         stored.setdefault(name, set()).add(values)
