@@ -67,8 +67,10 @@ class RobotView:
 
     def set_configuration(self, q: ArrayLike) -> None:
         """Move the robot to independent joint positions, shape (dof,) [rad or m]."""
-        self.T_root_link = forward_kinematics(self.robot, q)
-        for handle, T in zip(self.links, self.T_root_link, strict=True):
+        before, self.T_root_link = self.T_root_link, forward_kinematics(self.robot, q)
+        for i, (handle, T) in enumerate(zip(self.links, self.T_root_link, strict=True)):
+            if i < len(before) and np.array_equal(before[i], T):
+                continue  # each message to a browser takes time
             pose = Pose.from_matrix(T)
             handle.position, handle.wxyz = pose.position, pose.quaternion
 

@@ -14,11 +14,12 @@ import zstandard
 from PIL import Image
 
 from helpers.robots import arm
+from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
 from morphgen.viewer import turntable as turntable_module
 from morphgen.viewer.turntable import turntable
-from morphgen.viewer.web_page import robot_page
+from morphgen.viewer.web_page import joint_sweep, joint_titles, robot_page
 
 ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
 
@@ -54,6 +55,37 @@ def test_a_page_has_the_robot_the_stage_and_the_camera(page):
 
 def test_a_page_loads_nothing_else(page):
     assert ADDRESS.findall(page) == []
+
+
+def test_a_page_plays_each_joint_through_its_range(page):
+    robot = arm()
+    titles = [f"joint {i + 1} of {robot.dof}, " for i in range(robot.dof)]
+    messages = recorded_messages(page)
+    labels = [m["updates"]["text"] for m in messages if m["type"] == "SceneNodeUpdateMessage"]
+    assert [label[: len(titles[0])] for label in labels] == titles
+    moves = [m["name"] for m in messages if m["type"] == "SetOrientationMessage"]
+    assert moves.count("/robot/0") <= 1  # the root stays
+    assert max(map(moves.count, moves)) > 40
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_a_joint_moves_from_home_to_both_limits_and_back(column):
+    robot = arm()
+    home, (low, high) = np.array(robot.home), joint_limits(robot)[column]
+    q = joint_sweep(robot, column, 200)
+    assert q.shape == (200, robot.dof)
+    assert np.delete(q, column, axis=1) == pytest.approx(np.tile(np.delete(home, column), (200, 1)))
+    assert q[-1] == pytest.approx(home)
+    values = q[:, column]
+    assert values.min() == pytest.approx(low, abs=0.03 * (high - low))
+    assert values.max() == pytest.approx(high, abs=0.03 * (high - low))
+    assert values.argmin() < values.argmax()
+
+
+def test_titles_of_joints_have_their_ranges():
+    revolute, *_, last = joint_titles(arm())
+    assert re.fullmatch(r"joint 1 of \d+, \w+: -?[\d.]+ to [\d.]+ (deg|m)", revolute)
+    assert last.startswith(f"joint {arm().dof} of {arm().dof}, ")
 
 
 @pytest.mark.slow
@@ -94,7 +126,13 @@ def test_a_page_opens_without_a_network(chromium, page, tmp_path, picture):
     while orange_pixels(opened) < 100 and time.monotonic() < until:  # the colour of the robot
         opened.wait_for_timeout(1000)
     assert orange_pixels(opened) >= 100
+    time_field = opened.locator("input").first
+    opened.wait_for_function("parseFloat(document.querySelector('input').value) > 1.5")
+    opened.keyboard.press("Space")  # pauses; software GL draws slowly
+    opened.wait_for_timeout(1000)
+    paused = time_field.input_value()
     picture(opened, "web-page")
+    assert time_field.input_value() == paused
     context.close()
     assert failures == []
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
