@@ -125,6 +125,8 @@ def _summary(source: Source, population: Population, faults: list[tuple[str, str
     if faults:
         lines = "<br>".join(f"{escape(name)}: {escape(error)}" for name, error in faults[:5])
         text += f"{markup.tag(f'{len(faults)} cannot be read', 'error')}{markup.dim(lines)}"
+    if len(population) > scene_population.MAX_SHADOWS:
+        text += markup.dim(f"without shadows: more than {scene_population.MAX_SHADOWS} robots")
     return text + markup.dim(
         "Point at a robot for its facts, click to open it. Shift and drag selects a rectangle, "
         "shift and click one robot."

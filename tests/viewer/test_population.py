@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.errors import FormatError
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_set import read_index, remove_robots
@@ -14,6 +15,7 @@ from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Link, Robot
 from morphgen.viewer import population_layout as layout
+from morphgen.viewer import scene_population
 from morphgen.viewer.comparison import parse_moves, with_roles
 from morphgen.viewer.population import make_population, move_roles, robot_bounds, shape_poses
 from morphgen.viewer.population_hover import SCALE, pack_capsules
@@ -309,3 +311,12 @@ def test_robots_are_deleted_from_the_users_own_sets_only(folder, tmp_path):
     ):
         with pytest.raises(UriError, match=message):
             owned_set(text, files)
+
+
+def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
+    monkeypatch.setattr(scene_population, "MAX_SHADOWS", 10)
+    with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
+        client.shows("without shadows: more than 10 robots")
+        batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
+        assert batches
+        assert not any(message["props"]["cast_shadow"] for message in batches)
