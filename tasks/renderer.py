@@ -44,9 +44,9 @@ _MARGIN = 0.92
 _SHADOW_SIZE = 1536
 """Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take two
 thirds of the time; smoothed edges would take even longer, and are hardly visible in a video."""
-_SHADOW_CLIP = 1.5
-"""Half the width of the shadow map, as a multiple of the extent of the scene. With 1.25, dark dots
-appear on the ground at the edge of pictures."""
+_SHADOW_CLIP = 2.0
+"""Half the width of the shadow map, as a multiple of the extent of the scene. With 1.5, dark dots
+appear on the ground at the edge of some pictures of a turn."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
 """Pose of bodies that must not be visible."""
 _NUM_STARTS = 32

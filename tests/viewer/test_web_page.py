@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 import zstandard
 from PIL import Image
+from scipy.ndimage import median_filter
 
 from helpers.robots import arm
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
@@ -98,6 +102,18 @@ def test_a_turn_of_the_camera_ends_where_it_began():
     renderer.close()
     assert abs(start - side).mean() > 3
     assert abs(start - end).mean() < 0.5
+
+
+def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
+    derivation = parse_request(["base=gantry", "ee=cube"], default_library())
+    robot = compose(derivation, default_library(), "gantry")
+    home = np.array([robot.home])
+    renderer = Renderer(Scene(robot), (), home, turntable_module._ring(robot), (480, 360))
+    frame = renderer.frame(RenderState(home[0]), 75).astype(int).sum(axis=2)
+    renderer.close()
+    darker = median_filter(frame, 5) - frame
+    assert (darker[:, :40] <= 40).all()
+    assert (darker[:, -40:] <= 40).all()
 
 
 def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
