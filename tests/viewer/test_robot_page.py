@@ -169,7 +169,7 @@ def test_a_broken_robot_shows_its_findings(see, picture):
     page = see("?robot=robots/broken")
     page.locator(".tag.error").first.wait_for()
     assert page.get_by_text(re.compile("lost")).first.is_visible()
-    page.get_by_role("link", name="Library").wait_for()
+    page.get_by_role("link", name="Library").first.wait_for()
     picture(page)
 
 
