@@ -186,17 +186,22 @@ def wait_for_cards(page: Any) -> int:  # noqa: ANN401
     return int(shown)
 
 
+def _open_gallery(page: Any, address: str) -> tuple[float, float, int]:  # noqa: ANN401
+    """Open a gallery; return the times of its first and its last picture [s], and their number."""
+    begun = time.perf_counter()
+    page.goto(address)
+    page.locator(CARD).first.wait_for()
+    first = time.perf_counter() - begun
+    shown = wait_for_cards(page)
+    return first, time.perf_counter() - begun, shown
+
+
 def _library(browser: Any, folder: Path) -> list[Row]:  # noqa: ANN401
     rows = []
     with started_viewer([*MORPHGEN, "view"], folder) as (address, _, _):
         for cache in ("no thumbnail stored", "all stored"):
             with opened_page(browser) as page:
-                begun = time.perf_counter()
-                page.goto(address)
-                page.locator(CARD).first.wait_for()
-                first = time.perf_counter() - begun
-                shown = wait_for_cards(page)
-                every = time.perf_counter() - begun
+                first, every, shown = _open_gallery(page, address)
             rows.append((f"first picture of the library, {cache}", f"{first:.1f} s"))
             rows.append((f"all {shown} pictures, {cache}", f"{every:.1f} s"))
     return rows
@@ -221,12 +226,7 @@ def _edits(page: Any) -> list[float]:  # noqa: ANN401
 def _pages(browser: Any, folder: Path, robots: int) -> list[Row]:  # noqa: ANN401
     with started_viewer([*MORPHGEN, "view", "robots/arm3"], folder) as (address, ready, _):
         with opened_page(browser) as page:
-            begun = time.perf_counter()
-            page.goto(address)
-            page.locator(CARD).first.wait_for()
-            first = time.perf_counter() - begun
-            shown = wait_for_cards(page)
-            every = time.perf_counter() - begun
+            first, every, shown = _open_gallery(page, address)
             cards, backs = [], []
             for i in range(VISITS):
                 begun = time.perf_counter()

@@ -8,8 +8,6 @@ colours, to docs/images/viewer. Needs `pip install morphgen[test]` and chromium.
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,6 +19,9 @@ from typing import Any
 from PIL import Image
 
 from morphgen.viewer.app import serve
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+from viewer_speed import started_browser
 
 PAGES = {
     "library": ("?library=", ".card img"),
@@ -58,8 +59,6 @@ SETTLE = 8000
 WAIT = 240_000
 """Longest time to wait for a page [ms]."""
 IMAGES = Path(__file__).parent / "images" / "viewer"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-OPTIONS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 def main() -> int:
@@ -92,21 +91,6 @@ def served() -> Iterator[str]:
         viewer = serve(port=0)
         yield f"http://127.0.0.1:{viewer.port}/"
         viewer.stop()
-
-
-@contextmanager
-def started_browser() -> Iterator[Any]:
-    """Start a headless browser."""
-    from playwright.sync_api import sync_playwright
-
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        sys.exit("there is no chromium")
-    sandbox = () if os.geteuid() else ("--no-sandbox",)
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=[*OPTIONS, *sandbox])
-        yield browser
-        browser.close()
 
 
 def take(

@@ -232,28 +232,28 @@ class Learner:
             terms: Mean of each reward term, shape ().
         """
         ended = self.terminated | self.truncated
-        episodes = ended.sum()
+        num_ended = ended.sum()
         env_scores = self.scores.mean(dim=0)
         robot_scores = torch.zeros(self.num_robots, device=env_scores.device)
         robot_scores.index_add_(0, self.batch.env_robot_index, env_scores)
-        numbers = {
-            "reward": self.rewards.mean(),
-            "score": env_scores.mean(),
-            "success": (self.successes & ended).sum() / episodes,
-            "episodes": episodes,
-            "unstable": self.diverged.sum(),
-        }
+        numbers = (
+            self.rewards.mean(),
+            env_scores.mean(),
+            (self.successes & ended).sum() / num_ended,
+            num_ended,
+            self.diverged.sum(),
+        )
         # One copy from the device instead of one for each number.
-        means = torch.stack([*numbers.values(), *terms.values()])
-        values = torch.cat([means, robot_scores]).tolist()
-        read = dict(zip(numbers, values, strict=False))
-        scores = np.array(values[len(means) :]) / self._envs_of_robots
+        values = torch.cat([torch.stack([*numbers, *terms.values()]), robot_scores]).tolist()
+        reward, score, success, episodes, unstable, *means = values
         return {
-            **{name: read[name] for name in ("reward", "score", "success")},
-            **{name: int(read[name]) for name in ("episodes", "unstable")},
-            "scores": tuple(scores.tolist()),
-            # A term may have the name of a metric: push has a term "success".
-            "terms": dict(zip(terms, values[len(numbers) :], strict=False)),
+            "reward": reward,
+            "score": score,
+            "success": success,
+            "episodes": int(episodes),
+            "unstable": int(unstable),
+            "scores": tuple((np.array(means[len(terms) :]) / self._envs_of_robots).tolist()),
+            "terms": dict(zip(terms, means[: len(terms)], strict=True)),
         }
 
     @torch.no_grad()

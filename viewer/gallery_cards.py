@@ -43,7 +43,7 @@ class Gallery:
     coordinates: viser.GuiHtmlHandle | None = None
     """Parallel coordinates, if at least two facts vary."""
     notices: list[str] = field(default_factory=list)
-    """What the address asks for and cannot be done, until the user changes a control."""
+    """Messages about values of the address that were left out; cleared when a control changes."""
     empty: str = ""
     """HTML in place of the cards if no robot passes the filter."""
     grid: viser.GuiHtmlHandle | None = None

@@ -100,7 +100,7 @@ def add_grammar_tab(
     """
     gui, state = session.client.gui, session.address.state
     name, original = source_text(source, session.files)
-    names = tuple(dict.fromkeys((source, *grammar_names())))
+    names = _starts(source)
 
     def count(key: str) -> int:
         return parse_count(state.get(key, ""), 0)
@@ -230,6 +230,11 @@ def _make_robot(
     return individual, f"# {individual.derivation}", state
 
 
+def _starts(source: str) -> tuple[str, ...]:
+    """Return the grammars to start from: the present one, and all that have a name."""
+    return tuple(dict.fromkeys((source, *grammar_names())))
+
+
 def load_source(tab: GrammarTab, source: str) -> None:
     """Replace the text by that of another grammar, and show its typical robot.
 
@@ -238,7 +243,7 @@ def load_source(tab: GrammarTab, source: str) -> None:
     """
     tab.name, tab.original = source_text(source, tab.session.files)
     tab.source = source
-    tab.start.options = tuple(dict.fromkeys((source, *grammar_names())))
+    tab.start.options = _starts(source)
     set_value(tab.start, source)
     set_value(tab.text, tab.original)
     show_grammar(tab, "typical")

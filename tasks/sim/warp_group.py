@@ -172,7 +172,7 @@ class Group:
 def max_contacts(num_shapes: int) -> int:
     """Return how many contacts a world may have; with more it diverges.
 
-    Arms that push with the policy of a short training had up to 1.3 for each shape in MuJoCo.
+    Trained arms that push had up to 1.3 contacts for each shape in MuJoCo.
 
     Args:
         num_shapes: Number of shapes of the robot, its block, obstacles and ground together.
