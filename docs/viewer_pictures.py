@@ -72,7 +72,7 @@ def main() -> int:
         parser.error(f"unknown page: {', '.join(unknown)}; expected {', '.join(PAGES)}")
     args.out.mkdir(parents=True, exist_ok=True)
     out = args.out.resolve()
-    with served() as address, started_browser() as browser:
+    with served(ROBOTS) as address, started_browser() as browser:
         for name in names:
             for size in SIZES:
                 for theme in THEMES:
@@ -83,10 +83,10 @@ def main() -> int:
 
 
 @contextmanager
-def served() -> Iterator[str]:
+def served(robots: int) -> Iterator[str]:
     """Serve a temporary folder with a set of robots; return the address."""
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
-        words = ("sample", "arm3", "-n", str(ROBOTS), "--no-picture", "--out", "robots/arm3")
+        words = ("sample", "arm3", "-n", str(robots), "--no-picture", "--out", "robots/arm3")
         subprocess.run([sys.executable, "-m", "morphgen", *words], check=True)
         viewer = serve(port=0)
         yield f"http://127.0.0.1:{viewer.port}/"

@@ -42,6 +42,9 @@ _MARGIN = 0.92
 """Share of the picture that what the camera looks at may fill."""
 _MAX_ASPECT = 1.2
 """Largest aspect of the picture that is used: panels may still open beside it."""
+_STRIP_ASPECT, _PAGE_ASPECT = 0.3, 1.0
+"""Aspect below which the picture is still the strip beside the panel of a gallery that the browser
+is leaving, and the aspect that is used instead."""
 _BAR_COLOURS: tuple[Rgb, Rgb] = ((33, 37, 41), (248, 249, 250))
 _BAR_PARTS = 10
 
@@ -141,7 +144,8 @@ def look_at(
     direction: tuple[float, float, float] = CAMERA_DIRECTION,
 ) -> None:
     """Point a browser's camera at a box, from a direction and so near that it just is in view."""
-    aspect = min(client.camera.aspect, _MAX_ASPECT)
+    aspect = client.camera.aspect
+    aspect = min(aspect, _MAX_ASPECT) if aspect > _STRIP_ASPECT else _PAGE_ASPECT
     place_camera(client.camera, low, high, direction, aspect)
 
 
