@@ -30,6 +30,8 @@ class Gallery:
     """Roles that are shown in a column each; without any, all robots are in one grid."""
     scale: str = SCALES[1]
     """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
+    noun: str = "robot"
+    """What a row is called in the summary."""
     thumbnails: dict[str, str] = field(default_factory=dict)
     """Thumbnails drawn so far, by URI."""
     faults: dict[str, str] = field(default_factory=dict)

@@ -104,7 +104,8 @@ def show_page(gallery: Gallery, number: int) -> None:
     page = "" if gallery.page_number == 1 else str(gallery.page_number)
     session.update_address(gallery.title, n=page, **state)
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
-    gallery.summary = f"{len(rows)}{total} robots · page {gallery.page_number} of {count}"
+    noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
+    gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"
     gallery.empty = "" if rows else empty_text(gallery)
     load_bundle_pictures(gallery, gallery.page_rows)
     show_histograms(gallery)

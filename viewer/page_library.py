@@ -25,7 +25,7 @@ INTRODUCTION = (
 
 def show(session: Session) -> None:
     """Build the page."""
-    gallery = Gallery(session, "Parts", part_rows(session.files.library))
+    gallery = Gallery(session, "Parts", part_rows(session.files.library), noun="part")
     header = INTRODUCTION + section_links(library_sections(session.files))
     panel = open_panels(gallery, "", header)
     upload = session.client.gui.add_upload_button(

@@ -25,6 +25,11 @@ def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):
         assert hrefs == [f"?robot=robots/prims/prims-{i:06d}" for i in range(24)]
 
 
+def test_the_library_counts_parts(shared_viewer):
+    with PlainClient(shared_viewer.port, "?library=") as client:
+        client.shows(" parts · page 1 of")
+
+
 @pytest.mark.slow
 def test_search_filters_rows_and_updates_the_url(see, control):
     page = see("?gallery=robots/prims")
