@@ -143,10 +143,31 @@ def look_at(
     high: Array,
     direction: tuple[float, float, float] = CAMERA_DIRECTION,
 ) -> None:
-    """Point a browser's camera at a box, from a direction and so near that it just is in view."""
-    aspect = client.camera.aspect
-    aspect = min(aspect, _MAX_ASPECT) if aspect > _STRIP_ASPECT else _PAGE_ASPECT
-    place_camera(client.camera, low, high, direction, aspect)
+    """Point a browser's camera at a box, from a direction and so near that it just is in view.
+
+    If panels open or close beside the scene, the camera is placed again, unless the user has moved
+    it.
+    """
+    camera = client.camera
+    aspect, position = 0.0, camera.position
+
+    def place() -> None:
+        nonlocal aspect, position
+        aspect = _used_aspect(camera)
+        place_camera(camera, low, high, direction, aspect)
+        position = camera.position
+
+    def place_again(_: viser.CameraHandle) -> None:
+        if _used_aspect(camera) != aspect and np.allclose(camera.position, position, atol=1e-3):
+            place()
+
+    place()
+    camera.on_update(place_again)
+
+
+def _used_aspect(camera: viser.CameraHandle) -> float:
+    """Return the aspect for which the camera is placed."""
+    return min(camera.aspect, _MAX_ASPECT) if camera.aspect > _STRIP_ASPECT else _PAGE_ASPECT
 
 
 def place_camera(
