@@ -18,12 +18,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from viewer_pictures import WAIT, hide_notice, served
+from viewer_pictures import WAIT, hide_notice, served, started_browser
 
 from morphgen.tasks.renderer import Frame, write_video
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-from viewer_speed import started_browser
 
 SIZE = (1280, 800)
 """Size of the browser's window [pixels]."""

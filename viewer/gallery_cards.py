@@ -31,7 +31,7 @@ class Gallery:
     scale: str = SCALES[1]
     """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
     noun: str = "robot"
-    """What a row is called in the summary."""
+    """Singular word for what a row of ``rows`` shows: a robot, or a part of the library."""
     thumbnails: dict[str, str] = field(default_factory=dict)
     """Thumbnails drawn so far, by URI."""
     faults: dict[str, str] = field(default_factory=dict)
