@@ -120,6 +120,23 @@ def verify(
     return Verification(split_file.split, computed_id, tuple(differences), content)
 
 
+def require_unchanged(folder: Path, name: str) -> None:
+    """Require that the files of a split folder are those that ``SHA256SUMS`` lists.
+
+    Args:
+        folder: A split folder.
+        name: Name of the folder or archive, for the error.
+
+    Raises:
+        BenchmarkError: If a file differs, is missing or is not listed.
+    """
+    changed = list(_file_differences(folder))
+    if changed:
+        more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        first = f"{changed[0].where}: {changed[0].why}"
+        raise BenchmarkError(f"{name}: {first}{more}; get it again, or see morphgen split verify")
+
+
 def compare_robots(
     split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
 ) -> tuple[Difference, ...]:

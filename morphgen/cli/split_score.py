@@ -39,8 +39,9 @@ if TYPE_CHECKING:
     details="Every episode of every test robot must be there, with the goals, simulator and "
     "constants of the release. Scores and 95% bootstrap intervals are computed from the episodes, "
     "and ranked beside the reference scores of the release. A submission with a fault is refused "
-    "with one line, and nothing is ranked; so are submissions that disagree about the random "
-    "policy, if the release has no submission of it.",
+    "with one line, and nothing is ranked; so is a release whose files differ from its SHA256SUMS, "
+    "and so are submissions that disagree about the random policy, if the release has no "
+    "submission of it.",
     examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
 )
 def score(args: argparse.Namespace) -> None:
@@ -120,6 +121,7 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     )
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import SPLIT_FILE
+    from morphgen.benchmark.verify import require_unchanged
     from morphgen.rl.reference_scores import References, read_references
     from morphgen.tasks.eval_protocol import EvalProtocol, protocol_from
 
@@ -127,6 +129,7 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     if not path.is_dir() and not is_archive(path):
         return read_split(name), EvalProtocol(), References(), version("morphgen")
     folder = stack.enter_context(opened_folder(path))
+    require_unchanged(folder, name)
     split = read_split(folder / SPLIT_FILE)
     if not is_release(folder):
         return split, EvalProtocol(), References(), version("morphgen")

@@ -6,6 +6,7 @@ import argparse
 import sys
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.command import Option, number, option, repeated
@@ -106,6 +107,8 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
     try:
         split, folder = read_split_or_folder(words[0])
     except BenchmarkError as error:
+        if Path(words[0]).exists():
+            raise
         raise BenchmarkError(f"{error}; a robot needs {choices}") from error
     goal_folder = folder if folder is not None and has_goals(folder) else None
     if goal_folder is not None:

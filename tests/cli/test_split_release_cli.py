@@ -49,7 +49,7 @@ def test_release_prints_archive_and_hashes_and_passes_verify(run, small):
     assert [path.name for path in Path("releases").iterdir()] == ["mine-small-2.0.0.zip"]
 
 
-def test_a_tampered_archive_fails_verify(run, small):
+def test_a_tampered_archive_fails_verify_and_ranks_nothing(run, refused, small):
     run(*RELEASE, small)
     shutil.unpack_archive("releases/mine-small-1.0.0.zip", "unpacked")
     path = Path("unpacked/mine-small-1.0.0/robots.jsonl")
@@ -57,7 +57,13 @@ def test_a_tampered_archive_fails_verify(run, small):
     shutil.make_archive("changed", "zip", "unpacked", "mine-small-1.0.0")
     code, out, err = run("split", "verify", "changed.zip")
     assert (code, err) == (1, "")
-    assert "robots.jsonl is not what SHA256SUMS was written for" in out
+    why = "robots.jsonl is not what SHA256SUMS was written for"
+    assert why in out
+    Path("a.json").write_text(json.dumps(data()))
+    err = refused("split", "score", "a.json", "--split", "changed.zip")
+    assert f"changed.zip: robots.jsonl: file {why}" in err
+    err = refused("eval", "zero", "--split", "changed.zip")
+    assert err.endswith("unpack it, and name the folder\n")
 
 
 @pytest.mark.parametrize(
