@@ -103,7 +103,7 @@ def add_evolve_tab(
         "undo": lambda: _step(tab, -1),
         "redo": lambda: _step(tab, 1),
     }
-    session.on_change(make, lambda: _make_grammar(tab))
+    session.on_change(make, lambda: _next_generation(tab))
     session.on_change(buttons, lambda: actions[buttons.value]())
     session.on_change(steps, lambda: actions[steps.value]())
     session.on_change(seed, lambda: _breed(tab), "generation")
@@ -175,14 +175,13 @@ def _start(tab: EvolveTab, individual: Individual) -> None:
     _breed(tab)
 
 
-def _make_grammar(tab: EvolveTab) -> None:
-    """Make a grammar around the robot that is shown, and show its mutants."""
-    load_source(tab.grammar, tab.source)
-    _next_generation(tab)
-
-
 def _next_generation(tab: EvolveTab, partner: Choices | None = None) -> None:
-    """Show other mutants of the parent, or children of it and a partner."""
+    """Show other mutants of the parent, or children of it and a partner.
+
+    A robot that no grammar gave gets a grammar first.
+    """
+    if tab.parent is None and tab.source:
+        load_source(tab.grammar, tab.source)
     tab.partner = partner
     set_value(tab.seed, tab.seed.value + 1)
     _breed(tab)

@@ -27,7 +27,9 @@ from morphgen.viewer.split_form import show_saved
 from morphgen.viewer.splits import SAVED_REGIMES, SplitStudy, save_split, study_split
 
 PANEL_WIDTH = 520.0
-"""Width of the panel [pixels]."""
+"""Largest width of the controls [pixels]."""
+PANEL_SHARE = 0.36
+"""Largest share of the window that the controls take, so that names on the map are readable."""
 NUM_PLAYED = 4
 """Test robots of the link to a rollout."""
 
@@ -60,7 +62,8 @@ def show(session: Session) -> None:
     gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")
     gui = session.client.gui
     header = _description(split) + _rollout_link(name, split)
-    panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
+    width = min(PANEL_WIDTH, PANEL_SHARE * session.width)
+    panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         add_controls(gallery, panel)

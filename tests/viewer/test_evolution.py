@@ -103,6 +103,13 @@ def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_vie
         client.until(lambda: "evolve=1" in client.text)
 
 
+def test_mutants_of_a_robot_without_a_grammar_need_no_other_button(shared_viewer):
+    with PlainClient(shared_viewer.port, "?compose=base=gantry ee=cube") as client:
+        client.shows("This robot has no grammar whose choices could be drawn again")
+        client.change(client.control("ButtonGroup", "show"), "mutants")
+        client.shows('data-do="adopt" data-value="8"')
+
+
 def test_robots_of_parts_evolve_by_a_grammar_around_them(shared_viewer):
     with PlainClient(shared_viewer.port, "?compose=arm=ur5 ee=plane") as client:
         client.shows("This robot has no grammar whose choices could be drawn again")
