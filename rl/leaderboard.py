@@ -94,7 +94,7 @@ def score_submission(
                 groups.setdefault((side, outcomes.task), []).append(outcomes)
     sides = []
     for (side, task), robots in groups.items():
-        interval = stratified_mean_interval([_relative(each, random) for each in robots])
+        interval = stratified_mean_interval([relative_scores(each, random) for each in robots])
         success = float(np.mean([np.mean(each.success) for each in robots]))
         ends = finite_or_none((interval.low, interval.high))
         sides.append(SideScore(side, task, len(robots), interval.value, success, *ends))
@@ -114,7 +114,16 @@ def random_scores(submission: Submission) -> RandomScores:
     return {(each.side, each.robot): each.random_score for each in submission.robots}
 
 
-def _relative(outcomes: RobotOutcomes, random: RandomScores | None) -> Array:
+def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None) -> Array:
+    """Return the score of each episode, relative to the random policy where the task wants it.
+
+    Args:
+        outcomes: The episodes of a robot.
+        random: Scores of the random policy; None for those in ``outcomes``.
+
+    Raises:
+        BenchmarkError: If ``random`` lacks the robot.
+    """
     scores = np.array(outcomes.score)
     if not TASKS[outcomes.task].relative_to_random:
         return scores

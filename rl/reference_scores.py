@@ -15,17 +15,15 @@ import numpy as np
 
 from morphgen.benchmark.release_file import SCORES_FILE, SUBMISSIONS_DIR
 from morphgen.benchmark.split import SIDES, Split, split_id
-from morphgen.benchmark.split_file import parse_split
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError
+from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.records import Record, read_record
 from morphgen.grammar.library import Library
-from morphgen.rl.aliases import renamed
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.leaderboard import Row, SideScore, random_scores, score_submission
-from morphgen.rl.robot_source import RobotSource
-from morphgen.rl.scores import Score, finite_or_none, score_from_json
+from morphgen.rl.scores import Score, finite_or_none
 from morphgen.rl.study import SCORES
+from morphgen.rl.study_cells import require_all_robots, stored_cell, stored_split
 from morphgen.rl.submission import (
     Submission,
     is_submission,
@@ -39,9 +37,7 @@ from morphgen.rl.submission_checks import (
     require_same_random,
     require_series,
 )
-from morphgen.tasks.env_specs import GoalConfig, task_configs
 from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
-from morphgen.tasks.registry import TASKS
 
 FORMAT = 1
 RANDOM = "random"
@@ -66,7 +62,11 @@ class References:
     @property
     def random(self) -> Submission | None:
         """The submission of the random policy, if the release holds one."""
-        return next((each for each in self.submissions if _is_random(each)), None)
+        return self.baseline(RANDOM)
+
+    def baseline(self, name: str) -> Submission | None:
+        """Return the submission of a baseline, if the release holds one."""
+        return next((each for each in self.submissions if _is_baseline(each, name)), None)
 
     def all_rows(self) -> list[Row]:
         """Return the scores of the submissions, and the rows of other runs in studies."""
@@ -77,15 +77,15 @@ class References:
         return [*scored, *others]
 
 
-def reference_files(
+def collect_references(
     paths: Sequence[Path],
     split: Split,
     protocol: EvalProtocol,
     library: Library,
     *,
     jobs: int = 1,
-) -> dict[str, bytes]:
-    """Return the files of a release with reference scores, by path.
+) -> References:
+    """Read the reference scores of a new release from files, and check them.
 
     Args:
         paths: Submissions, files ``scores.json`` of studies, and folders of such files.
@@ -112,12 +112,12 @@ def reference_files(
                 continue
             expected = expected or expected_robots(split, protocol, library, jobs=jobs)
             check_submission(submission, str(file), split, protocol, expected, version("morphgen"))
-            if _is_random(submission) and len(submission.robots) < len(expected):
+            if _is_baseline(submission, RANDOM) and len(submission.robots) < len(expected):
                 raise BenchmarkError(
                     f"{file}: {RANDOM}: the train robots are missing, to whose episodes the scores "
                     "of other submissions are relative; evaluate it on both sides"
                 )
-            name = f"{SUBMISSIONS_DIR}/{_file_name(submission)}"
+            name = _path(submission)
             if name in submissions and submissions[name] != submission:
                 raise BenchmarkError(f"{file}: another submission of {submission.method} is there")
             submissions[name] = submission
@@ -125,16 +125,22 @@ def reference_files(
             raise BenchmarkError(f"{path}: no scores of split {split.name}, id {split_id(split)}")
     # Sorted, so that the order of the paths does not change the files.
     submissions = dict(sorted(submissions.items()))
-    files = {name: submission_text(each).encode() for name, each in submissions.items()}
     rows = sorted(_rows(cells), key=lambda row: (row.method, row.mode))
     references = References(tuple(rows), tuple(submissions.values()))
     if references.random is None:
         require_same_random([*submissions.items()])
+    return references
+
+
+def reference_files(references: References) -> dict[str, bytes]:
+    """Return the files of a release with reference scores, by path."""
+    submissions = references.submissions
     data = {
         "format": FORMAT,
-        "rows": msgspec.to_builtins(rows),
+        "rows": msgspec.to_builtins(references.rows),
         "of_submissions": msgspec.to_builtins(references.all_rows()[: len(submissions)]),
     }
+    files = {_path(each): submission_text(each).encode() for each in submissions}
     return files | {SCORES_FILE: (json.dumps(data, indent=2) + "\n").encode()}
 
 
@@ -193,46 +199,24 @@ def _cells(
     protocol: EvalProtocol,
 ) -> Iterator[_Cell]:
     """Yield the scores of a cell by mode; nothing if it is of another split."""
+    if stored_split(file, data) != split_id(split):
+        return
+    cell = stored_cell(file, data)
+    if cell.version is not None:
+        require_series(cell.version, version("morphgen"), str(file))
     try:
-        table = renamed("scores", data)
-        source = RobotSource(**renamed("source", table["source"]))
-        if not source.split or split_id(parse_split(source.split, file).split) != split_id(split):
-            return
-        rules = table["eval"]
-        constants = {name: values for name, values in rules.items() if name in TASKS}
-        goals = GoalConfig(source.goal_seed, task_configs(constants))
-        found = EvalProtocol(rules["sim"], rules["episodes"], rules["seed"], goals)
-        scores = {
-            mode: tuple(score_from_json(record) for record in records)
-            for mode, records in table["scores"].items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, MorphgenError) as error:
-        raise BenchmarkError(
-            f"{file}: neither a submission nor the scores of a study's cell: {error!r}"
-        ) from error
-    if "morphgen" in table:  # versions before 0.2.0 did not write it
-        require_series(str(table["morphgen"]), version("morphgen"), str(file))
+        found = EvalProtocol(cell.simulator, cell.episodes, cell.seed, cell.goals)
+    except BenchmarkError as error:
+        raise BenchmarkError(f"{file}: evaluation: {error}") from error
     require_rules(found.as_data(split), protocol.as_data(split), str(file))
-    for records in scores.values():
-        _require_all_robots(records, split, file)
+    for records in cell.scores.values():
+        require_all_robots(records, split, file)
     parent = file.parent.name
     is_seed = parent.removeprefix("seed").isdecimal() and parent.startswith("seed")
     seed = int(parent.removeprefix("seed")) if is_seed else None
     method = file.parent.parent.name if is_seed else parent
-    for mode, records in scores.items():
+    for mode, records in cell.scores.items():
         yield _Cell(file, method, "" if mode in BASELINES else mode, seed, records)
-
-
-def _require_all_robots(scores: Sequence[Score], split: Split, file: Path) -> None:
-    """Require a score of every robot of a side with a task: means of fewer do not compare."""
-    for side, task in {(score.side, score.task) for score in scores}:
-        found = sorted(s.robot for s in scores if (s.side, s.task) == (side, task))
-        expected = sorted(each.name for each in split.side(side) if each.task == task)
-        if found != expected:
-            raise BenchmarkError(
-                f"{file}: scores of {side} robots at {task}: {', '.join(found)}; expected one of "
-                f"each: {', '.join(expected) or 'none'}"
-            )
 
 
 def _rows(cells: Sequence[_Cell]) -> list[Row]:
@@ -268,17 +252,17 @@ def _rows(cells: Sequence[_Cell]) -> list[Row]:
     return rows
 
 
-def _is_random(submission: Submission) -> bool:
-    """Return whether a submission is of the baseline, not of a policy with its name."""
-    is_baseline = submission.mode == "" and submission.training_seed is None
-    return submission.method == RANDOM and is_baseline
+def _is_baseline(submission: Submission, name: str) -> bool:
+    """Return whether a submission is of a baseline, not of a policy with its name."""
+    is_trained = submission.mode != "" or submission.training_seed is not None
+    return submission.method == name and not is_trained
 
 
-def _file_name(submission: Submission) -> str:
-    """Return a file name of letters, digits and a few signs."""
+def _path(submission: Submission) -> str:
+    """Return the path in a release: a file name of letters, digits and a few signs."""
     words = [submission.method]
     if submission.mode == "stochastic":
         words.append(submission.mode)
     if submission.training_seed is not None:
         words.append(f"seed{submission.training_seed}")
-    return re.sub(r"[^A-Za-z0-9+_-]", "_", "-".join(words)) + ".json"
+    return f"{SUBMISSIONS_DIR}/{re.sub(r'[^A-Za-z0-9+_-]', '_', '-'.join(words))}.json"

@@ -81,7 +81,8 @@ class RunConfig:
     device: str = "cpu"
     """Device of networks and rollouts."""
     initial_checkpoint: str = ""
-    """Path of a checkpoint with the initial networks; empty for random initial weights."""
+    """Path of a checkpoint with the initial networks, relative to the folder of the run; empty for
+    random initial weights."""
     full_budget: bool = False
     """For an agent of single robots on a split: train each robot with all environments and
     timesteps (as in the paper), instead of an equal share of them."""

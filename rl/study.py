@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
-import time
-import traceback
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from morphgen import processes
-from morphgen.benchmark.split import Side
-from morphgen.errors import FormatError, MorphgenError, TaskError
+from morphgen.benchmark.split import Side, Split
+from morphgen.benchmark.split_file import parse_split
+from morphgen.errors import FormatError, TaskError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, write_atomic
-from morphgen.processes import ray_cluster, require_ray
+from morphgen.formats.files import write_atomic
+from morphgen.rl.agents import AGENTS
 from morphgen.rl.aliases import renamed
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
@@ -31,17 +26,23 @@ from morphgen.rl.evaluation import (
     evaluate_run,
     no_progress,
 )
-from morphgen.rl.inference import MODES, Mode
+from morphgen.rl.finetuning import finetuning_config
+from morphgen.rl.inference import MODES
 from morphgen.rl.robot_source import RobotSource, identity, members, other_side, tasks_of
-from morphgen.rl.runs import RunConfig, require_open, require_same_run
+from morphgen.rl.runs import CHECKPOINT, RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
+from morphgen.rl.submission import SubmissionRecorder, Training, write_submission
 from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
 from morphgen.tasks.env_specs import GoalConfig, task_configs
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.eval_protocol import EvalProtocol
+from morphgen.tasks.registry import SIMULATORS, TASKS, evaluation_simulator
 
 SCORES = "scores.json"
-POLL = 2.0
-"""Time between two checks of cells that another process works on [s]."""
+FINETUNED = "finetuned"
+"""Folder of fine-tuned policies in the folder of a run."""
+FINETUNING = {"num_steps": 64, "minibatches": 4, "bf16": False, "compile": False}
+"""Hyperparameters of fine-tuning: few environments need longer rollouts and fewer minibatches than
+the thousands of a training on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,17 @@ class Cell:
     """Configuration of the evaluation."""
     config: RunConfig | None = None
     """Config of the run; None for a baseline."""
+    finetune: tuple[int, ...] = ()
+    """Numbers of transitions that the policy is fine-tuned with on the test robots, each of them
+    from the end of the run."""
+
+    @property
+    def modes(self) -> dict[str, int]:
+        """Modes that the cell is evaluated in, with the transitions of fine-tuning before it."""
+        if self.config is None:
+            return {self.agent: 0}
+        tuned = {f"fine-tuned {steps:,}": steps for steps in self.finetune}
+        return dict.fromkeys(MODES, 0) | tuned
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -69,18 +81,6 @@ class Cell:
         return ("test",) if self.source.side == "test" else ("train", "test")
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Success or failure of a cell."""
-
-    cell: Cell
-    """The finished or failed cell."""
-    error: str = ""
-    """Error message; empty after success."""
-
-
-Work = Callable[[Sequence[Cell], ExecutionConfig], Iterator[Outcome]]
-"""Function that trains and evaluates cells, and yields their outcomes as they finish."""
 StartProgress = Callable[[str], Progress]
 """Called with the name of an evaluation when it starts; returns the callback for its progress."""
 
@@ -96,11 +96,30 @@ def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -
     ]
 
 
-def agent_cell(folder: Path, agent: str, config: RunConfig, eval_config: EvalConfig) -> Cell:
-    """Return the cell of a run."""
+def agent_cell(
+    folder: Path,
+    agent: str,
+    config: RunConfig,
+    eval_config: EvalConfig,
+    finetune: Sequence[int] = (),
+) -> Cell:
+    """Return the cell of a run.
+
+    Args:
+        folder: Output folder of the study.
+        agent: Label of the agent.
+        config: Config of the run.
+        eval_config: Configuration of the evaluation.
+        finetune: Numbers of transitions to fine-tune with on the test robots. Agents of single
+            robots and runs on test robots are not fine-tuned: they have no policy of train robots
+            that one could start from.
+    """
     source, eval_config = config.source, replace(eval_config, workers=1)
     run_folder = folder / source.name / agent / f"seed{config.seed}"
-    return Cell(run_folder, source.name, agent, config.seed, source, eval_config, config)
+    if AGENTS[config.policy.agent].per_robot or source.side == "test":
+        finetune = ()
+    tuned = tuple(finetune)
+    return Cell(run_folder, source.name, agent, config.seed, source, eval_config, config, tuned)
 
 
 def matched_budget(config: RunConfig) -> RunConfig:
@@ -181,27 +200,129 @@ def do_cell(
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
+    The scores and the episodes of a mode are written when it is evaluated.
+
     Raises:
         MorphgenError: As ``train`` and ``evaluate``.
     """
-    if read_scores(cell) is not None:
+    scores = read_scores(cell) or {}
+    if scores.keys() >= cell.modes.keys():
         return
-    eval_config = replace(cell.eval_config, workers=execution.workers)
-    if cell.config is None:
-        scores = {cell.agent: _baseline_scores(cell, eval_config, progress)}
-    else:
+
+    def learn(folder: Path, config: RunConfig) -> None:
         train(
-            cell.folder,
-            cell.config,
+            folder,
+            config,
             resume=True,
             execution=execution,
             show=show,
             prepare=prepare,
             hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
         )
-        scores = {
-            mode: _policy_scores(cell, cell.config, eval_config, mode, progress) for mode in MODES
-        }
+
+    if cell.config is not None:
+        learn(cell.folder, cell.config)
+    eval_config = replace(cell.eval_config, workers=execution.workers)
+    split = parse_split(cell.source.split, Path(cell.split)).split
+    for mode, steps in cell.modes.items():
+        if mode in scores:
+            continue
+        recorder = SubmissionRecorder(split)
+        if cell.config is None:
+            scores[mode] = _baseline_scores(cell, eval_config, progress, recorder)
+        elif not steps:
+            scores[mode] = _policy_scores(
+                cell.folder, cell, mode, cell.sides, eval_config, progress, recorder
+            )
+        else:
+            folder = cell.folder / FINETUNED / str(steps)
+            learn(folder, _finetuning(cell, cell.config, steps))
+            scores[mode] = _policy_scores(
+                folder, cell, mode, ("test",), eval_config, progress, recorder
+            )
+        _write_episodes(cell, mode, split, recorder)
+        _write_scores(cell, scores)
+
+
+def _finetuning(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
+    """Return the config of a cell's fine-tuning: on a CPU, in a simulator that CPUs run."""
+    tuned = finetuning_config(
+        config,
+        other_side(cell.source, "test"),
+        f"../../{CHECKPOINT}",
+        {"total_timesteps": steps, **FINETUNING},
+    )
+    return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
+
+
+def _policy_scores(
+    folder: Path,
+    cell: Cell,
+    mode: str,
+    sides: Sequence[Side],
+    eval_config: EvalConfig,
+    progress: StartProgress,
+    record: SubmissionRecorder,
+) -> list[Score]:
+    """Return the scores of a run on sides of its split."""
+    assert cell.config is not None
+    is_tuned = folder != cell.folder
+    scores = []
+    for side in sides:
+        show = progress(f"{cell.agent} {mode} on {side}")
+        scores += evaluate_run(
+            folder,
+            side,
+            eval_config,
+            next(each for each in MODES if is_tuned or each == mode),
+            device="cpu" if is_tuned else cell.config.device,
+            progress=show,
+            record=record,
+        )
+    return scores
+
+
+def _baseline_scores(
+    cell: Cell, eval_config: EvalConfig, progress: StartProgress, record: SubmissionRecorder
+) -> list[Score]:
+    """Return the scores of a baseline on the sides that have a robot with one of its tasks."""
+    scores = []
+    for side in cell.sides:
+        source = other_side(cell.source, side)
+        if BASELINES[cell.agent].suits(tasks_of(source)):
+            show = progress(f"{cell.agent} on {side}")
+            scores += evaluate_baseline(
+                cell.agent, source, eval_config, progress=show, record=record
+            )
+    return scores
+
+
+def _write_episodes(cell: Cell, mode: str, split: Split, recorder: SubmissionRecorder) -> None:
+    """Write the episodes of a mode as a submission.
+
+    A submission must be in a simulator that comes with morphgen; episodes in others are not kept.
+    """
+    config, evaluation = cell.config, cell.eval_config
+    if evaluation.sim not in SIMULATORS.builtin:
+        return
+    goals = GoalConfig(seed=cell.source.goal_seed, tasks=evaluation.tasks)
+    rules = EvalProtocol(evaluation.sim, evaluation.episodes, evaluation.seed, goals)
+    steps = cell.modes[mode]
+    training = None
+    if config is not None:
+        training = Training(config.sim, config.ppo.total_timesteps, steps)
+    submission = recorder.submission(
+        cell.agent,
+        mode if mode in MODES else MODES[0] if config is not None else "",
+        cell.seed,
+        rules.as_data(split),
+        training,
+    )
+    name = f"fine-tuned-{steps}" if steps else mode
+    write_submission(cell.folder / f"{name}.json", submission)
+
+
+def _write_scores(cell: Cell, scores: Mapping[str, Sequence[Score]]) -> None:
     data = {
         "morphgen": version("morphgen"),
         "eval": cell.eval_config.as_data(),
@@ -209,119 +330,6 @@ def do_cell(
         "scores": {mode: scores_to_json(records) for mode, records in scores.items()},
     }
     write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
-
-
-def run_cells(
-    cells: Sequence[Cell],
-    execution: ExecutionConfig,
-    show: Callable[[Subrun], ShowMetrics] | None = None,
-    progress: StartProgress = lambda name: no_progress,
-    prepare: processes.Progress = processes.no_progress,
-) -> Iterator[Outcome]:
-    """Train and evaluate cells one after another, and yield their outcomes.
-
-    Other processes may work on the same cells. Each cell is done by one process; this one waits at
-    the end for the cells of the others.
-    """
-    waiting = deque(cells)
-    skipped = 0
-    while waiting:
-        cell = waiting.popleft()
-        outcome = _do_locked(cell, execution, show, progress, prepare)
-        if outcome is not None:
-            skipped = 0
-            yield outcome
-            continue
-        waiting.append(cell)
-        skipped += 1
-        if skipped >= len(waiting):
-            time.sleep(POLL)
-            skipped = 0
-
-
-def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
-    """Return a function that does cells as tasks of a Ray cluster.
-
-    Its machines have morphgen installed and share the study's folder.
-
-    Args:
-        address: Address of the cluster; None for a local one.
-        gpus: GPUs per cell; a fraction if below 1.
-
-    Raises:
-        MissingDependencyError: If ray is not installed.
-    """
-    ray = require_ray()
-
-    def work(cells: Sequence[Cell], execution: ExecutionConfig) -> Iterator[Outcome]:
-        with ray_cluster(address):
-            remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
-            running = {
-                remote.remote(replace(cell, folder=cell.folder.resolve()), execution): cell
-                for cell in cells
-            }
-            while running:
-                (done, *_), _ = ray.wait(list(running))
-                cell = running.pop(done)
-                try:
-                    yield Outcome(cell, ray.get(done))
-                except ray.exceptions.RayError as error:
-                    yield Outcome(cell, f"its Ray task failed: {type(error).__name__}: {error}")
-
-    return work
-
-
-def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
-    (outcome,) = run_cells([cell], execution)
-    return outcome.error
-
-
-def _do_locked(
-    cell: Cell,
-    execution: ExecutionConfig,
-    show: Callable[[Subrun], ShowMetrics] | None,
-    progress: StartProgress,
-    prepare: processes.Progress,
-) -> Outcome | None:
-    """Train and evaluate a cell and return its outcome; None if another process works on it."""
-    try:
-        cell.folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(cell.folder / LOCK, timeout=0):
-            do_cell(cell, execution, show, progress, prepare)
-    except Timeout:
-        return None
-    except MorphgenError as error:
-        return Outcome(cell, str(error))
-    except OSError as error:
-        return Outcome(cell, f"{error.filename or cell.folder}: {error.strerror}")
-    except Exception as error:  # such as a GPU out of memory: the other cells go on
-        traceback.print_exc(file=sys.stderr)
-        return Outcome(cell, f"{type(error).__name__}: {error}")
-    return Outcome(cell)
-
-
-def _policy_scores(
-    cell: Cell, config: RunConfig, eval_config: EvalConfig, mode: Mode, progress: StartProgress
-) -> list[Score]:
-    """Return the scores of a run on the sides that its cell is evaluated on."""
-    scores = []
-    for side in cell.sides:
-        show = progress(f"{cell.agent} {mode} on {side}")
-        scores += evaluate_run(
-            cell.folder, side, eval_config, mode, device=config.device, progress=show
-        )
-    return scores
-
-
-def _baseline_scores(cell: Cell, eval_config: EvalConfig, progress: StartProgress) -> list[Score]:
-    """Return the scores of a baseline on the sides that have a robot with one of its tasks."""
-    scores = []
-    for side in cell.sides:
-        source = other_side(cell.source, side)
-        if BASELINES[cell.agent].suits(tasks_of(source)):
-            show = progress(f"{cell.agent} on {side}")
-            scores += evaluate_baseline(cell.agent, source, eval_config, progress=show)
-    return scores
 
 
 def as_record(cell: Cell) -> dict[str, Any]:

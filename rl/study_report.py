@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -95,23 +96,23 @@ def rows(results: Results) -> list[Row]:
     table: list[Row] = []
     for split, agent in dict.fromkeys((cell.split, cell.agent) for cell in results):
         cells = [cell for cell in results if (cell.split, cell.agent) == (split, agent)]
-        done = {cell: results[cell] or {} for cell in cells if results[cell] is not None}
-        seeds = tuple(cell.seed for cell in done)
-        missing = tuple(cell.seed for cell in cells if cell not in done)
         source, sides = cells[0].source, cells[0].sides
-        if not done:
-            task = next(iter(tasks_of(source)), "")
-            table.append(Row(split, task, agent, "", (), missing, {}, sides))
-        by_mode: dict[str, list[Score]] = {}
-        for cell_scores in done.values():
-            for mode, mode_scores in cell_scores.items():
-                by_mode.setdefault(mode, []).extend(mode_scores)
-        tasks = dict.fromkeys(score.task for scores in by_mode.values() for score in scores)
-        for task in tasks:
-            for mode, scores in by_mode.items():
-                groups = _groups(done, task, mode)
-                unstable = sum(score.unstable for score in scores if score.task == task)
-                table.append(Row(split, task, agent, mode, seeds, missing, groups, sides, unstable))
+        scored = {cell: results[cell] or {} for cell in cells}
+        modes = dict.fromkeys(mode for own in scored.values() for mode in own)
+        if not modes:
+            task, seeds = next(iter(tasks_of(source)), ""), tuple(cell.seed for cell in cells)
+            table.append(Row(split, task, agent, "", (), seeds, {}, sides))
+        tasks = dict.fromkeys(
+            score.task for own in scored.values() for scores in own.values() for score in scores
+        )
+        for task, mode in itertools.product(tasks, modes):
+            done = {cell: own[mode] for cell, own in scored.items() if mode in own}
+            seeds = tuple(cell.seed for cell in done)
+            missing = tuple(cell.seed for cell in cells if cell not in done)
+            own_scores = [s for scores in done.values() for s in scores if s.task == task]
+            unstable = sum(score.unstable for score in own_scores)
+            groups = _groups(done, task)
+            table.append(Row(split, task, agent, mode, seeds, missing, groups, sides, unstable))
     return table
 
 
@@ -204,16 +205,14 @@ def _curve(cell: Cell) -> Curve | None:
     return Curve(steps, scores, all(length == run.config.num_updates for run in runs))
 
 
-def _groups(
-    done: Mapping[Cell, Mapping[str, Sequence[Score]]], task: str, mode: str
-) -> dict[Side, Group]:
-    """Return averages by side over the cells (seeds) of one agent, for one task and mode."""
+def _groups(done: Mapping[Cell, Sequence[Score]], task: str) -> dict[Side, Group]:
+    """Return averages by side over the cells (seeds) of one agent in one mode, for one task."""
     cell = next(iter(done))
     per_robot = cell.config is not None and AGENTS[cell.config.policy.agent].per_robot
     groups: dict[Side, Group] = {}
     for side in SIDES:
         table = [
-            [score for score in scores[mode] if (score.side, score.task) == (side, task)]
+            [score for score in scores if (score.side, score.task) == (side, task)]
             for scores in done.values()
         ]
         if not table[0]:

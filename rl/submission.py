@@ -62,6 +62,15 @@ class RobotOutcomes(Record, frozen=True):
     random_success: tuple[bool, ...]
 
 
+class Training(Record, frozen=True):
+    """How a policy was trained."""
+
+    simulator: Name
+    transitions: Annotated[int, Meta(ge=0, le=10**15)]
+    finetuned: Count = 0
+    """Transitions of fine-tuning on the test robots, after ``transitions`` on the train robots."""
+
+
 class Submission(Record, frozen=True):
     """The content of a submission."""
 
@@ -79,6 +88,8 @@ class Submission(Record, frozen=True):
     evaluation: dict[str, Any]
     """Rules of the evaluation, see ``morphgen.tasks.eval_protocol``."""
     robots: tuple[RobotOutcomes, ...]
+    training: Training | None = None
+    """How the policy was trained, if it is known."""
 
     def __post_init__(self) -> None:
         if self.format != FORMAT:
@@ -123,7 +134,12 @@ class SubmissionRecorder:
         )
 
     def submission(
-        self, method: str, mode: str, training_seed: int | None, evaluation: dict[str, Any]
+        self,
+        method: str,
+        mode: str,
+        training_seed: int | None,
+        evaluation: dict[str, Any],
+        training: Training | None = None,
     ) -> Submission:
         """Return the submission of the recorded episodes; for the arguments see ``Submission``.
 
@@ -139,6 +155,7 @@ class SubmissionRecorder:
             "morphgen": version("morphgen"),
             "split": {"name": self._split.name, "id": split_id(self._split)},
             "evaluation": evaluation,
+            "training": msgspec.to_builtins(training),
             "robots": msgspec.to_builtins(self.robots),
         }
         return read_record(data, Submission, "submission", BenchmarkError)
@@ -148,6 +165,8 @@ def submission_text(submission: Submission) -> str:
     """Return the text of a submission: a line per list of a robot."""
     data = msgspec.to_builtins(submission)
     robots = data.pop("robots")
+    if submission.training is None:
+        del data["training"]
     head = json.dumps(data, indent=2).removesuffix("\n}")
     blocks = [
         ",\n".join(f"      {json.dumps(key)}: {json.dumps(value)}" for key, value in robot.items())

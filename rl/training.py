@@ -271,7 +271,8 @@ def _learner(
         if state:
             resume_learner(learner, state)
         elif config.initial_checkpoint:
-            load_networks(learner, read_checkpoint(Path(config.initial_checkpoint))[1])
+            initial = (part.folder / config.initial_checkpoint).resolve()
+            load_networks(learner, read_checkpoint(initial)[1])
         yield learner
 
 

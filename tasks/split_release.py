@@ -17,10 +17,13 @@ import msgspec
 
 from morphgen.benchmark.audit import Audit, audit, audit_survey
 from morphgen.benchmark.croissant import croissant_text
+from morphgen.benchmark.difficulty import BaselineResults, survey_difficulty
+from morphgen.benchmark.difficulty_table import difficulty_csv
 from morphgen.benchmark.licences import licence_ids, licenced_parts, require_allowed
 from morphgen.benchmark.private_test import draw_private_test
 from morphgen.benchmark.release_file import (
     CROISSANT_FILE,
+    DIFFICULTY_FILE,
     LICENCES_FILE,
     LICENCES_TEXT,
     RELEASE_FILE,
@@ -93,6 +96,7 @@ def release_split(
     request: ReleaseRequest,
     *,
     extra: Mapping[str, bytes] | None = None,
+    results: BaselineResults | None = None,
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> ReleaseReport:
@@ -104,6 +108,7 @@ def release_split(
         library: The library of parts.
         request: Version, licences and contents.
         extra: Further files by path, such as reference scores.
+        results: Results of baselines, for the columns of the difficulty.
         jobs: Number of processes.
         progress: Receives the number of robots that are finished, and of all, in each stage.
 
@@ -115,9 +120,10 @@ def release_split(
     parts = licenced_parts(split, library)
     require_allowed(split, parts, request.allowed_licences)
     release = _release(split, request, {})
-    survey = survey_split(split, library, jobs=jobs, progress=progress)
+    survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
     audited = audit_survey(survey, library)
     require_passed(audited)
+    rows = survey_difficulty(survey, results)
     private = None
     if request.private_robots:
         drawn, private = draw_private_test(
@@ -148,10 +154,11 @@ def release_split(
             RELEASE_FILE: release_text(release),
             LICENCES_FILE: licences_json(parts),
             LICENCES_TEXT: licences_text(parts),
+            DIFFICULTY_FILE: difficulty_csv(rows, tuple(results or ())),
         }
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
         known = [*read_sums(report.folder / SUMS_FILE), *files]
-        files[README_FILE] = card_text(split, release, parts, known).encode()
+        files[README_FILE] = card_text(split, release, parts, known, rows).encode()
         _add_files(report.folder, files)
         sums = read_sums(report.folder / SUMS_FILE)
         croissant = croissant_text(split, release, licence_ids(parts), sums)

@@ -11,7 +11,7 @@ import numpy as np
 from morphgen.benchmark.extrapolation import parse_bound
 from morphgen.benchmark.hold_out_audit import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.similarity import MEASURES
+from morphgen.benchmark.similarity import MEASURES, most_alike
 from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError
@@ -253,12 +253,11 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
 def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
     train, test = survey.split.train, survey.split.test
     for j, member in enumerate(test):
-        for name, measure in MEASURES.items():
+        for name in MEASURES:
             values = survey.by_measure(name)[:, j]
-            if np.isnan(values).all():
-                continue
-            best = np.nanargmax(values) if measure.larger_is_more_alike else np.nanargmin(values)
-            yield Neighbour(member.name, name, train[best].name, float(values[best]))
+            best = most_alike(values, name)
+            if best is not None:
+                yield Neighbour(member.name, name, train[best].name, float(values[best]))
 
 
 def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from morphgen.benchmark.licences import find_licence
 from morphgen.benchmark.release_file import (
+    DIFFICULTY_FILE,
     LICENCES_FILE,
     RELEASE_FILE,
     SCORES_FILE,
@@ -47,6 +48,7 @@ _FILES = {
     ROBOTS_FILE: ("application/jsonlines", "A line per robot, train robots first"),
     TOKENS_FILE: ("application/x-npz", "Tokens (n, max_links, 48) of the robots, with a mask"),
     RELEASE_FILE: ("application/json", "Version, evaluation and difficulty of the release"),
+    DIFFICULTY_FILE: ("text/csv", "Size, nearest train robots and scores of every robot"),
     LICENCES_FILE: ("application/json", "Every part with its licence, source and robots"),
     SCORES_FILE: ("application/json", "Reference scores"),
 }

@@ -4,6 +4,7 @@ A release is a split folder (see ``split_folder``) with further files:
 
 release.json       version of the release, evaluation, difficulty, commitment of a private test side
 licences.json      every part with its licence and robots; LICENCES.md is the same for readers
+difficulty.csv     size, nearest train robots and reference scores of every robot, from version 0.3
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
 scores.json        reference scores, if there are any
 submissions/       the reference submissions that the scores were computed from
@@ -34,6 +35,7 @@ from morphgen.formats.zip_files import ZipLimits, unpack_zip
 
 RELEASE_FILE = "release.json"
 LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
+DIFFICULTY_FILE = "difficulty.csv"
 CROISSANT_FILE = "croissant.json"
 SCORES_FILE = "scores.json"
 SUBMISSIONS_DIR = "submissions"

@@ -6,12 +6,14 @@ import json
 from collections.abc import Iterable, Sequence
 
 import yaml
-from tabulate import tabulate
 
 from morphgen.benchmark.croissant import citation
+from morphgen.benchmark.difficulty import RobotDifficulty
+from morphgen.benchmark.difficulty_table import difficulty_table
 from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids, restricted
 from morphgen.benchmark.release_file import (
     CROISSANT_FILE,
+    DIFFICULTY_FILE,
     LICENCES_FILE,
     LICENCES_TEXT,
     RELEASE_FILE,
@@ -28,6 +30,8 @@ from morphgen.benchmark.split_folder import (
     TOKENS_FILE,
 )
 
+MAX_ROWS = 20
+"""Largest number of test robots in the table of the card."""
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 """Size categories of Hugging Face by their upper bound."""
 
@@ -75,7 +79,11 @@ Without morphgen: `datasets.load_dataset("json", data_files="{robots}")`,
 
 
 def card_text(
-    split: Split, release: Release, parts: Sequence[LicencedPart], names: Iterable[str]
+    split: Split,
+    release: Release,
+    parts: Sequence[LicencedPart],
+    names: Iterable[str],
+    rows: Sequence[RobotDifficulty],
 ) -> str:
     """Return the dataset card: Markdown with the front matter that Hugging Face reads.
 
@@ -84,6 +92,7 @@ def card_text(
         release: The release.
         parts: The parts of its robots.
         names: Paths of the release's files.
+        rows: Difficulty of every robot.
     """
     text = _CARD.format(
         name=release.name,
@@ -102,7 +111,7 @@ def card_text(
         tokens=TOKENS_FILE,
         sums=SUMS_FILE,
         evaluation=_evaluation(release),
-        difficulty=_difficulty(release),
+        difficulty=_difficulty(release, rows),
         private=_private(release),
         licences=_licence_summary(parts),
         citation=citation(split, release),
@@ -168,6 +177,7 @@ def _file_table(names: Iterable[str]) -> str:
         ROBOTS_DIR: "a folder per robot with its URDF",
         "goals": "goals and starts of every robot",
         RELEASE_FILE: "version, evaluation and difficulty",
+        DIFFICULTY_FILE: "a row per robot: size, nearest train robots, scores of baselines",
         SCORES_FILE: "reference scores",
         SUBMISSIONS_DIR: "submissions that reference scores were computed from",
         f"{LICENCES_TEXT}, {LICENCES_FILE}": "every part with its licence, source and robots",
@@ -192,20 +202,18 @@ def _evaluation(release: Release) -> str:
     )
 
 
-def _difficulty(release: Release) -> str:
-    cosine = release.difficulty.get("cosine")
-    if not cosine:
-        return "Not measured."
-    rows = [
-        (test, *(f"{each['train']} {each['value']:.3f}" for each in measures.values()))
-        for test, measures in release.difficulty["nearest"].items()
-    ]
-    measures = next(iter(release.difficulty["nearest"].values()))
-    headers = ("test robot", *(f"nearest by {name}" for name in measures))
+def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
+    cosine = release.difficulty["cosine"]
     low, high = cosine["min"], cosine["max"]
+    test = [row for row in rows if row.side == "test"]
+    baselines = tuple(dict.fromkeys(name for row in rows for name in row.baselines))
+    scores = "; baselines: score, success rate" if baselines else ""
+    more = f" The table has {MAX_ROWS} of {len(test)} test robots." if test[MAX_ROWS:] else ""
     return (
         f"Cosine similarity of test and train robots: {cosine['mean']:.2f} (from {low:.2f} to "
-        f"{high:.2f}).\n\n{tabulate(rows, headers, tablefmt='github')}"
+        f"{high:.2f}). `{DIFFICULTY_FILE}` has a row per robot, train robots too.{more} Nearest: "
+        f"the most similar train robot and its value by each measure{scores}.\n\n"
+        f"{difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
     )
 
 

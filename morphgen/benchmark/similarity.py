@@ -149,6 +149,23 @@ def to_distances(values: Array, measure: str) -> Array:
     return np.asarray(np.maximum(distances, 0.0))
 
 
+def most_alike(values: Array, measure: str) -> int | None:
+    """Return the index of the most similar robot, the first of several equal ones.
+
+    Args:
+        values: A measure of the similarity to n robots, NaN where it is not known, shape (n,).
+        measure: A name in ``MEASURES``.
+
+    Returns:
+        The index; None if no value is known.
+
+    Raises:
+        BenchmarkError: If the measure is unknown.
+    """
+    best = np.nanargmax if get_measure(measure).larger_is_more_alike else np.nanargmin
+    return None if np.isnan(values).all() else int(best(values))
+
+
 def get_measure(name: str) -> Measure:
     """Return a measure by name.
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
-from morphgen.benchmark.split import Member, Split
-from morphgen.benchmark.survey import Fault, RobotStats, SplitSurvey, SurveyedRobot, survey_split
+from morphgen.benchmark.split import SIDES, Side, Split
+from morphgen.benchmark.survey import RobotStats, SplitSurvey, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress
@@ -58,10 +58,8 @@ def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
     Raises:
         BenchmarkError: If a robot could not be composed, or train or test is empty.
     """
-    split = survey.split
     return {
-        "train": _side(split, split.train, survey.train),
-        "test": _side(split, split.test, survey.test),
+        **{side: _side(survey, side) for side in SIDES},
         COSINE: mean_and_range(survey.by_measure(COSINE).ravel().tolist()),
     }
 
@@ -72,16 +70,10 @@ def mean_and_range(values: Sequence[float]) -> dict[str, float]:
     return {key: round(value, DIGITS) for key, value in numbers.items()}
 
 
-def _side(
-    split: Split, members: Sequence[Member], surveyed: Iterable[SurveyedRobot | Fault]
-) -> dict[str, object]:
-    if not members:
-        raise BenchmarkError(f"split {split.name!r} has a side without robots")
-    robots = []
-    for member, robot in zip(members, surveyed, strict=True):
-        if isinstance(robot, Fault):
-            raise BenchmarkError(f"split {split.name!r}: robot {member.name!r}: {robot.why}")
-        robots.append(robot)
+def _side(survey: SplitSurvey, side: Side) -> dict[str, object]:
+    robots = survey.composed(side)
+    if not robots:
+        raise BenchmarkError(f"split {survey.split.name!r} has a side without robots")
     stats = [robot.stats for robot in robots]
     return {
         "robots": len(robots),

@@ -14,8 +14,8 @@ import numpy as np
 
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import MEASURES, Features, features
-from morphgen.benchmark.split import Member, Split
-from morphgen.errors import MorphgenError, nearest
+from morphgen.benchmark.split import Member, Side, Split
+from morphgen.errors import BenchmarkError, MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.rounding import round_number
 from morphgen.grammar.compose import compose
@@ -90,10 +90,28 @@ class SplitSurvey:
     similarity: Array
     """Similarity of train and test robots by each of ``MEASURES``, shape (n_train, n_test,
     n_measures); NaN where one of the two robots has a fault."""
+    train_similarity: Array | None = None
+    """Similarity of train robots to each other by each of ``MEASURES``, shape (n_train, n_train,
+    n_measures); NaN where one of the two robots has a fault or both have the same derivation. None
+    if it was not asked for."""
 
     def by_measure(self, measure: str) -> Array:
         """Return the similarity by one measure, shape (n_train, n_test)."""
         return self.similarity[:, :, tuple(MEASURES).index(measure)]
+
+    def composed(self, side: Side) -> tuple[SurveyedRobot, ...]:
+        """Return the robots of a side.
+
+        Raises:
+            BenchmarkError: If one cannot be composed or measured; the message says why.
+        """
+        split, robots = self.split, []
+        surveyed = self.train if side == "train" else self.test
+        for member, robot in zip(split.side(side), surveyed, strict=True):
+            if isinstance(robot, Fault):
+                raise BenchmarkError(f"split {split.name!r}: robot {member.name!r}: {robot.why}")
+            robots.append(robot)
+        return tuple(robots)
 
 
 def robot_stats(robot: Robot) -> RobotStats:
@@ -130,21 +148,29 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
 
 
 def survey_split(
-    split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
+    split: Split,
+    library: Library,
+    *,
+    within_train: bool = False,
+    jobs: int = 1,
+    progress: Progress = no_progress,
 ) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once in train and test each.
 
     Args:
         split: The split.
         library: Library of its parts.
+        within_train: Compare the train robots with each other, too.
         jobs: Number of processes.
-        progress: Called repeatedly with the numbers of finished and of all robots.
+        progress: Called repeatedly with the numbers of finished and of all robots; train robots
+            count twice with ``within_train``.
 
     Raises:
         BenchmarkError: If ``jobs`` is below 1, or the split's provenance is malformed.
     """
     train_members, test_members = _firsts(split.train), _firsts(split.test)
-    total = len(train_members) + len(test_members)
+    done_first = len(train_members) + len(test_members)
+    total = done_first + within_train * len(train_members)
     measurement = _Measurement(library.folders, split.max_links)
     test_robots = list(
         parallel_map(measurement, test_members, jobs, lambda done, _: progress(done, total))
@@ -152,26 +178,31 @@ def survey_split(
     compare = _Comparison(
         measurement,
         tuple(None if isinstance(robot, Fault) else robot.features for robot in test_robots),
+        keep_features=within_train,
     )
     train_robots = list(
         parallel_map(
             compare, train_members, jobs, lambda done, _: progress(len(test_members) + done, total)
         )
     )
-    rows, columns = (
-        _first_indices(split.train, train_members),
-        _first_indices(split.test, test_members),
-    )
+    rows = _first_indices(split.train, train_members)
+    columns = _first_indices(split.test, test_members)
     shape = (len(train_members), len(test_members), len(MEASURES))
-    similarity = np.array([values for _, values in train_robots]).reshape(shape)
+    similarity = np.array([robot.similarity for robot in train_robots]).reshape(shape)
+    pairs = None
+    if within_train:
+        compared = tuple(robot.features for robot in train_robots)
+        pairs = _compare_pairs(compared, jobs, lambda done, _: progress(done_first + done, total))
+        pairs = pairs[rows][:, rows]
     return SplitSurvey(
         split,
-        tuple(train_robots[row][0] for row in rows),
+        tuple(train_robots[row].surveyed for row in rows),
         tuple(
             robot if isinstance(robot, Fault) else robot.surveyed
             for robot in (test_robots[column] for column in columns)
         ),
         similarity[rows][:, columns],
+        pairs,
     )
 
 
@@ -211,20 +242,55 @@ class _Measurement:
 
 
 @dataclass(frozen=True, eq=False)
+class _ComparedRobot:
+    """A train robot and its similarity to all test robots."""
+
+    surveyed: SurveyedRobot | Fault
+    features: Features | None
+    """None if it has a fault or the features are not needed, because they are large."""
+    similarity: Array
+    """Similarity by each of ``MEASURES``, shape (n_test, n_measures)."""
+
+
+@dataclass(frozen=True, eq=False)
 class _Comparison:
     """Picklable function that measures a train robot and compares it with all test robots."""
 
     measurement: _Measurement
     tests: tuple[Features | None, ...]
+    keep_features: bool
 
-    def __call__(self, member: Member) -> tuple[SurveyedRobot | Fault, Array]:
+    def __call__(self, member: Member) -> _ComparedRobot:
         measured = self.measurement(member)
-        values = np.full((len(self.tests), len(MEASURES)), np.nan)
         if isinstance(measured, Fault):
-            return measured, values
-        for row, test in zip(values, self.tests, strict=True):
-            if test is not None:
-                row[:] = [
-                    measure.function(test, measured.features) for measure in MEASURES.values()
-                ]
-        return measured.surveyed, values
+            return _ComparedRobot(measured, None, _similarity(None, self.tests))
+        kept = measured.features if self.keep_features else None
+        return _ComparedRobot(measured.surveyed, kept, _similarity(measured.features, self.tests))
+
+
+@dataclass(frozen=True, eq=False)
+class _PairComparison:
+    """Picklable function that compares a robot with all robots before it."""
+
+    robots: tuple[Features | None, ...]
+
+    def __call__(self, index: int) -> Array:
+        return _similarity(self.robots[index], self.robots[:index])
+
+
+def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Array:
+    """Return the similarity of a robot to n others, shape (n, n_measures); NaN without features."""
+    values = np.full((len(others), len(MEASURES)), np.nan)
+    for row, other in zip(values, others, strict=True):
+        if robot is not None and other is not None:
+            row[:] = [measure.function(other, robot) for measure in MEASURES.values()]
+    return values
+
+
+def _compare_pairs(robots: tuple[Features | None, ...], jobs: int, progress: Progress) -> Array:
+    """Return the similarity of n robots to each other, shape (n, n, n_measures); NaN to itself."""
+    values = np.full((len(robots), len(robots), len(MEASURES)), np.nan)
+    rows = parallel_map(_PairComparison(robots), range(len(robots)), jobs, progress)
+    for i, row in enumerate(rows):
+        values[i, :i] = values[:i, i] = row
+    return values

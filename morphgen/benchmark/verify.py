@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.licences import licenced_parts
-from morphgen.benchmark.release_file import (
-    LICENCES_FILE,
-    RELEASE_FILE,
-    is_archive,
-    is_release,
-    opened_folder,
-    read_release,
-)
+from morphgen.benchmark.release_checks import release_differences
+from morphgen.benchmark.release_file import is_archive, is_release, opened_folder
 from morphgen.benchmark.split import Member, Split, compose_member, sided_members, split_id
 from morphgen.benchmark.split_file import find_split, read_split_file
 from morphgen.benchmark.split_folder import (
@@ -44,7 +37,6 @@ from morphgen.benchmark.split_folder_files import (
 from morphgen.benchmark.split_folder_robots import differences, hashes, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.formats.data_files import read_json
 from morphgen.formats.files import file_sha256
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
@@ -85,7 +77,7 @@ def verify(
 
     The id of the split and the hash of each robot are tested. In a split folder every file is
     compared with ``SHA256SUMS`` and with the robot that its derivation gives, too; in a release
-    also its description and its licences.
+    also its description, its licences and its difficulty.
 
     Args:
         name_or_path: Name or file of a split, a split folder, or the archive of a release.
@@ -113,7 +105,10 @@ def verify(
     if is_built:
         differences += _folder_differences(folder, split_file.split, library, jobs, progress)
         if is_release(folder):
-            differences += _release_differences(folder, split_file.split, library)
+            found = release_differences(
+                folder, split_file.split, library, jobs=jobs, progress=progress
+            )
+            differences += itertools.starmap(Difference, found)
     else:
         differences += compare_robots(split_file.split, library, jobs=jobs, progress=progress)
     content = file_sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
@@ -246,31 +241,6 @@ def _file_differences(folder: Path) -> Iterator[Difference]:
         robot, _, file = rest.partition("/")
         where, path = (robot, file) if parent == ROBOTS_DIR and file else (name, name)
         yield Difference(where, f"file {path} {why}")
-
-
-def _release_differences(folder: Path, split: Split, library: Library) -> Iterator[Difference]:
-    """Yield what the description and the licences of a release state otherwise than the split."""
-    try:
-        release = read_release(folder)
-        if (release.name, release.id) != (split.name, split_id(split)):
-            why = f"it is of split {release.name}, id {release.id}, not of {SPLIT_FILE}"
-            yield Difference(RELEASE_FILE, why)
-        expected = [part.as_dict() for part in licenced_parts(split, library)]
-        if _without_sources(read_json(folder / LICENCES_FILE)) != _without_sources(expected):
-            yield Difference(LICENCES_FILE, "its licences are not those of the parts")
-    except MorphgenError as error:
-        yield Difference(RELEASE_FILE, str(error))
-    except OSError as error:
-        yield Difference(LICENCES_FILE, f"cannot be read: {error.strerror}")
-
-
-def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
-    """Return the content of ``licences.json`` without texts that a new version may word anew."""
-    entries = parts if isinstance(parts, list) else [parts]
-    return [
-        {key: entry[key] for key in entry if key != "source"} if isinstance(entry, dict) else entry
-        for entry in entries
-    ]
 
 
 def _record_differences(

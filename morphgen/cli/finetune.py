@@ -74,6 +74,7 @@ def finetune(args: argparse.Namespace) -> None:
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
     from morphgen.rl.agent_spec import parse_constants
     from morphgen.rl.config import PPOConfig
+    from morphgen.rl.finetuning import finetuning_config
     from morphgen.rl.robot_source import other_side, tasks_of
     from morphgen.rl.runs import read_checkpoint
 
@@ -89,14 +90,10 @@ def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
     changes |= {name: value for name, value in switches.items() if value is not None}
     changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
     return replace(
-        initial,
-        source=source,
-        ppo=replace(initial.ppo, **changes),
+        finetuning_config(initial, source, str(file.resolve()), changes),
         seed=args.seed,
         sim=args.sim or initial.sim,
         num_envs=args.envs,
         device=args.device,
-        initial_checkpoint=str(file.resolve()),
-        slice_updates=0,
         tasks=opt.with_goal(initial.tasks, args.goal, tasks_of(source)),
     )

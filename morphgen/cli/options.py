@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
-from morphgen.errors import FormatError, MorphgenError, TaskError
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import SIMULATORS, TASKS
 
@@ -189,6 +189,21 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
     if sound:
         return load_sound_grammar(name, library)
     return load_grammar(find_grammar(name, library.folders), library.folders)
+
+
+def require_writable(name: str, path: Path | None) -> None:
+    """Require, before long work, that the file of an option can be written.
+
+    Args:
+        name: Name of the option.
+        path: The file; None if the option is not given.
+
+    Raises:
+        BenchmarkError: If it is a folder, or its folder does not exist.
+    """
+    if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        why = "it is a folder" if path.is_dir() else f"there is no folder {path.parent}"
+        raise BenchmarkError(f"{name} {path}: {why}")
 
 
 def reject_idle(options: dict[str, Any], reason: str) -> None:

@@ -75,13 +75,9 @@ def _require_writable(args: argparse.Namespace) -> None:
         ("--map", args.map),
         ("--csv", args.csv),
     ):
-        if path is None:
-            continue
-        if option_name != "--csv" and path.suffix.lower() != ".png":
+        if path is not None and option_name != "--csv" and path.suffix.lower() != ".png":
             raise BenchmarkError(f"{option_name} {path}: expected a name that ends in .png")
-        if path.is_dir() or not path.parent.is_dir():
-            why = "it is a folder" if path.is_dir() else f"there is no folder {path.parent}"
-            raise BenchmarkError(f"{option_name} {path}: {why}")
+        opt.require_writable(option_name, path)
 
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:

@@ -14,6 +14,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Command, command, flag, option
 from morphgen.cli.progress import bar
 from morphgen.cli.split_checks import audit, build, verify
+from morphgen.cli.split_difficulty import difficulty
 from morphgen.cli.split_regimes import new
 from morphgen.cli.split_release import release, reveal
 from morphgen.cli.split_score import score
@@ -236,6 +237,8 @@ def _stats_row(
 split = Command(
     "split",
     "list, make, audit, build, release and score splits of train and test robots",
-    commands=(list_splits, show, new, audit, build, verify, stats, release, score, reveal),
+    commands=(
+        *(list_splits, show, new, audit, build, verify, stats, difficulty, release, score, reveal),
+    ),
     details="A split is a YAML file with the robots to train on and those to test on.",
 )

@@ -13,6 +13,7 @@ from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
+    from morphgen.benchmark.difficulty import BaselineResults
     from morphgen.benchmark.split import Split
 
 
@@ -61,7 +62,8 @@ if TYPE_CHECKING:
     ),
     *opt.JOBS_LIBRARY_JSON,
     details="The archive holds the built split, goal sets, licences of all parts, a Croissant "
-    "description, a dataset card, reference scores and SHA-256 of every file. A split that fails "
+    "description, a dataset card, the difficulty of every robot, reference scores and SHA-256 of "
+    "every file. A split that fails "
     "its audit, or with a part under a non-commercial, no-derivatives or unknown licence that is "
     "not allowed, is refused. The same inputs give the same bytes.",
     examples=(
@@ -86,10 +88,13 @@ def release(args: argparse.Namespace) -> None:
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
     extra: dict[str, bytes] = {}
+    results: BaselineResults = {}
     if args.scores:
-        from morphgen.rl.reference_scores import reference_files
+        from morphgen.rl.baseline_results import submitted_results
+        from morphgen.rl.reference_scores import collect_references, reference_files
 
-        extra = reference_files(args.scores, split, protocol, library, jobs=args.jobs)
+        references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
+        extra, results = reference_files(references), submitted_results(references)
     if args.private_test:
         test_grammars(split, library)  # refuses other splits before a secret is made
     is_new_secret = args.secret_file is not None and not args.secret_file.exists()
@@ -110,7 +115,14 @@ def release(args: argparse.Namespace) -> None:
     try:
         with bar(args, "releasing") as update:
             report = release_split(
-                split, args.out, library, request, extra=extra, jobs=args.jobs, progress=update
+                split,
+                args.out,
+                library,
+                request,
+                extra=extra,
+                results=results,
+                jobs=args.jobs,
+                progress=update,
             )
     except BaseException:  # an interrupt, too: no release needs the new secret
         if is_new_secret:

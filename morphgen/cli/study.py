@@ -21,11 +21,19 @@ from morphgen.tasks.registry import default_simulator, evaluation_simulator
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell
 
+PAPER = "paper"
+"""Word for all splits of the benchmark."""
+
 
 @command(
     "study",
     "train and score a matrix of agents, seeds and splits",
-    option("words", nargs="+", metavar="SPLIT", help="name of a split, its file or built folder"),
+    option(
+        "words",
+        nargs="+",
+        metavar="SPLIT",
+        help="name of a split, its file or built folder; paper: the 15 splits of the benchmark",
+    ),
     option(
         "--agents",
         default=",".join(AGENTS),
@@ -36,6 +44,13 @@ if TYPE_CHECKING:
     option("--seeds", default="0..2", help="such as 0..2 or 0,3"),
     path_option("--out", "DIR", "output folder", default=Path("study")),
     number("--eval-steps", "number of control steps of each robot's evaluation", default=10_000),
+    option(
+        "--finetune",
+        default="",
+        metavar="N,...",
+        help="also fine-tune every policy of train robots on the test robots, with these numbers "
+        "of control steps, such as 10000,30000",
+    ),
     flag("--report", "only write tables and curves of the finished cells"),
     opt.RAY,
     option(
@@ -48,8 +63,10 @@ if TYPE_CHECKING:
     opt.LIBRARY,
     details="A cell is an agent with a seed on a split, or a baseline on a split. The command "
     "trains and evaluates each cell, and writes tables and curves. Finished cells are skipped; "
-    "several processes with one folder share the work. The exit code is 1 if a cell failed.",
+    "several processes with one folder share the work. The exit code is 1 if a cell failed. The "
+    "folder of a cell also gets its episodes, which morphgen score reads.",
     examples=(
+        "study paper --seeds 0..1 --steps 30e6 --finetune 10000,30000 --out results",
         "study interpolation/arm3/reach --agents se,me-mlp,me-tf --seeds 0..2 --out study",
         "study interpolation/arm3/reach --agents ablation",
     ),
@@ -95,8 +112,9 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     sim = evaluation_simulator(args.sim or default_simulator())
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
+    finetune = _finetune(args.finetune)
     cells: list[Cell] = []
-    for name in dict.fromkeys(args.words):
+    for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
         source = robots_to_train([name], args)
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
         tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))
@@ -108,8 +126,27 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
                 seeded = matched_budget(replace(config, seed=seed))
                 for subrun in () if args.report else subruns_of(args.out, seeded):
                     require_runnable(subrun.config)
-                cells.append(agent_cell(args.out, label, seeded, eval_config))
+                cells.append(agent_cell(args.out, label, seeded, eval_config, finetune))
     return cells
+
+
+def _splits(word: str) -> tuple[str, ...]:
+    """Return the split that a word names, or the splits of the benchmark."""
+    from morphgen.benchmark.split_file import split_names
+
+    return tuple(split_names()) if word == PAPER and not Path(word).exists() else (word,)
+
+
+def _finetune(text: str) -> list[int]:
+    """Read ``10000,30000``.
+
+    Raises:
+        TaskError: If the text is something else.
+    """
+    parts = [part.strip() for part in text.split(",")] if text else []
+    if not all(part.isdecimal() and int(part) for part in parts):
+        raise TaskError(f"--finetune {text}: expected numbers of steps, such as 10000,30000")
+    return sorted({int(part) for part in parts})
 
 
 def _seeds(text: str) -> list[int]:
@@ -131,7 +168,7 @@ def _seeds(text: str) -> list[int]:
 
 def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
     """Run the cells and return how many failed."""
-    from morphgen.rl.study import run_cells, run_cells_on_ray
+    from morphgen.rl.study_work import run_cells, run_cells_on_ray
 
     failures = 0
     execution = execution_config(args)

@@ -9,7 +9,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
 from morphgen.rl import reference_scores
-from morphgen.rl.reference_scores import reference_files
+from morphgen.rl.reference_scores import collect_references, reference_files
 from morphgen.rl.submission import Submission
 from morphgen.rl.submission_checks import require_same_random
 
@@ -61,5 +61,6 @@ def test_references_that_disagree_about_the_random_policy_need_a_submission_of_i
         (tmp_path / f"{name}.json").write_text(json.dumps(values))
     paths = [tmp_path / f"{name}.json" for name in ("a", "b", "random")]
     with pytest.raises(BenchmarkError, match=r"random_score: mean -200\.00; expected -2\.00, as"):
-        reference_files(paths[:2], SPLIT, PROTOCOL, default_library())
-    assert "submissions/random.json" in reference_files(paths, SPLIT, PROTOCOL, default_library())
+        collect_references(paths[:2], SPLIT, PROTOCOL, default_library())
+    references = collect_references(paths, SPLIT, PROTOCOL, default_library())
+    assert "submissions/random.json" in reference_files(references)

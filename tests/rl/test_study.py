@@ -18,7 +18,7 @@ from helpers.commands import tree
 from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
-from morphgen.rl import study
+from morphgen.rl import study, study_work
 from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.evaluation import Score
 from morphgen.rl.inference import MODES
@@ -32,22 +32,22 @@ from morphgen.rl.study import (
     matched_budget,
     read_scores,
     require_cells,
-    run_cells,
-    run_cells_on_ray,
 )
 from morphgen.rl.study_report import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
+from morphgen.rl.study_work import run_cells, run_cells_on_ray
+from morphgen.rl.submission import read_submission
 from morphgen.rl.training import subruns_of
 
 pytestmark = pytest.mark.slow
 
 
-def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1)):
+def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1), finetune=()):
     source = small_source()
     made = baseline_cells(folder, source, EVAL)
     for agent in agents:
         for seed in seeds:
             config = small_config(source, agent=agent, seed=seed, total_timesteps=64)
-            made.append(agent_cell(folder, agent, config, EVAL))
+            made.append(agent_cell(folder, agent, config, EVAL, finetune))
     return made
 
 
@@ -77,6 +77,38 @@ def test_a_cell_is_a_run_folder_with_scores(whole):
         for own in scores.values():
             assert [each.side for each in own] == ["train", "train", "test"]
         assert (cell.folder / CHECKPOINT).is_file() == (cell.agent == "me-mlp")
+
+
+def test_a_cell_has_its_episodes_as_submissions(whole):
+    for cell in whole:
+        for mode, own in read_scores(cell).items():
+            submission = read_submission(cell.folder / f"{mode}.json")
+            assert (submission.method, submission.training_seed) == (cell.agent, cell.seed)
+            assert [robot.side for robot in submission.robots] == [each.side for each in own]
+            for robot, score in zip(submission.robots, own, strict=True):
+                assert np.mean(robot.score) == pytest.approx(score.raw)
+                assert np.mean(robot.success) == pytest.approx(score.success)
+            assert not cell.config or submission.training.transitions == 64
+
+
+def test_fine_tuning_is_added_to_finished_cells(whole, tmp_path):
+    folder = tmp_path / "study"
+    shutil.copytree(whole[0].folder.parents[2], folder)
+    mode, steps = "fine-tuned 1,024", 1024  # one update
+    cells = cells_in(folder, finetune=(steps,))
+    before = {cell: read_scores(cell) for cell in cells}
+    finished(cells)
+    for cell in cells:
+        after = read_scores(cell)
+        assert (mode in after) == (cell.agent == "me-mlp")
+        assert {key: after[key] for key in before[cell]} == before[cell]
+    tuned = cells[-1]
+    assert [each.side for each in read_scores(tuned)[mode]] == ["test"]
+    submission = read_submission(tuned.folder / f"fine-tuned-{steps}.json")
+    assert (submission.mode, submission.training.finetuned) == ("deterministic", steps)
+    assert not equal(weights(tuned.folder / f"finetuned/{steps}"), weights(tuned.folder))
+    table = rows({cell: read_scores(cell) for cell in cells})
+    assert [(row.agent, row.seeds) for row in table if row.mode == mode] == [("me-mlp", (0, 1))]
 
 
 def test_finished_cells_are_not_repeated(whole, monkeypatch):
@@ -133,7 +165,7 @@ def test_a_cell_locked_by_another_process_is_done_last(tmp_path, monkeypatch):
         waits.append(seconds)
         threading.Thread(target=other.release).start()
 
-    monkeypatch.setattr(study.time, "sleep", wait)
+    monkeypatch.setattr(study_work.time, "sleep", wait)
     order = [outcome.cell.agent for outcome in run_cells(cells, QUIET)]
     assert order == ["zero", "jacobian", "ik", "random"]
     assert waits

@@ -23,7 +23,7 @@ from morphgen.rl.leaderboard import (
     ranking_table,
     score_submission,
 )
-from morphgen.rl.reference_scores import read_references, reference_files
+from morphgen.rl.reference_scores import collect_references, read_references, reference_files
 from morphgen.rl.submission import Submission, read_submission, submission_text
 from morphgen.rl.submission_checks import check_submission
 from morphgen.tasks.eval_protocol import EvalProtocol, protocol_from
@@ -235,12 +235,13 @@ def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
     write_cell(cell)
     names = ("random.json", "ours.json", "other.json", "study")
     paths = [tmp_path / name for name in names]
-    files = reference_files(paths, SPLIT, PROTOCOL, LIBRARY)
+    files = reference_files(collect_references(paths, SPLIT, PROTOCOL, LIBRARY))
     assert set(files) == {
         *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
         "submissions/random-seed0.json",  # a policy of this name
     }
-    assert files == reference_files(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
+    again = collect_references(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
+    assert files == reference_files(again)
     for name, content in files.items():
         (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "release" / name).write_bytes(content)
@@ -259,7 +260,7 @@ def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
     baseline["robots"] = baseline["robots"][TEST:]
     (tmp_path / "random.json").write_text(json.dumps(baseline))
     with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
-        reference_files(paths, SPLIT, PROTOCOL, LIBRARY)
+        collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
     with pytest.raises(BenchmarkError, match=r"train robot [a-z-]+: the release has no episodes"):
         score_submission(submission(), random_scores(submission(baseline)))
 
@@ -310,23 +311,23 @@ def test_malformed_scores_of_a_release_are_refused(tmp_path, change, why):
 def test_references_of_other_splits_and_rules_are_refused(tmp_path):
     write_cell(tmp_path / "a" / "seed0", eval={"sim": "pybullet", "episodes": 4, "seed": 0})
     with pytest.raises(BenchmarkError, match=r"evaluation\.simulator: 'pybullet'"):
-        reference_files([tmp_path / "a"], SPLIT, PROTOCOL, LIBRARY)
+        collect_references([tmp_path / "a"], SPLIT, PROTOCOL, LIBRARY)
     write_cell(tmp_path / "e" / "seed0")
     path = tmp_path / "e" / "seed0" / "scores.json"
     content = json.loads(path.read_text())
     del content["scores"]["deterministic"][0]
     path.write_text(json.dumps(content))
     with pytest.raises(BenchmarkError, match=r"scores of train robots at reach: .*; expected one"):
-        reference_files([tmp_path / "e"], SPLIT, PROTOCOL, LIBRARY)
+        collect_references([tmp_path / "e"], SPLIT, PROTOCOL, LIBRARY)
     write_cell(tmp_path / "b" / "seed0")
     other = small_split(task="push")
     with pytest.raises(BenchmarkError, match=r"b: no scores of split mine/small, id "):
-        reference_files([tmp_path / "b"], other, PROTOCOL, LIBRARY)
+        collect_references([tmp_path / "b"], other, PROTOCOL, LIBRARY)
     (tmp_path / "c.json").write_text('{"ik": []}')
     with pytest.raises(BenchmarkError, match="neither a submission nor the scores of a study"):
-        reference_files([tmp_path / "c.json"], SPLIT, PROTOCOL, LIBRARY)
+        collect_references([tmp_path / "c.json"], SPLIT, PROTOCOL, LIBRARY)
     with pytest.raises(BenchmarkError, match="no such file or folder"):
-        reference_files([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
+        collect_references([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
 
 
 def test_the_rules_of_an_evaluation_are_read_as_they_were_written():

@@ -1,5 +1,6 @@
 """Releases: contents, determinism, verification, and archives of strangers."""
 
+import hashlib
 import json
 import re
 import zipfile
@@ -10,10 +11,13 @@ import yaml
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
-from morphgen.benchmark import release_file
+from morphgen.benchmark import release_checks, release_file, release_texts
 from morphgen.benchmark.croissant import CONFORMS_TO
+from morphgen.benchmark.difficulty import BaselineResult, split_difficulty
+from morphgen.benchmark.difficulty_table import difficulty_csv
 from morphgen.benchmark.release_file import (
     CROISSANT_FILE,
+    DIFFICULTY_FILE,
     LICENCES_FILE,
     RELEASE_FILE,
     opened_folder,
@@ -21,7 +25,7 @@ from morphgen.benchmark.release_file import (
 )
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_folder import SUMS_FILE, read_sums
-from morphgen.benchmark.split_folder_files import BuildSettings
+from morphgen.benchmark.split_folder_files import BuildSettings, sums_text
 from morphgen.benchmark.split_source import read_split_or_folder
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
@@ -66,7 +70,7 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
     sums = read_sums(folder / SUMS_FILE)
     assert {path.partition("/")[0] for path in sums} == {
         *("README.md", "LICENCES.md", "build.json", "croissant.json", "licences.json"),
-        *("release.json", "robots", "robots.jsonl", "split.yaml", "tokens.npz"),
+        *("release.json", "robots", "robots.jsonl", "split.yaml", "tokens.npz", "difficulty.csv"),
     }
     release = read_release(folder)
     assert (release.name, release.id, release.version) == (
@@ -96,6 +100,81 @@ def test_the_commands_of_the_card_name_the_simulator_of_the_evaluation(tmp_path,
     text = (tmp_path / "mine-some-1.2.0" / "README.md").read_text()
     for command in ("train", "eval"):
         assert re.search(rf"^morphgen {command} .*--sim {simulator}\b", text, re.MULTILINE)
+
+
+def test_a_release_has_the_difficulty_of_every_robot(tmp_path, report, folder):
+    text = difficulty_csv(split_difficulty(combined(), LIBRARY))
+    assert (folder / DIFFICULTY_FILE).read_text() == text
+    card = (folder / "README.md").read_text()
+    assert re.search(r"\| planar-plane +\| test +\| push +\| 3 +\| ", card)
+    assert "gantry-plane " not in card.partition("## Difficulty")[2].partition("planar-plane")[0]
+    results = {"random": {("test", "planar-plane"): BaselineResult(1.5, 0.25)}}
+    more = release_split(combined(), tmp_path / "out", LIBRARY, LIGHT, results=results)
+    unpack_zip(more.archive, tmp_path / "out", LIMITS)
+    folder = tmp_path / "out" / "mine-some-1.2.0"
+    header, *_, last = (folder / DIFFICULTY_FILE).read_text().splitlines()
+    assert header == f"{text.splitlines()[0]},random_score,random_success"
+    assert last == f"{text.splitlines()[-1]},1.500000,0.250000"
+    assert "| 1.5, 25% " in (folder / "README.md").read_text()
+    assert verify(folder, LIBRARY).differences == ()
+
+
+def test_the_card_lists_a_bounded_number_of_test_robots(report, folder, monkeypatch):
+    monkeypatch.setattr(release_texts, "MAX_ROWS", 1)
+    rows = split_difficulty(combined(), LIBRARY)
+    more = (*rows, replace(rows[-1], robot="another"))
+    text = release_texts.card_text(combined(), read_release(folder), [], [], more)
+    assert "The table has 1 of 2 test robots." in text
+    assert "another" not in text
+
+
+def change_difficulty(folder, change):
+    """Replace the text of ``difficulty.csv`` and its checksum; None deletes both."""
+    path, sums = folder / DIFFICULTY_FILE, read_sums(folder / SUMS_FILE)
+    text = change(path.read_text())
+    if text is None:
+        path.unlink()
+        del sums[DIFFICULTY_FILE]
+    else:
+        path.write_text(text)
+        sums[DIFFICULTY_FILE] = hashlib.sha256(text.encode()).hexdigest()
+    (folder / SUMS_FILE).write_text(sums_text(sums))
+
+
+def test_releases_of_earlier_versions_have_no_difficulty_and_pass_verify(folder):
+    change_difficulty(folder, lambda text: None)
+    assert verify(folder, LIBRARY).differences == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("planar-cube,push,false,3", "planar-cube,push,false,2", "line 3: movable_to_tool of "),
+        (r"(cube,push,.*),([\d.]+)$", r"\1,0.5", "workspace of planar-cube is '0.5', not '"),
+        (r"(plane,push,[^c]*cube,)[\d.]+", r"\1nan", "cosine of planar-plane is 'nan', not '0."),
+        (r"(planar-plane,push,.*)planar-cube", r"\1gantry-plane", "workspace_nearest of planar-"),
+        (r"(planar-plane,push,.*)planar-cube", r"\1x" + "y" * 999, "planar-plane is 'xyyy"),
+        (r"\n[^\n]*\n\Z", r"\n", "it has 3 robots, not 4"),
+        (r"\n\Z", r",\n", "line 5 has 15 cells, not 14"),
+        ("cosine_nearest", "cosine_farthest", "it has other columns; expected split, side, robot"),
+        (r"\A", "x" * 200_000, "cannot be read: field larger than field limit"),
+        (r"(?s).*", "", "it has other columns; expected split"),
+    ],
+)
+def test_verify_compares_the_difficulty(folder, old, new, why):
+    change_difficulty(folder, lambda text: re.sub(old, new, text, count=1, flags=re.MULTILINE))
+    first, *_ = verify(folder, LIBRARY).differences
+    assert first.where == DIFFICULTY_FILE
+    assert why in first.why
+    assert len(first.why) < 300
+
+
+def test_verify_accepts_another_nearest_robot_that_is_as_near_up_to_rounding(folder, monkeypatch):
+    pattern = r"(planar-plane,push,.*)planar-cube,[\d.]+$"
+    change_difficulty(folder, lambda text: re.sub(pattern, r"\1gantry-cylinder,0.75", text))
+    assert len(verify(folder, LIBRARY).differences) == 2
+    monkeypatch.setattr(release_checks, "TOLERANCE", 1.0)
+    assert verify(folder, LIBRARY).differences == ()
 
 
 def test_the_archive_and_its_folder_pass_verify(report, folder):
@@ -134,6 +213,7 @@ def test_croissant_lists_the_files_that_are_there(folder):
     assert data["license"] == ["https://spdx.org/licenses/MIT.html"]
     files = [each for each in data["distribution"] if each["@type"] == "cr:FileObject"]
     assert all(sums[each["contentUrl"]] == each["sha256"] for each in files)
+    assert DIFFICULTY_FILE in {each["@id"] for each in files}
     sets = [each["@id"] for each in data["distribution"] if each["@type"] == "cr:FileSet"]
     assert sets == ["urdf"]  # a light build has no MJCF
 

@@ -1,0 +1,157 @@
+"""``morphgen split difficulty``, and the difficulty of a release with reference scores."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from helpers.commands import tree
+from helpers.splits import TEST, TRAIN, combined, member
+from helpers.submissions import data
+from morphgen.benchmark.similarity import MEASURES
+from morphgen.benchmark.split import sided_members
+from morphgen.benchmark.split_file import read_split, split_text
+from morphgen.grammar.library import default_library
+from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
+
+STUDY = Path(__file__).parents[2] / "results" / "reach-30m"
+ARM3 = "interpolation/arm3/reach"
+WORDS = ("split", "difficulty")
+
+
+@pytest.fixture
+def small():
+    """Write the file of a small split at reach."""
+    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
+    Path("small.yaml").write_text(split_text(combined(train, test, name="mine/small")))
+    return "small.yaml"
+
+
+def test_table_json_and_csv_have_a_row_per_robot(run, small):
+    code, out, err = run(*WORDS, small, "--csv", "a.csv")
+    assert (code, err) == (0, "")
+    title, header, _, *rows = out.splitlines()
+    assert title == "mine/small"
+    assert all(f"nearest by {name}" in header for name in MEASURES)
+    assert [row.split()[:3] for row in rows[:4]] == [
+        ["gantry-plane", "train", "reach"],
+        ["planar-cube", "train", "reach"],
+        ["gantry-cylinder", "train", "reach"],
+        ["planar-plane", "test", "reach"],
+    ]
+    assert out.splitlines()[-1] == "a.csv"
+    first = Path("a.csv").read_bytes()
+    code, out, err = run(*WORDS, small, "--csv", "a.csv", "--json", "--jobs", "2")
+    assert (code, err) == (0, "")
+    assert Path("a.csv").read_bytes() == first
+    data = json.loads(out)
+    assert data["files"] == ["a.csv"]
+    for line, row in zip(csv.DictReader(first.decode().splitlines()), data["rows"], strict=True):
+        assert (line["robot"], float(line["reach"])) == (row["robot"], row["reach"])
+        assert line["obstacles"] == "false"
+        for name in MEASURES:
+            nearest = {"train": line[f"{name}_nearest"], "value": float(line[name])}
+            assert row["nearest"][name] == nearest
+    assert "baselines" not in data["rows"][0]
+
+
+def test_several_splits_have_the_baselines_of_all_their_tasks(run, small):
+    folder = Path("study") / "mine" / "some"
+    content = json.loads((STUDY / ARM3 / "zero" / "scores.json").read_text())
+    split = combined()
+    scores, result = content["scores"]["zero"], {"score": -0.04, "success": 0.5}
+    for name in ("scripted", "zero"):
+        content["source"] |= {"name": split.name, "split": split_text(split)}
+        content["scores"] = {
+            name: [
+                scores[0] | {"robot": each.name, "side": side, "task": "push"} | result
+                for side, each in sided_members(split)
+            ]
+        }
+        (folder / name).mkdir(parents=True)
+        (folder / name / "scores.json").write_text(json.dumps(content))
+    shutil.copytree(STUDY / ARM3, Path("study") / ARM3)
+    Path("push.yaml").write_text(split_text(split))
+    code, out, err = run(*WORDS, "push.yaml", ARM3, "--study", "study", "--csv", "a.csv")
+    assert (code, err) == (0, "")
+    header, *lines = csv.reader(Path("a.csv").read_text().splitlines())
+    names = ["random", "zero", "jacobian", "ik", "scripted"]
+    assert header[-10::2] == [f"{name}_score" for name in names]
+    rows = [dict(zip(header, line, strict=True)) for line in lines]
+    push, reach = rows[0], rows[-1]
+    assert [push[f"{name}_success"] for name in names] == ["", "0.500000", "", "", "0.500000"]
+    assert [reach[f"{name}_success"] for name in names] == [
+        *("0.000000", "0.000000", "0.676471", "1.000000", "")
+    ]
+    first, second = out.split(f"\n\n{ARM3}\n")
+    assert first.splitlines()[1].split()[-2:] == ["zero", "scripted"]
+    assert second.splitlines()[0].split()[-2:] == ["jacobian", "ik"]
+    assert ".0, " in out
+    assert "-0.0" not in out
+
+
+def test_bad_input_is_refused(refused, small):
+    assert "a.yaml: no such file" in refused(*WORDS, "a.yaml")
+    assert "'mine/small' is also in small.yaml" in refused(*WORDS, small, small)
+    err = refused(*WORDS, small, "--csv", "none/a.csv")
+    assert "--csv none/a.csv: there is no folder none" in err
+    Path("folder").mkdir()
+    assert "--csv folder: it is a folder" in refused(*WORDS, small, "--csv", "folder")
+    assert "0: expected a whole number" in refused(*WORDS, small, "--jobs", "0")
+    assert "none: no such folder" in refused(*WORDS, small, "--study", "none")
+    err = refused(*WORDS, small, "--study", STUDY)
+    assert "no scores of baselines on split 'mine/small'" in err
+    assert "interpolation/arm3/reach" in err
+    Path("other.yaml").write_text(Path(small).read_text().replace("mine/small", ARM3))
+    err = refused(*WORDS, "other.yaml", "--study", STUDY)
+    assert "interpolation/arm3/reach/random/scores.json: of other robots: split id " in err
+
+
+def test_nothing_is_written_if_a_robot_is_broken(refused):
+    other = member(TRAIN[0])
+    other = replace(other, name="other", derivation=other.derivation.replace("plane", "planf"))
+    Path("other.yaml").write_text(split_text(combined([*TRAIN, other])))
+    err = refused(*WORDS, "other.yaml", "--csv", "a.csv")
+    assert "split 'mine/some': robot 'other': the library has no part 'planf'" in err
+
+
+def test_an_interrupted_write_keeps_the_old_file(run, small, monkeypatch):
+    Path("a.csv").write_text("old")
+    before = tree(Path())
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    code, out, err = run(*WORDS, small, "--csv", "a.csv")
+    assert (code, out, err) == (2, "", "morphgen: cannot write a.csv: No space left on device\n")
+    assert tree(Path()) == before
+
+
+def test_a_release_has_the_results_of_the_submitted_baselines(run, small):
+    split, protocol = read_split(small), EvalProtocol()
+    expected = expected_robots(split, protocol, default_library())
+    values = data(split=split, expected=expected, protocol=protocol, episodes=protocol.episodes)
+    values |= {"morphgen": version("morphgen"), "method": "ik", "mode": "", "training_seed": None}
+    Path("ik.json").write_text(json.dumps(values))
+    release = ("split", "release", "--light", "--no-goals", small, "--scores", "ik.json")
+    assert run(*release)[0] == 0
+    archive = Path("releases/mine-small-1.0.0.zip")
+    assert run(*release, "--out", "again", "--jobs", "2")[0] == 0
+    assert Path("again", archive.name).read_bytes() == archive.read_bytes()
+    shutil.unpack_archive(archive, ".")
+    text = Path("mine-small-1.0.0", "difficulty.csv").read_text()
+    header, *lines = csv.reader(text.splitlines())
+    assert header[-2:] == ["ik_score", "ik_success"]
+    # Three of 34 episodes succeed with 150, 151 and 152; the others have -1, and random has -2.
+    score = (150 + 151 + 152 - 31) / 34 + 2
+    assert {tuple(line[-2:]) for line in lines} == {(f"{score:.6f}", f"{3 / 34:.6f}")}
+    assert run("split", "verify", archive)[0] == 0
+    assert run(*WORDS, "mine-small-1.0.0", "--csv", "a.csv")[0] == 0  # the unpacked release
+    assert [line[:-2] for line in csv.reader(text.splitlines())] == [
+        *csv.reader(Path("a.csv").read_text().splitlines())
+    ]
