@@ -13,7 +13,7 @@ from morphgen.errors import TaskError
 if TYPE_CHECKING:
     from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.robot_source import RobotSource
-    from morphgen.rl.submission import SubmissionRecorder
+    from morphgen.rl.submission import SubmissionRecorder, Training
     from morphgen.tasks.eval_protocol import EvalProtocol
 
 
@@ -26,6 +26,7 @@ class PlannedSubmission:
     mode: str
     training_seed: int | None
     evaluation: dict[str, Any]
+    training: Training | None
     record: SubmissionRecorder
     """Callback for the episodes of every robot."""
 
@@ -34,7 +35,7 @@ class PlannedSubmission:
         from morphgen.rl.submission import write_submission
 
         submission = self.record.submission(
-            self.method, self.mode, self.training_seed, self.evaluation
+            self.method, self.mode, self.training_seed, self.evaluation, self.training
         )
         write_submission(self.path, submission)
 
@@ -58,6 +59,7 @@ def plan_submission(
     method: str,
     mode: str = "",
     training_seed: int | None = None,
+    training: Training | None = None,
 ) -> PlannedSubmission | None:
     """Return the submission that the arguments ask for, or None.
 
@@ -68,6 +70,7 @@ def plan_submission(
         method: Name of the method unless ``--method`` is given.
         mode: How the policy acts; empty for a baseline.
         training_seed: Seed of the training; None for a baseline.
+        training: How the policy was trained, if it is known.
 
     Raises:
         TaskError: If the robots are not those of a split, or the test side is left out.
@@ -97,4 +100,4 @@ def plan_submission(
     record = SubmissionRecorder(split)
     # Refuses an invalid name or seed now, not after hours of episodes.
     record.submission(name, mode, training_seed, followed)
-    return PlannedSubmission(args.submission, name, mode, training_seed, followed, record)
+    return PlannedSubmission(args.submission, name, mode, training_seed, followed, training, record)

@@ -156,6 +156,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     )
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint
+    from morphgen.rl.submission import Training
     from morphgen.rl.training import checkpoint_files
     from morphgen.tasks.device import require_device
 
@@ -183,6 +184,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         method=args.checkpoint if is_named(args.checkpoint) else run.policy.agent,
         mode=args.mode or "",
         training_seed=run.seed,
+        # A fine-tuned policy was trained before, by a run that its checkpoint does not describe.
+        training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
     record = plan.record if plan else no_record
     _prepare(sources if args.words else _sources_of(run.source, sides), config, display)

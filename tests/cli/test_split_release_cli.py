@@ -256,6 +256,15 @@ def test_submissions_are_recorded_scored_and_ranked(run, refused, small):
         ["random", "reference"],
     ]
     assert "by the episodes of the release" in out
+    brief = ("--steps", "64", "--envs", "4", "--set", "num_steps=16", "--set", "minibatches=4")
+    code, _, err = run(
+        "train", folder, "--agent", "me-mlp", *brief, "--sim", "mujoco", "--out", "r"
+    )
+    assert code == 0, err
+    words = ("--mode", "deterministic", *few, "--submission", "policy.json")
+    assert run("eval", "r", "--split", folder, *words)[0] == 0
+    policy = json.loads(Path("policy.json").read_text())
+    assert policy["training"] == {"simulator": "mujoco", "transitions": 64, "finetuned": 0}
     broken = json.loads(Path("ik.json").read_text())
     broken["robots"][-1]["score"][0] = 999
     Path("broken.json").write_text(json.dumps(broken))
