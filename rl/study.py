@@ -27,7 +27,7 @@ from morphgen.rl.evaluation import (
     no_progress,
 )
 from morphgen.rl.finetuning import finetuning_config
-from morphgen.rl.inference import MODES
+from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.robot_source import RobotSource, identity, members, other_side, tasks_of
 from morphgen.rl.runs import CHECKPOINT, RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
@@ -68,12 +68,17 @@ class Cell:
     from the end of the run."""
 
     @property
-    def modes(self) -> dict[str, int]:
-        """Modes that the cell is evaluated in, with the transitions of fine-tuning before it."""
+    def modes(self) -> dict[str, tuple[Mode | None, int]]:
+        """Names under which the cell has scores: how the policy acts, and its fine-tuning.
+
+        The mode is None for a baseline, and the number is that of the transitions of fine-tuning.
+        """
         if self.config is None:
-            return {self.agent: 0}
-        tuned = {f"fine-tuned {steps:,}": steps for steps in self.finetune}
-        return dict.fromkeys(MODES, 0) | tuned
+            return {self.agent: (None, 0)}
+        modes: dict[str, tuple[Mode | None, int]] = {mode: (mode, 0) for mode in MODES}
+        for steps in self.finetune:
+            modes[f"fine-tuned {steps:,}"] = (MODES[0], steps)
+        return modes
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -224,23 +229,31 @@ def do_cell(
         learn(cell.folder, cell.config)
     eval_config = replace(cell.eval_config, workers=execution.workers)
     split = parse_split(cell.source.split, Path(cell.split)).split
-    for mode, steps in cell.modes.items():
-        if mode in scores:
+    for name, (mode, steps) in cell.modes.items():
+        if name in scores:
             continue
+        folder, config, sides = cell.folder, cell.config, cell.sides
+        if config is not None and steps:
+            folder, sides = folder / FINETUNED / str(steps), ("test",)
+            config = _finetuning(cell, config, steps)
+            learn(folder, config)
         recorder = SubmissionRecorder(split)
-        if cell.config is None:
-            scores[mode] = _baseline_scores(cell, eval_config, progress, recorder)
-        elif not steps:
-            scores[mode] = _policy_scores(
-                cell.folder, cell, mode, cell.sides, eval_config, progress, recorder
-            )
-        else:
-            folder = cell.folder / FINETUNED / str(steps)
-            learn(folder, _finetuning(cell, cell.config, steps))
-            scores[mode] = _policy_scores(
-                folder, cell, mode, ("test",), eval_config, progress, recorder
-            )
-        _write_episodes(cell, mode, split, recorder)
+        records: list[Score] = []
+        for side in sides:
+            shown = progress(f"{cell.agent}{f' {name}' if mode else ''} on {side}")
+            if config is not None and mode is not None:
+                device = config.device
+                records += evaluate_run(
+                    folder, side, eval_config, mode, device=device, progress=shown, record=recorder
+                )
+            # A baseline is not evaluated on a side without a robot for it.
+            elif BASELINES[cell.agent].suits(tasks_of(other_side(cell.source, side))):
+                source = other_side(cell.source, side)
+                records += evaluate_baseline(
+                    cell.agent, source, eval_config, progress=shown, record=recorder
+                )
+        scores[name] = records
+        _write_episodes(cell, name, split, recorder)
         _write_scores(cell, scores)
 
 
@@ -255,50 +268,8 @@ def _finetuning(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
     return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
 
 
-def _policy_scores(
-    folder: Path,
-    cell: Cell,
-    mode: str,
-    sides: Sequence[Side],
-    eval_config: EvalConfig,
-    progress: StartProgress,
-    record: SubmissionRecorder,
-) -> list[Score]:
-    """Return the scores of a run on sides of its split."""
-    assert cell.config is not None
-    is_tuned = folder != cell.folder
-    scores = []
-    for side in sides:
-        show = progress(f"{cell.agent} {mode} on {side}")
-        scores += evaluate_run(
-            folder,
-            side,
-            eval_config,
-            next(each for each in MODES if is_tuned or each == mode),
-            device="cpu" if is_tuned else cell.config.device,
-            progress=show,
-            record=record,
-        )
-    return scores
-
-
-def _baseline_scores(
-    cell: Cell, eval_config: EvalConfig, progress: StartProgress, record: SubmissionRecorder
-) -> list[Score]:
-    """Return the scores of a baseline on the sides that have a robot with one of its tasks."""
-    scores = []
-    for side in cell.sides:
-        source = other_side(cell.source, side)
-        if BASELINES[cell.agent].suits(tasks_of(source)):
-            show = progress(f"{cell.agent} on {side}")
-            scores += evaluate_baseline(
-                cell.agent, source, eval_config, progress=show, record=record
-            )
-    return scores
-
-
-def _write_episodes(cell: Cell, mode: str, split: Split, recorder: SubmissionRecorder) -> None:
-    """Write the episodes of a mode as a submission.
+def _write_episodes(cell: Cell, name: str, split: Split, recorder: SubmissionRecorder) -> None:
+    """Write the episodes of one of the modes of a cell as a submission.
 
     A submission must be in a simulator that comes with morphgen; episodes in others are not kept.
     """
@@ -307,19 +278,15 @@ def _write_episodes(cell: Cell, mode: str, split: Split, recorder: SubmissionRec
         return
     goals = GoalConfig(seed=cell.source.goal_seed, tasks=evaluation.tasks)
     rules = EvalProtocol(evaluation.sim, evaluation.episodes, evaluation.seed, goals)
-    steps = cell.modes[mode]
+    mode, steps = cell.modes[name]
     training = None
     if config is not None:
         training = Training(config.sim, config.ppo.total_timesteps, steps)
     submission = recorder.submission(
-        cell.agent,
-        mode if mode in MODES else MODES[0] if config is not None else "",
-        cell.seed,
-        rules.as_data(split),
-        training,
+        cell.agent, mode or "", cell.seed, rules.as_data(split), training
     )
-    name = f"fine-tuned-{steps}" if steps else mode
-    write_submission(cell.folder / f"{name}.json", submission)
+    file = f"fine-tuned-{steps}" if steps else name
+    write_submission(cell.folder / f"{file}.json", submission)
 
 
 def _write_scores(cell: Cell, scores: Mapping[str, Sequence[Score]]) -> None:

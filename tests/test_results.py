@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from morphgen.cli import main
+from morphgen.rl.leaderboard import relative_scores
+from morphgen.rl.score_tables import read_submissions
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = re.findall(
@@ -62,6 +64,20 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
     assert means
     for agent, numbers in means.items():
         assert any(numbers <= {cell.split(" ")[0] for cell in line} for line in DOCS), agent
+
+
+def test_scores_follow_from_the_stored_episodes():
+    submissions = read_submissions([ROOT / "results"])
+    assert len(submissions) > 60
+    for path, submission in ((Path(file), each) for file, each in submissions.items()):
+        mode = path.stem if submission.training is None else submission.mode
+        if submission.training is not None and submission.training.finetuned:
+            mode = f"fine-tuned {submission.training.finetuned:,}"
+        stored = json.loads((path.parent / "scores.json").read_text("utf-8"))["scores"][mode]
+        for robot, score in zip(submission.robots, stored, strict=True):
+            assert (robot.robot, robot.side) == (score["robot"], score["side"]), path
+            assert relative_scores(robot).mean() == pytest.approx(score["score"]), path
+            assert sum(robot.success) == pytest.approx(score["success"] * score["episodes"]), path
 
 
 def test_the_docs_have_the_table_of_the_number_of_robots():
