@@ -11,8 +11,6 @@ from morphgen.rl.runs import RunConfig
 
 NUM_ENVS = 16
 """Default number of environments."""
-STEPS = 30_000
-"""Default number of transitions."""
 
 
 def finetuning_config(

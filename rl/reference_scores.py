@@ -27,6 +27,7 @@ from morphgen.rl.study_cells import require_all_robots, stored_cell, stored_spli
 from morphgen.rl.submission import (
     Submission,
     is_submission,
+    json_files,
     read_submission,
     submission_from,
     submission_text,
@@ -177,17 +178,7 @@ class _Cell:
 
 def _files_below(path: Path) -> Iterator[tuple[Path, Any]]:
     """Yield a JSON file, or the submissions and scores of studies below a folder."""
-    if path.is_dir():
-        files = sorted({*path.rglob(SCORES), *path.glob("*.json")})
-    elif path.is_file():
-        files = [path]
-    else:
-        raise BenchmarkError(f"{path}: no such file or folder")
-    for file in files:
-        try:
-            data = read_json(file)
-        except (OSError, FormatError) as error:
-            raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+    for file, data in json_files(path, f"**/{SCORES}", "*.json"):
         if file == path or is_submission(data) or file.name == SCORES:
             yield file, data
 

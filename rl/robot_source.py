@@ -99,6 +99,15 @@ def robot_source(
     )
 
 
+def split_of(source: RobotSource) -> Split:
+    """Return the split of a source that has one.
+
+    Raises:
+        BenchmarkError: If the text of the split is malformed.
+    """
+    return parse_split(source.split, Path(source.name)).split
+
+
 def members(source: RobotSource) -> tuple[Member, ...]:
     """Return the members of the split that are meant; none for one robot.
 
@@ -107,7 +116,7 @@ def members(source: RobotSource) -> tuple[Member, ...]:
     """
     if not source.split:
         return ()
-    side = parse_split(source.split, Path(source.name)).split.side(source.side)
+    side = split_of(source).side(source.side)
     if source.member is None:
         return side
     names = [member.name for member in side]
@@ -127,7 +136,7 @@ def identity(source: RobotSource) -> dict[str, Any]:
     Raises:
         BenchmarkError: If the text of the split is malformed.
     """
-    text = source.split and split_id(parse_split(source.split, Path(source.name)).split)
+    text = source.split and split_id(split_of(source))
     return asdict(source) | {"split": text}
 
 

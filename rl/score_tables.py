@@ -17,8 +17,7 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.errors import BenchmarkError, FormatError
-from morphgen.formats.data_files import read_json
+from morphgen.errors import BenchmarkError
 from morphgen.rl.eval_report import SIDES as SIDE_NAMES
 from morphgen.rl.intervals import (
     Interval,
@@ -27,7 +26,13 @@ from morphgen.rl.intervals import (
     wilson_interval,
 )
 from morphgen.rl.leaderboard import relative_scores
-from morphgen.rl.submission import RobotOutcomes, Submission, is_submission, submission_from
+from morphgen.rl.submission import (
+    RobotOutcomes,
+    Submission,
+    is_submission,
+    json_files,
+    submission_from,
+)
 from morphgen.typing import Array
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -80,14 +85,8 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
     """
     found: dict[str, Submission] = {}
     for path in paths:
-        if not path.exists():
-            raise BenchmarkError(f"{path}: no such file or folder")
         before = len(found)
-        for file in sorted(path.rglob("*.json")) if path.is_dir() else [path]:
-            try:
-                data = read_json(file)
-            except (OSError, FormatError) as error:
-                raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        for file, data in json_files(path, "**/*.json"):
             if is_submission(data) or file == path:
                 found[str(file)] = submission_from(data, file)
         if len(found) == before:

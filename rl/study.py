@@ -12,7 +12,6 @@ from typing import Any
 
 from morphgen import processes
 from morphgen.benchmark.split import Side, Split
-from morphgen.benchmark.split_file import parse_split
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_atomic
@@ -28,7 +27,14 @@ from morphgen.rl.evaluation import (
 )
 from morphgen.rl.finetuning import finetuning_config
 from morphgen.rl.inference import MODES, Mode
-from morphgen.rl.robot_source import RobotSource, identity, members, other_side, tasks_of
+from morphgen.rl.robot_source import (
+    RobotSource,
+    identity,
+    members,
+    other_side,
+    split_of,
+    tasks_of,
+)
 from morphgen.rl.runs import CHECKPOINT, RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
 from morphgen.rl.submission import SubmissionRecorder, Training, write_submission
@@ -228,7 +234,7 @@ def do_cell(
     if cell.config is not None:
         learn(cell.folder, cell.config)
     eval_config = replace(cell.eval_config, workers=execution.workers)
-    split = parse_split(cell.source.split, Path(cell.split)).split
+    split = split_of(cell.source)
     for name, (mode, steps) in cell.modes.items():
         if name in scores:
             continue

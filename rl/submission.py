@@ -7,7 +7,7 @@ robot have an entry per episode, in the order of the evaluation, which the seed 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -183,6 +183,30 @@ def write_submission(path: Path, submission: Submission) -> None:
         FormatError: If it cannot be written; then nothing is left behind.
     """
     write_file(path, submission_text(submission))
+
+
+def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
+    """Yield a JSON file with its content, or those of a folder in the order of their paths.
+
+    Args:
+        path: The file or folder.
+        patterns: Patterns of the files in the folder.
+
+    Raises:
+        BenchmarkError: If there is no such file or folder, or a file is no JSON.
+    """
+    if path.is_dir():
+        files = sorted({file for pattern in patterns for file in path.glob(pattern)})
+    elif path.is_file():
+        files = [path]
+    else:
+        raise BenchmarkError(f"{path}: no such file or folder")
+    for file in files:
+        try:
+            data = read_json(file)
+        except (OSError, FormatError) as error:
+            raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        yield file, data
 
 
 def is_submission(data: object) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from morphgen.model.geometry import Box
 from morphgen.model.inertia import box_corners
 from morphgen.typing import Array
 from morphgen.viewer.scene_shapes import Rgb, batch_colours, triangles
+from morphgen.viewer.viser_internals import remove_camera_callbacks
 
 BRAND: Rgb = (24, 100, 171)
 """Colour of links, buttons and sliders."""
@@ -148,21 +150,33 @@ def look_at(
     If panels open or close beside the scene, the camera is placed again, unless the user has moved
     it.
     """
-    camera = client.camera
-    aspect, position = 0.0, camera.position
+    placement = _Placement(low, high, direction)
+    placement.place(client.camera)
+    remove_camera_callbacks(client.camera, _Placement)
+    client.camera.on_update(placement)
 
-    def place() -> None:
-        nonlocal aspect, position
-        aspect = _used_aspect(camera)
-        place_camera(camera, low, high, direction, aspect)
-        position = camera.position
 
-    def place_again(_: viser.CameraHandle) -> None:
-        if _used_aspect(camera) != aspect and np.allclose(camera.position, position, atol=1e-3):
-            place()
+@dataclass(eq=False)
+class _Placement:
+    """Where a camera is placed; called whenever a browser reports its camera."""
 
-    place()
-    camera.on_update(place_again)
+    low: Array
+    high: Array
+    direction: tuple[float, float, float]
+    aspect: float = 0.0
+    """Aspect for which the camera was placed last."""
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    """Position of the camera then [m]."""
+
+    def place(self, camera: viser.CameraHandle) -> None:
+        self.aspect = _used_aspect(camera)
+        place_camera(camera, self.low, self.high, self.direction, self.aspect)
+        self.position = camera.position
+
+    def __call__(self, camera: viser.CameraHandle) -> None:
+        has_moved = not np.allclose(camera.position, self.position, atol=1e-3)
+        if _used_aspect(camera) != self.aspect and not has_moved:
+            self.place(camera)
 
 
 def _used_aspect(camera: viser.CameraHandle) -> float:

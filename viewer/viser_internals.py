@@ -65,6 +65,12 @@ def clear_page(client: viser.ClientHandle) -> None:
     client.camera._state.camera_cb.clear()
 
 
+def remove_camera_callbacks(camera: viser.CameraHandle, kind: type) -> None:
+    """Remove the callbacks of a camera that are instances of a class."""
+    callbacks = camera._state.camera_cb
+    callbacks[:] = [callback for callback in callbacks if not isinstance(callback, kind)]
+
+
 def replace_handlers(
     client: viser.ClientHandle, handlers: Mapping[type[Any], Handler]
 ) -> Mapping[type[Any], Handler]:

@@ -76,7 +76,7 @@ def plan_submission(
         TaskError: If the robots are not those of a split, or the test side is left out.
         BenchmarkError: If the evaluation does not follow the rules, or the name is invalid.
     """
-    from morphgen.benchmark.split_file import parse_split
+    from morphgen.rl.robot_source import split_of
     from morphgen.rl.submission import SubmissionRecorder
     from morphgen.rl.submission_checks import require_rules
     from morphgen.tasks.eval_protocol import EvalProtocol
@@ -91,7 +91,7 @@ def plan_submission(
         raise TaskError(f"{args.submission}: there is no folder {args.submission.parent}")
     if args.submission.is_dir():
         raise TaskError(f"{args.submission}: is a folder; expected the name of a file")
-    split = parse_split(source.split, Path(source.name)).split
+    split = split_of(source)
     rules = rules_of(args.words)
     goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)
     followed = EvalProtocol(config.sim, config.episodes, config.seed, goals).as_data(split)

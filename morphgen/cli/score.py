@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from morphgen.cli import options as opt
@@ -40,8 +41,6 @@ MODES = ("deterministic", "stochastic", "all")
 )
 def score(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    import dataclasses
-
     from morphgen.rl.score_tables import read_submissions, result_rows, result_tables
     from morphgen.rl.scores import finite_or_none
 
@@ -51,7 +50,7 @@ def score(args: argparse.Namespace) -> None:
         if args.mode == "all" or each.mode in ("", args.mode)
     }
     rows = result_rows(found)
-    data = [finite_or_none(dataclasses.asdict(row)) for row in rows]
+    data = [finite_or_none(asdict(row)) for row in rows]
     notes = "MT: train robots, ZS: test robots; intervals: 95%"
     style = "github" if args.markdown else "simple"
     opt.print_result(args, data, lambda: f"{result_tables(rows, style)}\n{notes}")

@@ -293,12 +293,12 @@ def _max_links(source: RobotSource) -> int:
     For a split it is the split's number. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    from morphgen.benchmark.split_file import parse_split
     from morphgen.benchmark.token_layout import default_max_links
+    from morphgen.rl.robot_source import split_of
     from morphgen.tasks.env_specs import load_robot
 
     if source.split:
-        return parse_split(source.split, Path(source.name)).split.max_links
+        return split_of(source).max_links
     robot = load_robot(source.name, library=map(Path, source.library))
     return default_max_links([len(robot.links)])
 

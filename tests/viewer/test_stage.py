@@ -14,7 +14,9 @@ class Camera(SimpleNamespace):
     """A camera of a browser with a picture of an aspect."""
 
     def __init__(self, aspect):
-        super().__init__(aspect=aspect, position=np.zeros(3), callbacks=[])
+        callbacks = []
+        state = SimpleNamespace(camera_cb=callbacks)
+        super().__init__(aspect=aspect, position=np.zeros(3), callbacks=callbacks, _state=state)
 
     def on_update(self, callback):
         self.callbacks.append(callback)
@@ -45,6 +47,16 @@ def test_the_camera_is_placed_again_when_panels_open_or_close(before):
 
 def test_the_strip_beside_a_gallery_does_not_decide_the_distance():
     assert looking(0.14).distance == looking(1.0).distance
+
+
+def test_only_the_last_box_is_kept_in_view():
+    camera = Camera(1.5)
+    client = SimpleNamespace(camera=camera)
+    for scale in (3.0, 2.0, 1.0):
+        look_at(client, scale * LOW, scale * HIGH, (0.0, -1.0, 0.2))
+    assert len(camera.callbacks) == 1
+    camera.resize(0.9)
+    assert camera.distance == pytest.approx(looking(0.9).distance)
 
 
 def test_a_camera_that_the_user_has_moved_stays():
