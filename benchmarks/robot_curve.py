@@ -1,12 +1,16 @@
-"""Success on real robots against the number of procedural robots that a policy was trained on.
+"""Success on unseen robots against the number of procedural robots that a policy was trained on.
 
-    python benchmarks/robot_curve.py [--robots 10 30 100 300 1000] [--seeds 0 1] [--steps 1e6]
-        [--agent me-graph] [--out results/robot-curve] [--report]
+    python benchmarks/robot_curve.py [--variants reach obstacles pose push]
+        [--robots 10 30 100 300 1000] [--seeds 0 1] [--steps N] [--agent me-graph]
+        [--out results/robot-curve] [--report]
 
-Each policy is trained in MuJoCo on reach with robots of the grammar ``serial``, none of which is in
-a split, and judged on the test robots of four splits. Robots and training of a seed have this seed.
-Finished evaluations are kept; ``--report`` only prints the table of what is there. A cell has the
-mean score over the seeds, in brackets the lowest and the highest score, and the mean success.
+Each policy is trained in MuJoCo with robots of the grammar ``serial``, none of which is in a split,
+on one variant of a task: reach, reach among obstacles, reach with a goal pose, or push. It is
+judged on the test robots of splits, and on ten real arms with a stick, 20 episodes each. Robots and
+training of a seed have this seed. Finished evaluations are kept in one file for each policy;
+``--report`` only prints the tables of what is there. A cell has the mean score over the seeds, in
+brackets the lowest and the highest score, and the mean success; push, whose score is the success,
+has the latter alone.
 """
 
 from __future__ import annotations
@@ -15,17 +19,67 @@ import argparse
 import json
 import subprocess
 import sys
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 from tabulate import tabulate
 
-SPLITS = (
-    "interpolation/arm3/reach",
-    "interpolation/panda/reach",
-    "composition/ee-arm/reach",
-    "extrapolation/arms/reach",
+from morphgen.formats.files import write_atomic
+
+REAL_ARMS = (
+    *("ur5", "panda", "kinova_gen3", "xarm7", "iiwa14"),
+    *("jaco2", "lwr", "widowx", "z1", "ur10"),
 )
+REAL_EPISODES = 20
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A variant of a task, and what its policies are judged on."""
+
+    task: str
+    options: tuple[str, ...]
+    """Options of ``morphgen train`` that make the variant; those of one arm's evaluation too."""
+    splits: tuple[str, ...]
+    steps: float
+    """Default number of transitions."""
+
+
+VARIANTS = {
+    "reach": Variant(
+        "reach",
+        (),
+        (
+            "interpolation/arm3/reach",
+            "interpolation/panda/reach",
+            "composition/ee-arm/reach",
+            "extrapolation/arms/reach",
+        ),
+        1e6,
+    ),
+    "obstacles": Variant("reach", ("--obstacles",), ("interpolation/arm3/reach-obstacles",), 1e6),
+    "pose": Variant(
+        "reach",
+        ("--goal", "pose"),
+        ("interpolation/arm3/reach", "extrapolation/primitives/reach"),
+        1e6,
+    ),
+    "push": Variant(
+        "push",
+        (),
+        (
+            "interpolation/arm3/push",
+            "interpolation/panda/push",
+            "composition/ee-arm/push",
+            "extrapolation/primitives/push",
+            "extrapolation/arms/push",
+        ),
+        1.5e6,
+    ),
+}
 
 
 def morphgen(*words: str) -> None:
@@ -33,61 +87,97 @@ def morphgen(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "morphgen", *words], check=True)
 
 
-def file_of(out: Path, robots: int, seed: int, split: str) -> Path:
-    """Return the file with the scores of a policy on the test robots of a split."""
-    return out / f"serial{robots}-seed{seed}-{split.removesuffix('/reach').replace('/', '-')}.json"
+def tests_of(variant: Variant) -> dict[str, tuple[str, ...]]:
+    """Return the options of ``morphgen eval`` for each split and real arm."""
+    tests: dict[str, tuple[str, ...]] = {
+        split: ("--split", split, "--on", "test") for split in variant.splits
+    }
+    obstacles = [word for word in variant.options if word == "--obstacles"]
+    for arm in REAL_ARMS:
+        words = ("--split", f"arm={arm}", "ee=stick", f"task={variant.task}")
+        tests[f"{arm}-stick"] = (*words, *obstacles, "--episodes", str(REAL_EPISODES))
+    return tests
 
 
-def train_and_judge(robots: int, seed: int, args: argparse.Namespace) -> None:
-    """Train one policy and write its scores on each split that has none."""
-    files = {split: file_of(args.out, robots, seed, split) for split in SPLITS}
-    missing = {split: path for split, path in files.items() if not path.exists()}
+def file_of(out: Path, name: str, robots: int, seed: int) -> Path:
+    """Return the file with the scores of a policy."""
+    return out / f"{name}-serial{robots}-seed{seed}.json"
+
+
+def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace) -> None:
+    """Train one policy, and write its scores on each split and real arm that has none."""
+    variant, path = VARIANTS[name], file_of(args.out, name, robots, seed)
+    scores = json.loads(path.read_text("utf-8")) if path.exists() else {}
+    missing = {test: words for test, words in tests_of(variant).items() if test not in scores}
     if not missing:
         return
-    run = Path("runs/robot-curve") / f"serial{robots}-seed{seed}"
+    run = Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}"
     morphgen(
-        *("train", "task=reach", "--robots", f"serial:{robots}", "--robot-seed", str(seed)),
-        *("--agent", args.agent, "--seed", str(seed), "--steps", str(args.steps)),
+        *("train", f"task={variant.task}", *variant.options),
+        *("--robots", f"serial:{robots}", "--robot-seed", str(seed)),
+        *("--agent", args.agent, "--seed", str(seed), "--steps", str(args.steps or variant.steps)),
         *("--sim", "mujoco", "--envs", "160", "--train-goals", "50", "--workers", "2"),
         *("--no-tensorboard", "--out", str(run), "--resume"),
     )
-    for split, path in missing.items():
-        morphgen(
-            *("eval", str(run), "--split", split, "--on", "test", "--mode", "deterministic"),
-            *("--sim", "mujoco", "--out", str(path)),
-        )
+    for test, words in missing.items():
+        with tempfile.TemporaryDirectory() as folder:
+            rows = Path(folder) / "rows.json"
+            morphgen(
+                *("eval", str(run), *words, "--mode", "deterministic", "--sim", "mujoco"),
+                *("--out", str(rows)),
+            )
+            scores[test] = json.loads(rows.read_text("utf-8"))["deterministic"]
+        write_atomic(path, json.dumps(scores, indent=1) + "\n")
 
 
-def cell(paths: list[Path]) -> str:
-    """Return score and success over seeds; nothing if no seed has scores."""
-    rows = [json.loads(path.read_text("utf-8"))["deterministic"] for path in paths if path.exists()]
-    if not rows:
+def cell(seeds: list[list[dict[str, Any]]]) -> str:
+    """Return score and success over seeds from the rows of robots; nothing if no seed has rows."""
+    if not seeds:
         return ""
-    scores = [mean(row["score"] for row in seed) for seed in rows]
-    success = mean(row["success"] for seed in rows for row in seed)
+    scores = [mean(row["score"] for row in rows) for rows in seeds]
+    success = mean(row["success"] for rows in seeds for row in rows)
+    if seeds[0][0]["task"] == "push":
+        return f"{success:.0%} [{min(scores):.0%}, {max(scores):.0%}]"
     return f"{mean(scores):.1f} [{min(scores):.1f}, {max(scores):.1f}], {success:.0%}"
 
 
-def main() -> None:
-    """Train and judge what is missing, and print the table."""
+def table(name: str, args: argparse.Namespace) -> str:
+    """Return the table of a variant: a row for each number of robots."""
+    splits, lines = VARIANTS[name].splits, []
+    arms = [f"{arm}-stick" for arm in REAL_ARMS]
+    for robots in args.robots:
+        paths = [file_of(args.out, name, robots, seed) for seed in args.seeds]
+        stored = [json.loads(path.read_text("utf-8")) for path in paths if path.exists()]
+        cells = [cell([rows[split] for rows in stored if split in rows]) for split in splits]
+        complete = [rows for rows in stored if all(arm in rows for arm in arms)]
+        real = cell([[row for arm in arms for row in rows[arm]] for rows in complete])
+        lines.append([robots, *cells, real])
+    return tabulate(lines, headers=["robots", *splits, "ten real arms"], tablefmt="github")
+
+
+def arguments(words: list[str] | None = None) -> argparse.Namespace:
+    """Return the options of the command line, or of other words."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--robots", type=int, nargs="+", default=[10, 30, 100, 300, 1000])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--steps", type=float, default=1e6)
+    parser.add_argument("--steps", type=float, help="transitions (default: 1e6, push: 1.5e6)")
     parser.add_argument("--agent", default="me-graph")
     parser.add_argument("--out", type=Path, default=Path("results/robot-curve"))
-    parser.add_argument("--report", action="store_true", help="only print the table")
-    args = parser.parse_args()
+    parser.add_argument("--report", action="store_true", help="only print the tables")
+    return parser.parse_args(words)
+
+
+def main() -> None:
+    """Train and judge what is missing, and print the tables."""
+    args = arguments()
     args.out.mkdir(parents=True, exist_ok=True)
-    if not args.report:
-        for robots in args.robots:
-            for seed in args.seeds:
-                train_and_judge(robots, seed, args)
-    table = [
-        [n, *(cell([file_of(args.out, n, seed, split) for seed in args.seeds]) for split in SPLITS)]
-        for n in args.robots
-    ]
-    print(tabulate(table, headers=["robots", *SPLITS], tablefmt="github"))
+    for name in args.variants:
+        if not args.report:
+            for robots in args.robots:
+                for seed in args.seeds:
+                    train_and_judge(name, robots, seed, args)
+        print(f"\n{name}\n{table(name, args)}")
 
 
 if __name__ == "__main__":

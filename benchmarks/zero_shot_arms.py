@@ -1,13 +1,13 @@
 """Success of a policy on every arm of the library with a stick, beside untrained controllers.
 
-    python benchmarks/zero_shot_arms.py [--policy CHECKPOINT] [--obstacles] [--episodes 50]
-        [--only ur] [--seed 0] [--jobs 2] [--json rows.json]
+    python benchmarks/zero_shot_arms.py [--task reach] [--goal position] [--obstacles]
+        [--policy CHECKPOINT] [--episodes 50] [--only ur] [--seed 0] [--jobs 2] [--json rows.json]
 
 The arms are those in use: not the templates of which robots are drawn for training, not the Panda
 with other sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in
-MuJoCo. The controller "path" follows the straight path of the observation channel ``ik``, to which
-policies with ``--residual`` add their actions. A cell is the success rate with its 95% Wilson
-interval. The last rows are the mean over the arms, and the number of arms below 80%.
+MuJoCo. At reach, the controller "path" follows the straight path of the observation channel ``ik``,
+to which policies with ``--residual`` add their actions. A cell is the success rate with its 95%
+Wilson interval. The last rows are the mean over the arms, and the number of arms below 80%.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import mean
 
@@ -25,14 +25,15 @@ from tqdm import tqdm
 
 from morphgen.grammar.library import default_library
 from morphgen.processes import parallel_map
-from morphgen.rl.evaluation import EvalConfig, evaluate
+from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate
 from morphgen.rl.robot_source import robot_source
-from morphgen.rl.runs import Interface
+from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.rl.zeroshot import ZeroShotResult, result_of, zero_shot
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import observation_config
+from morphgen.tasks.reach import GOAL_KINDS
 
 LEFT_OUT = ("arm3", "arm5", "arm_ed", "panda_scaled", "yumi")
 ENOUGH = 0.8
@@ -51,23 +52,26 @@ class FollowPath:
 class Measuring:
     """Measurement of one arm, as worker processes run it."""
 
-    policy: Path
+    task: str
     obstacles: bool
-    episodes: int
-    seed: int
+    policy: Path
+    config: EvalConfig
 
     def __call__(self, arm: str) -> tuple[str, list[ZeroShotResult]]:
         """Run the episodes of one arm."""
-        source = robot_source(f"arm={arm} ee=stick", "reach", obstacles=self.obstacles)
-        config = EvalConfig(self.episodes, "mujoco", self.seed)
-        (score,) = evaluate([FollowPath], source, config, Interface(channels=PATH))
-        results = zero_shot(source, config, policy=self.policy)
-        return arm, [results[0], result_of("path", score), *results[1:]]
+        source = robot_source(f"arm={arm} ee=stick", self.task, obstacles=self.obstacles)
+        results = zero_shot(source, self.policy, self.config)
+        if self.task == "reach":
+            (score,) = evaluate([FollowPath], source, self.config, Interface(channels=PATH))
+            results.insert(1, result_of("path", score))
+        return arm, results
 
 
 def main() -> None:
     """Measure all arms and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", default="reach")
+    parser.add_argument("--goal", choices=GOAL_KINDS, default=GOAL_KINDS[0])
     parser.add_argument("--policy", help="a checkpoint, or a policy that comes with morphgen")
     parser.add_argument("--obstacles", action="store_true")
     parser.add_argument("--episodes", type=int, default=50)
@@ -83,8 +87,11 @@ def main() -> None:
         and manifest.name not in LEFT_OUT
         and re.search(args.only, manifest.name)
     ]
-    policy = checkpoint_path(args.policy or zero_shot_policy(obstacles=args.obstacles).name)
-    work = Measuring(policy, args.obstacles, args.episodes, args.seed)
+    shipped = zero_shot_policy(args.task, args.goal, obstacles=args.obstacles)
+    policy = checkpoint_path(args.policy or shipped.name)
+    run, _ = read_checkpoint(policy)
+    config = replace(eval_config_of(run, args.episodes, seed=args.seed), sim="mujoco")
+    work = Measuring(args.task, args.obstacles, policy, config)
     measured = dict(tqdm(parallel_map(work, arms, args.jobs, chunk=1), total=len(arms), unit="arm"))
     if args.json:
         rows = {arm: [asdict(result) for result in results] for arm, results in measured.items()}

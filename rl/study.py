@@ -211,7 +211,8 @@ def do_cell(
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
-    The scores and the episodes of a mode are written when it is evaluated.
+    The scores and the episodes of a mode are written when it is evaluated. Policies are evaluated
+    on the CPU, so that a machine without the GPU of the training gives the same scores.
 
     Raises:
         MorphgenError: As ``train`` and ``evaluate``.
@@ -248,9 +249,8 @@ def do_cell(
         for side in sides:
             shown = progress(f"{cell.agent}{f' {name}' if mode else ''} on {side}")
             if config is not None and mode is not None:
-                device = config.device
                 records += evaluate_run(
-                    folder, side, eval_config, mode, device=device, progress=shown, record=recorder
+                    folder, side, eval_config, mode, progress=shown, record=recorder
                 )
             # A baseline is not evaluated on a side without a robot for it.
             elif BASELINES[cell.agent].suits(tasks_of(other_side(cell.source, side))):

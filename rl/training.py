@@ -138,8 +138,9 @@ def train(
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
         require_runnable(part.config)
-    require_device(config.device)
     require_open(folder, config, resume=resume)
+    if not all(map(is_done, parts)):
+        require_device(config.device)  # a finished run is evaluated on machines without its GPU
     with ExitStack() as held:
         processes, device = held.enter_context(process_group(config.device))
         holds = False

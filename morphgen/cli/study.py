@@ -99,14 +99,12 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.robot_source import other_side, tasks_of
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.rl.training import require_runnable, subruns_of
+    from morphgen.rl.training import is_done, require_runnable, subruns_of
     from morphgen.tasks.device import require_device
     from morphgen.tasks.env_specs import default_configs
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
-    if args.ray is None and not args.report:
-        require_device(args.device)
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
     sim = evaluation_simulator(args.sim or default_simulator())
@@ -124,9 +122,14 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
             config = run_config(other_side(source, side), spec, args)
             for seed in seeds:
                 seeded = matched_budget(replace(config, seed=seed))
-                for subrun in () if args.report else subruns_of(args.out, seeded):
-                    require_runnable(subrun.config)
-                cells.append(agent_cell(args.out, label, seeded, eval_config, finetune))
+                cell = agent_cell(args.out, label, seeded, eval_config, finetune)
+                cells.append(cell)
+                parts = () if args.report else subruns_of(cell.folder, seeded)
+                for part in parts:
+                    require_runnable(part.config)
+                gpu = args.device != "cpu" and args.ray is None
+                if gpu and not all(map(is_done, parts)):
+                    require_device(args.device)  # policies are evaluated on the CPU
     return cells
 
 

@@ -273,6 +273,25 @@ def test_study_report_of_gpu_runs_needs_no_gpu(run, split_yaml, tmp_path):
     assert "missing" in out
 
 
+def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)
+    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    assert run(*words)[0] == 0
+    folder = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0"
+    scores = (folder / "scores.json").read_bytes()
+    (folder / "scores.json").unlink()
+    config = (folder / "config.json").read_text()
+    assert '"device": "cpu"' in config
+    (folder / "config.json").write_text(config.replace('"device": "cpu"', '"device": "cuda"'))
+    assert run(*words, "--device", "cuda")[0] == 0
+    assert (folder / "scores.json").read_bytes() == scores
+    (folder / CHECKPOINT).unlink()
+    code, _, err = run(*words, "--device", "cuda")
+    assert code == 2
+    assert "device 'cuda': this machine has no CUDA device" in err
+
+
 @pytest.mark.slow
 def test_study_prints_a_table(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)

@@ -1,0 +1,262 @@
+"""Write the tables and figures of docs/results.md from the scores in results/.
+
+    python docs/results_page.py
+
+Each table stands between two comments of the page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
+replaced. The figures are docs/images/results/reach.png and robots.png.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from tabulate import tabulate
+
+from morphgen.benchmark.split import SIDES, Side
+from morphgen.rl.intervals import wilson_interval
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs/results.md"
+IMAGES = ROOT / "docs/images/results"
+STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
+SPLITS = (
+    "interpolation/arm3",
+    "interpolation/panda",
+    "composition/ee-arm",
+    "extrapolation/primitives",
+    "extrapolation/arms",
+)
+PAPER_AGENT = "-symlog-slow-critic-discrete"
+CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
+AGENTS = {
+    "me-graph": "`me-graph`",
+    f"me-mlp{PAPER_AGENT}{CHANNELS}": "`me-mlp`, kinematic channels",
+    f"me-tf{PAPER_AGENT}{CHANNELS}": "`me-tf`, kinematic channels",
+    f"me-mlp{PAPER_AGENT}": "`me-mlp`, the paper's observations",
+    f"me-tf{PAPER_AGENT}": "`me-tf`, the paper's observations",
+}
+BASELINES = ("scripted", "ik", "jacobian", "random")
+COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
+CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Scores of the robots of a side, over all seeds of an agent."""
+
+    seeds: int
+    score: float
+    """Mean score over seeds and robots."""
+    success: float
+    successes: int
+    episodes: int
+    """Number of successful episodes, and of all."""
+
+
+def results_of(study: str, split: str) -> dict[tuple[str, int], dict[str, dict[Side, Result]]]:
+    """Return the results of a split by agent and transitions, by mode, and by side.
+
+    Args:
+        study: Folder in results/.
+        split: Split with its task.
+    """
+    rows: dict[tuple[str, int], dict[str, dict[Side, list[list[dict[str, Any]]]]]] = {}
+    for path in sorted((ROOT / "results" / study / split).glob("*/**/scores.json")):
+        config = path.with_name("config.json")
+        run = json.loads(config.read_text("utf-8")) if config.exists() else None
+        steps = run["ppo"]["total_timesteps"] if run else 0
+        agent = path.parent.parent.name if run else path.parent.name
+        modes = rows.setdefault((agent, steps), {})
+        for mode, records in json.loads(path.read_text("utf-8"))["scores"].items():
+            for side in SIDES:
+                own = [record for record in records if record["side"] == side]
+                if own:
+                    modes.setdefault(mode, {}).setdefault(side, []).append(own)
+    return {
+        key: {
+            mode: {side: _result(seeds) for side, seeds in sides.items()}
+            for mode, sides in modes.items()
+        }
+        for key, modes in rows.items()
+    }
+
+
+def _result(seeds: list[list[dict[str, Any]]]) -> Result:
+    records = [record for seed in seeds for record in seed]
+    successes = sum(round(record["success"] * record["episodes"]) for record in records)
+    return Result(
+        len(seeds),
+        mean(record["score"] for record in records),
+        mean(record["success"] for record in records),
+        successes,
+        sum(record["episodes"] for record in records),
+    )
+
+
+def split_table(task: str) -> str:
+    """Return the table of a task: every split with all agents and baselines."""
+    lines = []
+    for split in SPLITS:
+        found: dict[tuple[str, int, str], dict[str, dict[Side, Result]]] = {}
+        for study in STUDIES:
+            note = ", four epochs" if "4epochs" in study else ""
+            for (agent, steps), modes in results_of(study, f"{split}/{task}").items():
+                if agent in AGENTS or (agent in BASELINES and study == f"{task}-30m"):
+                    found[agent, steps, note] = modes
+        order = [*AGENTS, *BASELINES]
+        for agent, steps, note in sorted(found, key=lambda key: (order.index(key[0]), key[1:])):
+            modes = found[agent, steps, note]
+            lines.append([split, *_line(agent, steps, note, modes, task)])
+            split = ""
+    score = ["MT", "success", "ZS", "success"] if task == "reach" else ["MT", "ZS"]
+    headers = ["split", "agent", "transitions", "seeds", *score, "fine-tuned"]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def _line(
+    agent: str,
+    steps: int,
+    note: str,
+    modes: Mapping[str, Mapping[Side, Result]],
+    task: str,
+) -> list[str]:
+    sides = modes["deterministic"] if steps else next(iter(modes.values()))
+    cells = [AGENTS.get(agent, f"`{agent}`") + note]
+    cells.append(f"{round(steps / 1e6)} million" if steps else "")
+    cells.append(str(sides["train"].seeds) if steps else "")
+    for side in SIDES:
+        if side not in sides:
+            cells += [""] * (2 if task == "reach" else 1)
+            continue
+        result = sides[side]
+        interval = wilson_interval(result.successes, result.episodes).as_percent()
+        cells += [f"{result.score:.1f}", interval] if task == "reach" else [interval]
+    tuned = [modes[key]["test"] for key in modes if key.startswith("fine-tuned 30,000")]
+    cells.append(f"{tuned[0].success:.0%}" if tuned else "")
+    return cells
+
+
+def curve_table(name: str) -> str:
+    """Return the table of a variant of benchmarks/robot_curve.py."""
+    command = ["--report", "--variants", name, "--out", str(ROOT / "results/robot-curve")]
+    args = CURVE["arguments"](command)
+    return str(CURVE["table"](name, args))
+
+
+def write_tables(tables: Mapping[str, str], page: str) -> str:
+    """Return a page with its tables replaced.
+
+    Raises:
+        ValueError: If the page has no place for a table.
+    """
+    for name, table in tables.items():
+        pattern = rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)"
+        page, count = re.subn(pattern, rf"\1\n{table}\n\n\2", page, flags=re.DOTALL)
+        if count != 1:
+            raise ValueError(f"{PAGE}: {count} places for the table {name}; expected one")
+    return page
+
+
+def bar_figure() -> Figure:
+    """Return bars of the zero-shot success of each agent on each split of reach."""
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 / (len(AGENTS) + 1)
+    names = {**AGENTS, "jacobian": "`jacobian`"}
+    for i, (agent, name) in enumerate(names.items()):
+        label: str | None = name.replace("`", "")
+        for x, split in enumerate(SPLITS):
+            found = results_of("reach-30m", f"{split}/reach")
+            modes = [modes for (of, _), modes in found.items() if of == agent]
+            if not modes:
+                continue
+            sides = modes[0].get("deterministic") or next(iter(modes[0].values()))
+            rate = wilson_interval(sides["test"].successes, sides["test"].episodes)
+            axes.bar(
+                x + (i - len(AGENTS) / 2) * width,
+                100 * rate.value,
+                width,
+                yerr=[[100 * (rate.value - rate.low)], [100 * (rate.high - rate.value)]],
+                color=(*COLOURS, "#a0aec0")[i],
+                label=label,
+                error_kw={"elinewidth": 0.8},
+            )
+            label = None  # once in the legend
+    axes.set_xticks(range(len(SPLITS)), SPLITS, fontsize=8)
+    axes.set_ylabel("zero-shot success [%]")
+    axes.set_ylim(0, 105)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def curve_figure() -> Figure:
+    """Return success on ten real arms against the number of training robots, by variant."""
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    axes = figure.subplots()
+    arms = [f"{arm}-stick" for arm in CURVE["REAL_ARMS"]]
+    for name, colour in zip(CURVE["VARIANTS"], COLOURS, strict=False):
+        points: list[tuple[int, list[float]]] = []
+        for robots in (10, 30, 100, 300, 1000):
+            rates = list(_real_rates(name, robots, arms))
+            if rates:
+                points.append((robots, rates))
+        if not points:
+            continue
+        xs = [robots for robots, _ in points]
+        axes.plot(xs, [100 * mean(rates) for _, rates in points], color=colour, label=name)
+        for robots, rates in points:
+            axes.plot([robots] * len(rates), [100 * r for r in rates], "o", ms=3, color=colour)
+    axes.set_xscale("log")
+    axes.set_xlabel("robots of the grammar serial in training")
+    axes.set_ylabel("success on ten real arms [%]")
+    axes.set_ylim(0, 102)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _real_rates(name: str, robots: int, arms: Iterable[str]) -> Iterable[float]:
+    """Yield the mean success on the real arms of each seed that has all of them."""
+    for seed in (0, 1):
+        path = CURVE["file_of"](ROOT / "results/robot-curve", name, robots, seed)
+        rows = json.loads(path.read_text("utf-8")) if path.exists() else {}
+        if all(arm in rows for arm in arms):
+            yield mean(row["success"] for arm in arms for row in rows[arm])
+
+
+def save(figure: Figure, name: str) -> Path:
+    """Write a figure, and return its path."""
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    path = IMAGES / name
+    FigureCanvasAgg(figure).print_figure(path, dpi=110, metadata={"Software": None})
+    return path
+
+
+def tables() -> dict[str, str]:
+    """Return the tables of the page by their names."""
+    return {
+        **{task: split_table(task) for task in ("reach", "push")},
+        **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
+    }
+
+
+def main() -> int:
+    """Write the page and the figures."""
+    PAGE.write_text(write_tables(tables(), PAGE.read_text("utf-8")), "utf-8")
+    print(PAGE)
+    print(save(bar_figure(), "reach.png"))
+    print(save(curve_figure(), "robots.png"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
