@@ -373,9 +373,6 @@ def _score(
 def eval_config_of(
     config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
 ) -> EvalConfig:
-    """Return the config to evaluate a run in its tasks, and its simulator if that has contacts.
-
-    The number of goals per robot is the tasks' default, whatever the run was trained with.
-    """
-    tasks = tuple(replace(task, num_goals=type(task)().num_goals) for task in config.tasks)
-    return EvalConfig(episodes, evaluation_simulator(config.sim), seed, workers, tasks)
+    """Return the config to evaluate a run in its tasks, and its simulator if that has contacts."""
+    sim = evaluation_simulator(config.sim)
+    return EvalConfig(episodes, sim, seed, workers, config.evaluation_tasks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,10 +24,17 @@ from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.make import BatchOptions
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.task import TaskConfig
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
 """How a policy acts: by the mean of its actions, or by sampling."""
+
+
+class PolicyBatchOptions(BatchOptions):
+    """Keyword arguments of ``make_batch`` for the environments of a policy."""
+
+    configs: Sequence[TaskConfig]
 
 
 class Policy:
@@ -39,7 +47,14 @@ class Policy:
         actions = policy.act(batch.reset())
     """
 
-    def __init__(self, learner: dict[str, Any], mode: Mode, seed: int, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        learner: dict[str, Any],
+        mode: Mode,
+        seed: int,
+        device: str = "cpu",
+        tasks: Sequence[TaskConfig] = (),
+    ) -> None:
         """Build the actor of a learner.
 
         Args:
@@ -47,10 +62,12 @@ class Policy:
             mode: Whether the policy acts by the mean of its actions, or samples them.
             seed: Seed of the samples.
             device: Device of the network.
+            tasks: Configs of the tasks that the policy is for, as for goals that are poses.
 
         Raises:
             TaskError: If the state is of an agent that is unknown here.
         """
+        self._tasks = tuple(tasks)
         self.layout = layout_from(learner["layout"])
         """Layout of the observations that the policy was trained with."""
         self.config = policy_from(learner["policy"])
@@ -62,15 +79,20 @@ class Policy:
         self._generator = torch.Generator(self._device).manual_seed(seed)
 
     @property
-    def batch_options(self) -> BatchOptions:
+    def batch_options(self) -> PolicyBatchOptions:
         """Arguments of ``make_batch`` for environments with the policy's observations and actions.
 
-        They are continuous or discrete actions, the observation channels, and the number of links
-        that an agent for robots of one size needs.
+        They are continuous or discrete actions, the observation channels, the number of links that
+        an agent for robots of one size needs, and the configs of the tasks.
         """
         links, obstacles = self.layout.links, self.layout.obstacles
         needed = policy_interface(self.config, max_links=links, obstacles=obstacles)
-        return {"kind": needed.kind, "observe": needed.channels, "max_links": needed.max_links}
+        return {
+            "kind": needed.kind,
+            "observe": needed.channels,
+            "max_links": needed.max_links,
+            "configs": self._tasks,
+        }
 
     def require(self, observation: Observation) -> None:
         """Require that an observation has the layout that the policy was trained with.
@@ -106,8 +128,8 @@ def load_policy(
     """Load a policy. Nothing in its checkpoint is executed.
 
     Args:
-        path: A checkpoint, the folder of a run, or the name of a shipped policy: ``zero-shot`` or
-            ``zero-shot-obstacles``.
+        path: A checkpoint, the folder of a run, or the name of a shipped policy, such as
+            ``zero-shot``.
         mode: Whether the policy acts by the mean of its actions, or samples them.
         seed: Seed of the samples.
         device: Device of the network.
@@ -115,7 +137,8 @@ def load_policy(
     Raises:
         TaskError: If the checkpoint is missing, damaged or of another version.
     """
-    return Policy(read_checkpoint(checkpoint_path(path))[1], mode, seed, device)
+    run, learner = read_checkpoint(checkpoint_path(path))
+    return Policy(learner, mode, seed, device, run.evaluation_tasks)
 
 
 class PolicyController:

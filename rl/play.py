@@ -11,7 +11,6 @@ from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
 from morphgen.processes import one_torch_thread
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
@@ -69,7 +68,7 @@ def read_controller(name: str, task: str) -> ControllerSpec:
     if not path.exists():
         raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
     run, learner = read_checkpoint(path)
-    config = GoalConfig(tasks=eval_config_of(run, 1).tasks).task_config(task)
+    config = GoalConfig(tasks=run.evaluation_tasks).task_config(task)
     return ControllerSpec(name, task, config, run.interface, learner)
 
 

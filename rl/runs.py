@@ -94,6 +94,11 @@ class RunConfig:
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of the tasks; a file has an entry for each, under the name of the task."""
 
+    @property
+    def evaluation_tasks(self) -> tuple[TaskConfig, ...]:
+        """Configs of the tasks in evaluations: with the default number of goals per robot."""
+        return tuple(replace(task, num_goals=type(task)().num_goals) for task in self.tasks)
+
     def __post_init__(self) -> None:
         """Check the numbers.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.tasks.registry import Registry
 
@@ -31,6 +32,14 @@ ZERO_SHOT_OBSTACLES = ShippedPolicy(
     "zero-shot-obstacles", _FOLDER / "reach-obstacles" / "checkpoint.pt", ("reach",)
 )
 """The policy of ``morphgen zeroshot --obstacles``: it reaches among three boxes."""
+ZERO_SHOT_POSE = ShippedPolicy("zero-shot-pose", _FOLDER / "pose" / "checkpoint.pt", ("reach",))
+"""The policy of ``morphgen zeroshot --goal pose``: it reaches poses."""
+ZERO_SHOT_POSE_OBSTACLES = ShippedPolicy(
+    "zero-shot-pose-obstacles", _FOLDER / "pose-obstacles" / "checkpoint.pt", ("reach",)
+)
+"""The policy of ``morphgen zeroshot --goal pose --obstacles``: it reaches poses among boxes."""
+ZERO_SHOT_PUSH = ShippedPolicy("zero-shot-push", _FOLDER / "push" / "checkpoint.pt", ("push",))
+"""The policy of ``morphgen zeroshot --task push``: it pushes with any robot."""
 
 POLICIES: Registry[ShippedPolicy] = Registry(
     "policy",
@@ -38,14 +47,40 @@ POLICIES: Registry[ShippedPolicy] = Registry(
     {
         "zero-shot": f"{__name__}:ZERO_SHOT",
         "zero-shot-obstacles": f"{__name__}:ZERO_SHOT_OBSTACLES",
+        "zero-shot-pose": f"{__name__}:ZERO_SHOT_POSE",
+        "zero-shot-pose-obstacles": f"{__name__}:ZERO_SHOT_POSE_OBSTACLES",
+        "zero-shot-push": f"{__name__}:ZERO_SHOT_PUSH",
     },
 )
 """Shipped policies by name."""
+_ZERO_SHOT = {
+    ("reach", "position", False): ZERO_SHOT,
+    ("reach", "position", True): ZERO_SHOT_OBSTACLES,
+    ("reach", "pose", False): ZERO_SHOT_POSE,
+    ("reach", "pose", True): ZERO_SHOT_POSE_OBSTACLES,
+    ("push", "position", False): ZERO_SHOT_PUSH,
+}
 
 
-def zero_shot_policy(*, obstacles: bool) -> ShippedPolicy:
-    """Return the shipped policy for reach with any robot, in free space or among obstacles."""
-    return ZERO_SHOT_OBSTACLES if obstacles else ZERO_SHOT
+def zero_shot_policy(task: str, goal: str, *, obstacles: bool) -> ShippedPolicy:
+    """Return the shipped policy that does a task with any robot.
+
+    Args:
+        task: Name of the task.
+        goal: Goal of reach, ``position`` or ``pose``; ``position`` for other tasks.
+        obstacles: Whether the robot is among obstacles.
+
+    Raises:
+        TaskError: If none comes with morphgen.
+    """
+    try:
+        return _ZERO_SHOT[task, goal, obstacles]
+    except KeyError as error:
+        among = " among obstacles" if obstacles else ""
+        raise TaskError(
+            f"no policy for {task}{among} comes with morphgen; name one with --policy, or choose "
+            "task reach, or push without obstacles"
+        ) from error
 
 
 def name_of(file: Path) -> str:

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from morphgen.errors import TaskError
+from morphgen.rl.baselines import ZERO, baselines_for
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints
 from morphgen.rl.intervals import Interval, wilson_interval
-from morphgen.rl.robot_source import RobotSource
+from morphgen.rl.robot_source import RobotSource, tasks_of
+from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.scores import Score
-from morphgen.rl.shipped_policies import ZERO_SHOT, name_of
-
-COMPARED = ("jacobian", "ik", "random")
-"""Controllers that the policy is compared with."""
+from morphgen.rl.shipped_policies import name_of
 
 Progress = Callable[[str, float, int], None]
 """Callback with a controller, the number of its episodes done, and their total."""
@@ -31,35 +30,38 @@ class ZeroShotResult:
     success: Interval
     """Success rate with its 95% Wilson interval."""
     distance: float
-    """Mean distance between tool and goal at the end of an episode [m]."""
+    """Mean distance from success at the end of an episode [m]."""
+    angle: float
+    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
     score: float
-    """Mean score of the episodes, relative to the random policy."""
+    """Mean score of the episodes; that of reach is relative to the random policy."""
 
 
 def zero_shot(
     source: RobotSource,
+    policy: Path,
     config: EvalConfig,
     *,
-    policy: Path = ZERO_SHOT.file,
     progress: Progress = lambda name, done, total: None,
 ) -> list[ZeroShotResult]:
-    """Run a policy, and the controllers of ``COMPARED``, on a robot that reaches.
+    """Run a policy on a robot, and the controllers that do not learn.
 
     All of them have the same starts and goals.
 
     Args:
-        source: One robot, at reach.
-        config: Episodes, simulator and seed.
+        source: One robot and its task.
         policy: Checkpoint of the policy, or folder of its run.
+        config: Episodes, simulator, seed, and the constants of the task.
         progress: Callback for the progress.
 
     Raises:
-        TaskError: If the source is no single robot at reach, or the checkpoint is invalid.
+        TaskError: If the checkpoint is invalid or was trained on other tasks.
         MorphgenError: If the robot or simulator cannot be built.
     """
-    if source.task != "reach":
-        raise TaskError(f"{source.name}: task {source.task}; expected a robot at reach")
-    name = name_of(policy)
+    task, name = str(source.task), name_of(policy)
+    trained = tasks_of(read_checkpoint(policy)[0].source)
+    if task not in trained:
+        raise TaskError(f"policy {name} was trained on {' and '.join(trained)}, not on {task}")
     (score,) = evaluate_checkpoints(
         [policy],
         source,
@@ -68,7 +70,7 @@ def zero_shot(
         progress=lambda done, total: progress(name, done, total),
     )
     scores = [(name, score)]
-    for baseline in COMPARED:
+    for baseline in compared_with(task):
         (score,) = evaluate_baseline(
             baseline,
             source,
@@ -79,6 +81,11 @@ def zero_shot(
     return [result_of(controller, score) for controller, score in scores]
 
 
+def compared_with(task: str) -> tuple[str, ...]:
+    """Return the baselines of a task that a policy is compared with: all but zero actions."""
+    return tuple(name for name in baselines_for(task) if name != ZERO.name)
+
+
 def result_of(controller: str, score: Score) -> ZeroShotResult:
     """Return the result of a controller from its score on a robot."""
     return ZeroShotResult(
@@ -86,5 +93,6 @@ def result_of(controller: str, score: Score) -> ZeroShotResult:
         score.episodes,
         wilson_interval(round(score.success * score.episodes), score.episodes),
         score.distance,
+        score.angle,
         score.score,
     )

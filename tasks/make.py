@@ -204,6 +204,11 @@ def batch_from_specs(
     require_geometry(geometry)
     simulator = SIMULATORS[sim or default_simulator()]
     require_simulator_device(simulator.name, device)
+    if workers > 1 and not simulator.takes_workers:
+        raise TaskError(
+            f"{workers} workers: simulator {simulator.name!r} steps all environments at once; "
+            "expected 1"
+        )
     _require_contacts(simulator, specs, geometry)
     folders = default_library(tuple(library)).folders
     robots = [spec.robot for spec in specs]

@@ -25,7 +25,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.presets import PRESETS, preset_of
 from morphgen.tasks.channels import CHANNELS
-from morphgen.tasks.registry import TASKS, default_simulator
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
 if TYPE_CHECKING:
@@ -164,8 +164,11 @@ def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
     with status(args, "loading"):
         from morphgen.rl.robot_source import other_side
+        from morphgen.tasks.device import batch_device, require_simulator_device
 
     require_robots_for_options(args)
+    sim = args.sim or default_simulator()
+    require_simulator_device(sim, batch_device(sim, args.device))
     with status(args, "reading the robots"):
         spec = agent_spec(args)
         if args.robots is None:
@@ -189,6 +192,8 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
 
     with training_progress() as show:
         execution = execution_config(args)
+        if config.source.grammars and not SIMULATORS[config.sim].takes_workers:
+            execution = replace(execution, workers=1)  # those of --workers have drawn the robots
         subruns = train(
             folder,
             config,

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
-from morphgen.errors import SimulationError
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
@@ -161,18 +160,8 @@ class Simulator:
     """Types of the devices that its tensors can be on, as of ``torch.device.type``."""
     simulates_contacts: bool = True
     """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
-
-
-def require_one_worker(simulator: str, workers: int) -> None:
-    """Require one worker for a simulator that steps all environments at once.
-
-    Raises:
-        SimulationError: If there are several.
-    """
-    if workers != 1:
-        raise SimulationError(
-            f"simulator {simulator!r} steps all environments at once: {workers} workers; expected 1"
-        )
+    takes_workers: bool = True
+    """Whether processes or threads share its work; one without steps all environments at once."""
 
 
 def require_reset_shapes(

@@ -14,7 +14,6 @@ from morphgen.tasks.sim.base import (
     Contacts,
     Scene,
     Simulator,
-    require_one_worker,
     require_reset_shapes,
 )
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
@@ -199,9 +198,8 @@ def _load(
     """Load scenes; see ``Simulator.load``.
 
     Raises:
-        SimulationError: If a scene has contacts, or there are several workers.
+        SimulationError: If a scene has contacts.
     """
-    require_one_worker("kinematic", workers)
     return KinematicSimulation(scenes, contacts, device=device)
 
 
@@ -212,4 +210,5 @@ SIMULATOR = Simulator(
     max_envs=65_536,
     devices=("cpu", "cuda"),
     simulates_contacts=False,
+    takes_workers=False,
 )

@@ -21,7 +21,6 @@ from morphgen.tasks.sim.base import (
     Contacts,
     Scene,
     Simulator,
-    require_one_worker,
     require_reset_shapes,
 )
 from morphgen.tasks.sim.mujoco_model import World, worlds
@@ -247,12 +246,7 @@ def _fault(overflow: int) -> str:
 def _load(
     scenes: Sequence[Scene], contacts: Contacts | None, workers: int, device: torch.device
 ) -> WarpSimulation:
-    """Load scenes; see ``Simulator.load``.
-
-    Raises:
-        SimulationError: If there are several workers.
-    """
-    require_one_worker("warp", workers)
+    """Load scenes; see ``Simulator.load``."""
     return WarpSimulation(scenes, contacts, device=device)
 
 
@@ -262,4 +256,5 @@ SIMULATOR = Simulator(
     native_step=None,
     max_envs=65_536,
     devices=("cuda",),  # tests use the CPU, where MuJoCo is far faster
+    takes_workers=False,
 )

@@ -97,9 +97,17 @@ def test_held_out_robots_are_skipped_and_fit_the_observations(run, tmp_path):
     assert read_checkpoint(Path("run"))[1]["layout"]["links"] == 25
 
 
+def test_workers_draw_for_a_simulator_that_has_none(run):
+    words = [*RUN, "cubes:2", "--steps", "32", "--workers", "2"]
+    words[words.index("mujoco")] = "kinematic"
+    assert run(*words)[0] == 0
+    assert len(read_drawn(Path("runs/cubes-2-reach/me-mlp/seed0"))) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ((*RUN, "cubes:900", "--sim", "warp"), "simulator 'warp' on device 'cpu'"),
         ((*RUN, "cubes"), "--robots cubes: 'cubes' is not a grammar and a number of robots"),
         ((*RUN, "none:3"), "unknown grammar 'none'"),
         (("train", "planar-cube", *RUN[1:], "cubes:2"), "name the task and nothing else"),

@@ -14,6 +14,7 @@ from morphgen.rl.agents import AGENTS, Agent, NetworkConfig, encoder
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.inference import load_policy
 from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.shipped_policies import POLICIES
 from morphgen.rl.training import train
 
 
@@ -87,15 +88,16 @@ def test_a_policy_acts_on_an_observation_alone(tmp_path):
         policy.act({**observation, "tokens": observation["tokens"][:, :3]})
 
 
-@pytest.mark.parametrize("name", ["zero-shot", "zero-shot-obstacles"])
+@pytest.mark.parametrize("name", POLICIES.builtin)
 def test_a_shipped_policy_is_loaded_by_its_name(name):
     from contextlib import closing
 
     from morphgen.tasks.make import make_batch
 
     policy = load_policy(name)
+    (task,) = POLICIES[name].tasks
     with closing(
-        make_batch("reach", ["planar-cube"], 2, sim="mujoco", **policy.batch_options)
+        make_batch(task, ["arm=ur5 ee=stick"], 2, sim="mujoco", **policy.batch_options)
     ) as batch:
         observation = batch.reset()
         assert policy.act(observation).shape == observation["links"].shape
