@@ -47,6 +47,7 @@ AGENTS = {
 }
 BASELINES = ("scripted", "ik", "jacobian", "random")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
+CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030")
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 
 
@@ -204,7 +205,7 @@ def curve_figure() -> Figure:
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
     axes = figure.subplots()
     arms = [f"{arm}-stick" for arm in CURVE["REAL_ARMS"]]
-    for name, colour in zip(CURVE["VARIANTS"], COLOURS, strict=False):
+    for name, colour in zip(CURVE["VARIANTS"], CURVE_COLOURS, strict=True):
         points: list[tuple[int, list[float]]] = []
         for robots in (10, 30, 100, 300, 1000):
             rates = list(_real_rates(name, robots, arms))

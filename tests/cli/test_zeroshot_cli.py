@@ -25,20 +25,25 @@ def test_shipped_policies_are_small_and_act_on_any_robot(name):
 @pytest.mark.parametrize(
     ("options", "controllers"),
     [
-        ("--obstacles", ["zero-shot-obstacles", "ik", "jacobian", "random"]),
-        ("--goal pose", ["zero-shot-pose", "ik", "jacobian", "random"]),
+        pytest.param(
+            "--obstacles",
+            ["zero-shot-obstacles", "ik", "jacobian", "random"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "--goal pose",
+            ["zero-shot-pose", "ik", "jacobian", "random"],
+            marks=pytest.mark.slow,
+        ),
         ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
         ("--task push", ["zero-shot-push", "scripted", "random"]),
     ],
 )
 def test_each_variant_has_a_policy_and_controllers_to_compare(options, controllers, capsys):
-    words = ["arm=ur5", "ee=stick", *options.split(), "--episodes", "2"]
-    assert main(["zeroshot", *words, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert [row["controller"] for row in rows] == controllers
-    assert all((row["angle"] is not None) == ("pose" in options) for row in rows)
+    words = ["arm=ur5", "ee=stick", *options.split(), "--episodes", "1"]
     assert main(["zeroshot", *words]) == 0
-    head = capsys.readouterr().out.splitlines()[0]
+    head, _, *rows = capsys.readouterr().out.splitlines()
+    assert [row.split()[0] for row in rows] == controllers
     assert ("angle" in head) == ("pose" in options)
     assert ("score" in head) == ("push" not in options)
 
@@ -58,11 +63,9 @@ def test_variants_without_a_policy_are_refused(options, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_the_goal_is_that_of_the_policys_training(capsys):
-    words = ["arm=ur5", "ee=stick", "--policy", "zero-shot-pose", "--episodes", "1", "--json"]
-    assert main(["zeroshot", *words]) == 0
-    assert all(row["angle"] is not None for row in json.loads(capsys.readouterr().out))
-    assert main(["zeroshot", *words, "--goal", "position"]) == 2
+def test_a_policy_for_poses_has_other_observations(capsys):
+    words = ["arm=ur5", "ee=stick", "--policy", "zero-shot-pose", "--goal", "position"]
+    assert main(["zeroshot", *words, "--episodes", "1"]) == 2
     assert "the checkpoint is for other observations" in capsys.readouterr().err
 
 
