@@ -3,7 +3,7 @@
     python docs/results_page.py
 
 Each table stands between two comments of the page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
-replaced. The figures are docs/images/results/reach.png and robots.png.
+replaced. The figures are reach.png, robots.png and similarity.png in docs/images/results.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ AGENTS = {
 BASELINES = ("scripted", "ik", "jacobian", "random")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
 CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030")
+sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
+TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 
 
 @dataclass(frozen=True)
@@ -247,7 +249,13 @@ def tables() -> dict[str, str]:
     return {
         **{task: split_table(task) for task in ("reach", "push")},
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
+        "similarity": TRANSFER["table"](similarity_rows()),
     }
+
+
+def similarity_rows() -> list[Any]:
+    """Return the rows of benchmarks/similarity_transfer.py."""
+    return list(TRANSFER["read_rows"](ROOT / TRANSFER["OUT"]))
 
 
 def main() -> int:
@@ -256,6 +264,8 @@ def main() -> int:
     print(PAGE)
     print(save(bar_figure(), "reach.png"))
     print(save(curve_figure(), "robots.png"))
+    TRANSFER["draw_figure"](similarity_rows(), IMAGES / "similarity.png")
+    print(IMAGES / "similarity.png")
     return 0
 
 
