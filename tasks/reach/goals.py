@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.errors import TaskError
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
@@ -75,6 +76,12 @@ def sample_goals(
     Configurations are uniform within the joint limits. Those that collide, also with the ground,
     and those outside of the main component of free C-space (``cspace_components``) are drawn again.
     Obstacles do not matter: each of their layouts leaves some of the configurations free.
+
+    Raises:
+        TaskError: If the tool is as good as still, so that every start is at every goal.
+        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration, or
+            obstacles block most goals.
+        MeshError: If a mesh cannot be read.
     """
     goals_seeds, obstacle_seeds = seeds.spawn(2)
     goals_rng = np.random.default_rng(goals_seeds)
@@ -84,6 +91,13 @@ def sample_goals(
         config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
     )
     poses = _pose_rows(frame_pose(robot, q, TOOL))
+    moved = float(np.linalg.norm(poses[:, :3] - poses[0, :3], axis=1).max())
+    if moved <= config.near and len(poses) > 1:
+        raise TaskError(
+            f"robot {robot.name!r} cannot reach: over {len(poses)} configurations its tool moves "
+            f"{moved:.2g} m, and a goal is reached within {config.near:g} m; place the frame "
+            f"{TOOL!r} at the working point"
+        )
     boxes: tuple[Block, ...] = ()
     layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
     if obstacles:

@@ -14,9 +14,9 @@ from helpers.goal_sets import CONFIG, LIFTED, sample_goals
 from helpers.scenes import robot
 from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.errors import BenchmarkError, TaskError
-from morphgen.model.geometry import Box, Shape
+from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
-from morphgen.model.robot import Link
+from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import (
@@ -332,3 +332,12 @@ def test_certificate_detects_a_collision(body, cache):
     walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])
     lines = certify_goals(goal_set, walled, scene_of(walled, goal_set))
     assert "goal 0: its configuration is in collision" in lines
+
+
+def test_a_robot_whose_tool_stays_in_place_has_no_goals(cache):
+    joint = Joint("turn", "revolute", "base", "rod", IDENTITY, (0.0, 0.0, 1.0), limits=(-1.0, 1.0))
+    rod = Link("rod", collisions=(Shape(Box((0.1, 0.1, 0.1))),))
+    tool = Frame("tool", "rod", Pose((0.0, 0.0, 0.5)))
+    body = Robot("spinner", (Link("base"), rod), (joint,), (tool,), (0.0,))
+    with pytest.raises(TaskError, match="'spinner' cannot reach: over 12 configurations its tool"):
+        sample_goals(body, cache)
