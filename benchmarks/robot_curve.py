@@ -141,17 +141,26 @@ def cell(seeds: list[list[dict[str, Any]]]) -> str:
     return f"{mean(scores):.1f} [{min(scores):.1f}, {max(scores):.1f}], {success:.0%}"
 
 
+def stored_scores(name: str, robots: int, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the rows of each test, for each seed that has scores."""
+    paths = [file_of(args.out, name, robots, seed) for seed in args.seeds]
+    return [json.loads(path.read_text("utf-8")) for path in paths if path.exists()]
+
+
+def real_arm_rows(stored: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Return the rows of the real arms, for each seed that has all of them."""
+    arms = [f"{arm}-stick" for arm in REAL_ARMS]
+    complete = [rows for rows in stored if all(arm in rows for arm in arms)]
+    return [[row for arm in arms for row in rows[arm]] for rows in complete]
+
+
 def table(name: str, args: argparse.Namespace) -> str:
     """Return the table of a variant: a row for each number of robots."""
     splits, lines = VARIANTS[name].splits, []
-    arms = [f"{arm}-stick" for arm in REAL_ARMS]
     for robots in args.robots:
-        paths = [file_of(args.out, name, robots, seed) for seed in args.seeds]
-        stored = [json.loads(path.read_text("utf-8")) for path in paths if path.exists()]
+        stored = stored_scores(name, robots, args)
         cells = [cell([rows[split] for rows in stored if split in rows]) for split in splits]
-        complete = [rows for rows in stored if all(arm in rows for arm in arms)]
-        real = cell([[row for arm in arms for row in rows[arm]] for rows in complete])
-        lines.append([robots, *cells, real])
+        lines.append([robots, *cells, cell(real_arm_rows(stored))])
     return tabulate(lines, headers=["robots", *splits, "ten real arms"], tablefmt="github")
 
 

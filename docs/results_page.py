@@ -8,11 +8,10 @@ replaced. The figures are reach.png, robots.png and similarity.png in docs/image
 
 from __future__ import annotations
 
-import json
 import re
 import runpy
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -23,7 +22,11 @@ from matplotlib.figure import Figure
 from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
-from morphgen.rl.intervals import wilson_interval
+from morphgen.formats.data_files import read_json
+from morphgen.rl.intervals import Interval, wilson_interval
+from morphgen.rl.runs import read_config
+from morphgen.rl.scores import Score
+from morphgen.rl.study_cells import stored_cell
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
@@ -50,6 +53,7 @@ COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
 CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030")
 sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
+CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve")])
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 
 
@@ -60,57 +64,59 @@ class Result:
     seeds: int
     score: float
     """Mean score over seeds and robots."""
-    success: float
-    successes: int
-    episodes: int
-    """Number of successful episodes, and of all."""
+    success: Interval
+    """Success rate of all episodes with its Wilson interval."""
 
 
-def results_of(study: str, split: str) -> dict[tuple[str, int], dict[str, dict[Side, Result]]]:
-    """Return the results of a split by agent and transitions, by mode, and by side.
+Modes = Mapping[str, Mapping[Side, Result]]
+"""Results by mode, or by the name of a baseline."""
+
+
+def results_of(study: str, split: str) -> dict[tuple[str, int], Modes]:
+    """Return the results of a split by agent and transitions; baselines have 0 transitions.
 
     Args:
         study: Folder in results/.
         split: Split with its task.
     """
-    rows: dict[tuple[str, int], dict[str, dict[Side, list[list[dict[str, Any]]]]]] = {}
+    found: dict[tuple[str, int], dict[str, dict[Side, list[list[Score]]]]] = {}
     for path in sorted((ROOT / "results" / study / split).glob("*/**/scores.json")):
-        config = path.with_name("config.json")
-        run = json.loads(config.read_text("utf-8")) if config.exists() else None
-        steps = run["ppo"]["total_timesteps"] if run else 0
-        agent = path.parent.parent.name if run else path.parent.name
-        modes = rows.setdefault((agent, steps), {})
-        for mode, records in json.loads(path.read_text("utf-8"))["scores"].items():
+        agent, steps = path.parent.name, 0
+        if path.with_name("config.json").exists():
+            agent = path.parent.parent.name
+            steps = read_config(path.parent).ppo.total_timesteps
+        modes = found.setdefault((agent, steps), {})
+        for mode, scores in stored_cell(path, read_json(path)).scores.items():
             for side in SIDES:
-                own = [record for record in records if record["side"] == side]
-                if own:
+                if own := [score for score in scores if score.side == side]:
                     modes.setdefault(mode, {}).setdefault(side, []).append(own)
     return {
         key: {
             mode: {side: _result(seeds) for side, seeds in sides.items()}
             for mode, sides in modes.items()
         }
-        for key, modes in rows.items()
+        for key, modes in found.items()
     }
 
 
-def _result(seeds: list[list[dict[str, Any]]]) -> Result:
-    records = [record for seed in seeds for record in seed]
-    successes = sum(round(record["success"] * record["episodes"]) for record in records)
-    return Result(
-        len(seeds),
-        mean(record["score"] for record in records),
-        mean(record["success"] for record in records),
-        successes,
-        sum(record["episodes"] for record in records),
-    )
+def _result(seeds: list[list[Score]]) -> Result:
+    scores = [score for seed in seeds for score in seed]
+    successes = sum(round(score.success * score.episodes) for score in scores)
+    episodes = sum(score.episodes for score in scores)
+    success = wilson_interval(successes, episodes)
+    return Result(len(seeds), mean(score.score for score in scores), success)
+
+
+def by_mean(modes: Modes) -> Mapping[Side, Result]:
+    """Return the results of a policy that acts by its mean, or of a baseline."""
+    return modes.get("deterministic") or next(iter(modes.values()))
 
 
 def split_table(task: str) -> str:
     """Return the table of a task: every split with all agents and baselines."""
     lines = []
     for split in SPLITS:
-        found: dict[tuple[str, int, str], dict[str, dict[Side, Result]]] = {}
+        found: dict[tuple[str, int, str], Modes] = {}
         for study in STUDIES:
             note = ", four epochs" if "4epochs" in study else ""
             for (agent, steps), modes in results_of(study, f"{split}/{task}").items():
@@ -126,14 +132,8 @@ def split_table(task: str) -> str:
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
-def _line(
-    agent: str,
-    steps: int,
-    note: str,
-    modes: Mapping[str, Mapping[Side, Result]],
-    task: str,
-) -> list[str]:
-    sides = modes["deterministic"] if steps else next(iter(modes.values()))
+def _line(agent: str, steps: int, note: str, modes: Modes, task: str) -> list[str]:
+    sides = by_mean(modes)
     cells = [AGENTS.get(agent, f"`{agent}`") + note]
     cells.append(f"{round(steps / 1e6)} million" if steps else "")
     cells.append(str(sides["train"].seeds) if steps else "")
@@ -141,19 +141,16 @@ def _line(
         if side not in sides:
             cells += [""] * (2 if task == "reach" else 1)
             continue
-        result = sides[side]
-        interval = wilson_interval(result.successes, result.episodes).as_percent()
-        cells += [f"{result.score:.1f}", interval] if task == "reach" else [interval]
+        success = sides[side].success.as_percent()
+        cells += [f"{sides[side].score:.1f}", success] if task == "reach" else [success]
     tuned = [modes[key]["test"] for key in modes if key.startswith("fine-tuned 30,000")]
-    cells.append(f"{tuned[0].success:.0%}" if tuned else "")
+    cells.append(f"{tuned[0].success.value:.0%}" if tuned else "")
     return cells
 
 
 def curve_table(name: str) -> str:
     """Return the table of a variant of benchmarks/robot_curve.py."""
-    command = ["--report", "--variants", name, "--out", str(ROOT / "results/robot-curve")]
-    args = CURVE["arguments"](command)
-    return str(CURVE["table"](name, args))
+    return str(CURVE["table"](name, CURVE_OPTIONS))
 
 
 def write_tables(tables: Mapping[str, str], page: str) -> str:
@@ -175,16 +172,15 @@ def bar_figure() -> Figure:
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / (len(AGENTS) + 1)
+    results = [results_of("reach-30m", f"{split}/reach") for split in SPLITS]
     names = {**AGENTS, "jacobian": "`jacobian`"}
     for i, (agent, name) in enumerate(names.items()):
         label: str | None = name.replace("`", "")
-        for x, split in enumerate(SPLITS):
-            found = results_of("reach-30m", f"{split}/reach")
+        for x, found in enumerate(results):
             modes = [modes for (of, _), modes in found.items() if of == agent]
             if not modes:
                 continue
-            sides = modes[0].get("deterministic") or next(iter(modes[0].values()))
-            rate = wilson_interval(sides["test"].successes, sides["test"].episodes)
+            rate = by_mean(modes[0])["test"].success
             axes.bar(
                 x + (i - len(AGENTS) / 2) * width,
                 100 * rate.value,
@@ -206,34 +202,22 @@ def curve_figure() -> Figure:
     """Return success on ten real arms against the number of training robots, by variant."""
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
     axes = figure.subplots()
-    arms = [f"{arm}-stick" for arm in CURVE["REAL_ARMS"]]
     for name, colour in zip(CURVE["VARIANTS"], CURVE_COLOURS, strict=True):
-        points: list[tuple[int, list[float]]] = []
-        for robots in (10, 30, 100, 300, 1000):
-            rates = list(_real_rates(name, robots, arms))
-            if rates:
-                points.append((robots, rates))
-        if not points:
-            continue
-        xs = [robots for robots, _ in points]
-        axes.plot(xs, [100 * mean(rates) for _, rates in points], color=colour, label=name)
-        for robots, rates in points:
-            axes.plot([robots] * len(rates), [100 * r for r in rates], "o", ms=3, color=colour)
+        points: dict[int, list[float]] = {}
+        for robots in CURVE_OPTIONS.robots:
+            seeds = CURVE["real_arm_rows"](CURVE["stored_scores"](name, robots, CURVE_OPTIONS))
+            if seeds:
+                points[robots] = [100 * mean(row["success"] for row in rows) for rows in seeds]
+        if points:
+            axes.plot(list(points), [mean(p) for p in points.values()], color=colour, label=name)
+        for robots, rates in points.items():
+            axes.plot([robots] * len(rates), rates, "o", ms=3, color=colour)
     axes.set_xscale("log")
     axes.set_xlabel("robots of the grammar serial in training")
     axes.set_ylabel("success on ten real arms [%]")
     axes.set_ylim(0, 102)
     axes.legend(fontsize=8, frameon=False)
     return figure
-
-
-def _real_rates(name: str, robots: int, arms: Iterable[str]) -> Iterable[float]:
-    """Yield the mean success on the real arms of each seed that has all of them."""
-    for seed in (0, 1):
-        path = CURVE["file_of"](ROOT / "results/robot-curve", name, robots, seed)
-        rows = json.loads(path.read_text("utf-8")) if path.exists() else {}
-        if all(arm in rows for arm in arms):
-            yield mean(row["success"] for arm in arms for row in rows[arm])
 
 
 def save(figure: Figure, name: str) -> Path:

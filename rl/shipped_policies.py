@@ -76,11 +76,15 @@ def zero_shot_policy(task: str, goal: str, *, obstacles: bool) -> ShippedPolicy:
     try:
         return _ZERO_SHOT[task, goal, obstacles]
     except KeyError as error:
-        among = " among obstacles" if obstacles else ""
+        wanted, valid = _described(task, goal, obstacles), [_described(*key) for key in _ZERO_SHOT]
         raise TaskError(
-            f"no policy for {task}{among} comes with morphgen; name one with --policy, or choose "
-            "task reach, or push without obstacles"
+            f"no policy for {wanted} comes with morphgen; valid: {', '.join(valid)}; or name a "
+            "policy with --policy"
         ) from error
+
+
+def _described(task: str, goal: str, obstacles: bool) -> str:
+    return f"{task}{' of poses' * (goal == 'pose')}{' among obstacles' * obstacles}"
 
 
 def name_of(file: Path) -> str:

@@ -139,14 +139,13 @@ def train(
     for part in parts:
         require_runnable(part.config)
     require_open(folder, config, resume=resume)
-    if not all(map(is_done, parts)):
-        require_device(config.device)  # a finished run is evaluated on machines without its GPU
+    unfinished = [part for part in parts if not is_done(part)]
+    if unfinished:  # a finished run is evaluated on machines without its GPU
+        require_device(config.device)
     with ExitStack() as held:
         processes, device = held.enter_context(process_group(config.device))
         holds = False
-        for part in parts:
-            if is_done(part):
-                continue
+        for part in unfinished:
             if not holds:
                 require_links(config.source, config.max_links)
             envs = processes.share(part.config.num_envs, "--envs")

@@ -206,7 +206,7 @@ def batch_from_specs(
     require_simulator_device(simulator.name, device)
     if workers > 1 and not simulator.takes_workers:
         raise TaskError(
-            f"{workers} workers: simulator {simulator.name!r} steps all environments at once; "
+            f"simulator {simulator.name!r} steps all environments at once: {workers} workers; "
             "expected 1"
         )
     _require_contacts(simulator, specs, geometry)

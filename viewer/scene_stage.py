@@ -158,22 +158,27 @@ def look_at(
 
 @dataclass(eq=False)
 class _Placement:
-    """Where a camera is placed; called whenever a browser reports its camera."""
+    """Callback of a camera that points it at a box again when the aspect of the scene changes."""
 
     low: Array
+    """Lower corner of the box, shape (3,) [m]."""
     high: Array
+    """Upper corner of the box, shape (3,) [m]."""
     direction: tuple[float, float, float]
+    """Direction from the box to the camera."""
     aspect: float = 0.0
     """Aspect for which the camera was placed last."""
     position: Array = field(default_factory=lambda: np.zeros(3))
-    """Position of the camera then [m]."""
+    """Position of the camera when it was placed last, shape (3,) [m]."""
 
     def place(self, camera: viser.CameraHandle) -> None:
+        """Point a camera at the box."""
         self.aspect = _used_aspect(camera)
         place_camera(camera, self.low, self.high, self.direction, self.aspect)
         self.position = camera.position
 
     def __call__(self, camera: viser.CameraHandle) -> None:
+        """Place a camera again for another aspect, unless the user has moved it."""
         has_moved = not np.allclose(camera.position, self.position, atol=1e-3)
         if _used_aspect(camera) != self.aspect and not has_moved:
             self.place(camera)

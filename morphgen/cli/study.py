@@ -110,6 +110,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     sim = evaluation_simulator(args.sim or default_simulator())
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
+    here_on_gpu = args.device != "cpu" and args.ray is None
     finetune = _finetune(args.finetune)
     cells: list[Cell] = []
     for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
@@ -127,8 +128,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
                 parts = () if args.report else subruns_of(cell.folder, seeded)
                 for part in parts:
                     require_runnable(part.config)
-                gpu = args.device != "cpu" and args.ray is None
-                if gpu and not all(map(is_done, parts)):
+                if here_on_gpu and not all(map(is_done, parts)):
                     require_device(args.device)  # policies are evaluated on the CPU
     return cells
 

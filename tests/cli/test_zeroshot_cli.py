@@ -99,7 +99,8 @@ def test_a_shipped_policy_is_named_like_a_checkpoint(capsys, tmp_path):
 def test_other_packages_register_policies(monkeypatch, capsys):
     monkeypatch.setattr(POLICIES, "_loaded", {})
     POLICIES.register(ShippedPolicy("mine", ZERO_SHOT.file, ("reach",)))
-    assert "mine" in policies_for("reach")
+    poses = ("zero-shot-pose", "zero-shot-pose-obstacles")
+    assert policies_for("reach")[-5:] == ("zero-shot", "zero-shot-obstacles", *poses, "mine")
     words = ["arm=arm3", "ee=stick", "--policy", "mine", "--sim", "mujoco"]
     assert main(["play", "reach", *words]) == 0
     assert "episode 1" in capsys.readouterr().out

@@ -108,7 +108,7 @@ def test_batches_with_something_to_touch_are_refused(tmp_path):
 
 
 def test_invalid_batch_options_are_rejected(specs):
-    with pytest.raises(TaskError, match=r"2 workers: .* at once; expected 1"):
+    with pytest.raises(TaskError, match="2 workers; expected 1"):
         make_kinematic(specs, 3, workers=2)
     with pytest.raises(TaskError, match="unknown device 'tpu'"):
         make_kinematic(specs, 3, device="tpu")
