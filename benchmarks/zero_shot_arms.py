@@ -28,6 +28,7 @@ from morphgen.processes import parallel_map
 from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate
 from morphgen.rl.robot_source import robot_source
 from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.rl.scores import finite_or_none
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.rl.zeroshot import ZeroShotResult, result_of, zero_shot
 from morphgen.tasks.batch import TaskBatch
@@ -95,7 +96,7 @@ def main() -> None:
     measured = dict(tqdm(parallel_map(work, arms, args.jobs, chunk=1), total=len(arms), unit="arm"))
     if args.json:
         rows = {arm: [asdict(result) for result in results] for arm, results in measured.items()}
-        args.json.write_text(json.dumps(rows, indent=2) + "\n")
+        args.json.write_text(json.dumps(finite_or_none(rows), indent=2) + "\n")
     names = [result.controller for result in measured[arms[0]]]
     rates = list(zip(*([r.success.value for r in measured[arm]] for arm in arms), strict=True))
     table: list[list[str]] = [
