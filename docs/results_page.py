@@ -25,7 +25,7 @@ from morphgen.benchmark.split import SIDES, Side
 from morphgen.formats.data_files import read_json
 from morphgen.rl.intervals import Interval, wilson_interval
 from morphgen.rl.runs import read_config
-from morphgen.rl.scores import Score
+from morphgen.rl.scores import Score, score_from_json
 from morphgen.rl.study_cells import stored_cell
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -148,6 +148,28 @@ def _line(agent: str, steps: int, note: str, modes: Modes, task: str) -> list[st
     return cells
 
 
+def pybullet_table() -> str:
+    """Return scores on the test robots in MuJoCo and in PyBullet, for runs that have both."""
+    lines: list[list[str]] = []
+    for path in sorted((ROOT / "results/pybullet").rglob("seed*.json")):
+        run = path.relative_to(ROOT / "results/pybullet").with_suffix("")
+        stored = ROOT / "results" / run / "scores.json"
+        ours = stored_cell(stored, read_json(stored)).scores["deterministic"]
+        mujoco = _result([[score for score in ours if score.side == "test"]])
+        bullet = _result([[score_from_json(row) for row in read_json(path)["deterministic"]]])
+        _, *split, task, agent, seed = run.parts
+        rates = [100 * result.success.value for result in (mujoco, bullet)]
+        cells = ["/".join([*split, task]), AGENTS[agent], seed.removeprefix("seed")]
+        cells += [f"{rate:.0f}%" for rate in rates] + [f"{rates[1] - rates[0]:+.0f} points"]
+        scores = mujoco.score, bullet.score
+        same = task == "push"  # the score of push is its success
+        cells += [] if same else [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
+        lines.append(cells)
+    rate, score = ("MuJoCo", "PyBullet", "difference"), ("score", "PyBullet", "difference")
+    headers = ["split", "agent", "seed", *rate, *score]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
 def curve_table(name: str) -> str:
     """Return the table of a variant of benchmarks/robot_curve.py."""
     return str(CURVE["table"](name, CURVE_OPTIONS))
@@ -232,6 +254,7 @@ def tables() -> dict[str, str]:
     """Return the tables of the page by their names."""
     return {
         **{task: split_table(task) for task in ("reach", "push")},
+        "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
         "similarity": TRANSFER["table"](similarity_rows()),
     }
