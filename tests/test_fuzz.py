@@ -42,6 +42,30 @@ ROBOT = """<?xml version="1.0"?>
 </robot>
 """
 
+MODEL = """<mujoco model="m">
+  <compiler angle="radian" autolimits="true"/>
+  <default><default class="c"><geom type="capsule" size="0.1 0.2" rgba="1 0 0 1"/></default>
+  </default>
+  <asset><material name="grey" rgba="0.5 0.5 0.5 1"/>
+    <mesh name="cut" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+  <worldbody><geom type="plane" size="1 1 1"/>
+    <body name="base"><inertial pos="0 0 0.1" mass="1.5" diaginertia="0.01 0.01 0.01"/>
+      <geom type="box" size="0.1 0.2 0.3" material="grey"/><site name="tool" pos="0 0 1"/>
+      <body name="tip" pos="0 0 0.3" euler="0 1.57 0" childclass="c">
+        <joint name="turn" axis="0 0 1" range="-1 1" ref="0.1" pos="0 0.1 0"/><geom/>
+        <body name="nail"><joint name="slide" type="slide" range="0 0.1"/><geom mass="1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <contact><exclude body1="base" body2="nail"/></contact>
+  <tendon><fixed name="t"><joint joint="turn" coef="1"/><joint joint="slide" coef="2"/></fixed>
+  </tendon>
+  <equality><joint joint1="slide" joint2="turn" polycoef="0 2 0 0 0"/></equality>
+  <actuator><motor joint="turn" gear="3" ctrlrange="-2 2"/><position tendon="t" kp="1"/></actuator>
+  <keyframe><key name="home" qpos="0.5 0"/></keyframe>
+</mujoco>
+"""
+
 STRANGE = [
     "",
     "0",
@@ -177,9 +201,8 @@ def mutated(draw, text, tokens):
 
 
 @st.composite
-def broken_urdf(draw):
-    """Generate a URDF with invalid values, tags and bytes."""
-    text = ROBOT
+def broken_xml(draw, text):
+    """Generate a description with invalid values, tags and bytes."""
     for _ in range(draw(st.integers(0, 3))):
         values = [i for i, letter in enumerate(text) if letter == '"']
         first = 2 * draw(st.integers(0, len(values) // 2 - 1))
@@ -281,9 +304,18 @@ def test_xacro_expressions(runner, expression):
 
 @pytest.mark.slow
 @manners(250)
-@given(data=broken_urdf(), command=st.sampled_from(["check", "show"]))
+@given(data=broken_xml(ROBOT), command=st.sampled_from(["check", "show"]))
 def test_urdf_bytes(runner, data, command):
     path = runner.folder / "robot.urdf"
+    path.write_bytes(data)
+    require_good_manners(runner.run(command, path), data)
+
+
+@pytest.mark.slow
+@manners(250)
+@given(data=broken_xml(MODEL), command=st.sampled_from(["check", "show"]))
+def test_mjcf_bytes(runner, data, command):
+    path = runner.folder / "robot.xml"
     path.write_bytes(data)
     require_good_manners(runner.run(command, path), data)
 

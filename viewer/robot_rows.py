@@ -13,10 +13,11 @@ from morphgen.benchmark.split import SIDES, Split
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
+from morphgen.formats.description import SUFFIXES, is_mjcf
 from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings
-from morphgen.grammar.robot_source import DESCRIPTION_SUFFIXES, is_robot_folder
+from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.viewer.robot_uri import (
     DERIVATION,
     WORDS,
@@ -171,7 +172,9 @@ def folder_rows(text: str, files: FileAccess) -> list[Row]:
         uri = f"{text}/{path.name}"
         if path.is_dir() and is_robot_folder(path):
             rows.append(_bundle_row(uri, path, len(rows)))
-        elif path.is_file() and path.suffix in DESCRIPTION_SUFFIXES:
+        elif (
+            path.is_file() and path.suffix in SUFFIXES and (path.suffix != ".xml" or is_mjcf(path))
+        ):
             rows.append(Row(path.name, uri, "description", order=len(rows)))
     if not rows:
         raise UriError(f"{text} holds no robot; morphgen sample and morphgen compose make some")

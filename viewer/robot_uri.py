@@ -2,7 +2,7 @@
 
 A robot URI is a text that fits into an address:
 
-    robots/ur5-plane                               the folder of a bundle, or a URDF or xacro
+    robots/ur5-plane                               the folder of a bundle, or a URDF, xacro or MJCF
     words:arm=ur5 ee=plane                         words as for ``morphgen compose``
     derivation:body=cubes(size=0.1)                parts and parameters
     split:extrapolation/arms/reach@test/widowx     a member of a split

@@ -33,7 +33,7 @@ def tokens(
         True
 
     Args:
-        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``.
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
         q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
         max_links: Number that link indices are relative to, the same for all robots that are
             compared; by default the paper's 23, or the links of the robot if it has more.

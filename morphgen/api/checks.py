@@ -34,7 +34,7 @@ def check(
         []
 
     Args:
-        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``.
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
         tool_required: Whether a missing tool is a finding; without effect for a file that is not
             a bundle, which need not have one.
         library: Folders of your own parts.
@@ -97,7 +97,7 @@ def conform(
         ('mujoco (urdf)', True)
 
     Args:
-        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``. The files
+        robot: The robot, its bundle's folder, a description, or words of ``compose``. The files
             of a bundle are loaded; for anything else a temporary bundle is written.
         samples: Number of random configurations within the joint limits.
         seed: Seed of the configurations.

@@ -38,7 +38,7 @@ def fit(
         True
 
     Args:
-        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``; or a mesh
+        robot: The robot, its bundle's folder, a description, or words of ``compose``; or a mesh
             file, which becomes a robot of one link.
         max_primitives: Largest number of primitives per link, 1 to 32.
         iou: Use the fewest primitives that reach this intersection over union.

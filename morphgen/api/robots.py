@@ -104,7 +104,7 @@ def sample(
 
 
 def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:
-    """Read a robot from a bundle's folder, a URDF or a xacro.
+    """Read a robot from a bundle's folder, a URDF, a xacro or an MJCF.
 
     Examples:
         >>> folder = morphgen.write("ur5-plane", "robots", picture=False)
@@ -137,7 +137,7 @@ def write(
         robots/ur5-plane
 
     Args:
-        robot: The robot, its bundle's folder, a URDF or xacro, or words of ``compose``.
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
         folder: Folder in which the bundle's folder, of the robot's name, is created or replaced.
         picture: Whether to render ``preview.png``.
         library: Folders of your own parts.

@@ -155,7 +155,7 @@ def _targets(args: argparse.Namespace) -> list[Target]:
     library = opt.library_of(args)
     word = args.words[0]
     if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
-        opt.reject_idle({f"--root {args.root}": args.root}, "only with a bundle, a URDF or a xacro")
+        opt.reject_idle({f"--root {args.root}": args.root}, "only with a bundle or a description")
         return [Target(word, load_part(library.manifest(word)).fragment, None, is_part=True)]
     return [
         Target(source.label, robot, source.path, is_part=False)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 ROBOT_HELP = (
-    "a bundle's folder, a URDF or xacro, parts such as ur5-plane, or words of morphgen compose "
-    "such as arm=ur5 ee=plane"
+    "a bundle's folder, a URDF, xacro or MJCF, parts such as ur5-plane, or words of morphgen "
+    "compose such as arm=ur5 ee=plane"
 )
 ROBOTS_HELP = f"{ROBOT_HELP}; a set of morphgen sample or a folder of bundles names all its robots"
 ROBOT = option("words", nargs="+", metavar="ROBOT", help=ROBOT_HELP)
@@ -137,8 +137,8 @@ def sources_of(args: argparse.Namespace) -> list[RobotSource]:
     sources = find_robots(args.words, library_of(args))
     if args.root is not None and (composed := [s for s in sources if s.path is None]):
         raise FormatError(
-            f"--root {args.root}: {composed[0].label} is composed; expected a bundle, a URDF or a "
-            "xacro"
+            f"--root {args.root}: {composed[0].label} is composed; expected a bundle, a URDF, a "
+            "xacro or an MJCF"
         )
     return sources
 

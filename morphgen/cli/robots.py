@@ -58,8 +58,8 @@ def compose(args: argparse.Namespace) -> int:
 
 @command(
     "import",
-    "turn a URDF or xacro into a bundle",
-    option("file", type=Path, help="a URDF, or a xacro if its suffix is .xacro"),
+    "turn a URDF, xacro or MJCF into a bundle",
+    option("file", type=Path, help="a URDF, an MJCF, or a xacro if its suffix is .xacro"),
     option(
         "--root-link",
         metavar="LINK",
@@ -77,7 +77,11 @@ def compose(args: argparse.Namespace) -> int:
     opt.JSON,
     details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
     "no safe repair removes (see morphgen check); the bundle is written all the same.",
-    examples=("import my_arm.urdf --tool flange", "import my_arm.xacro --arg length=0.4"),
+    examples=(
+        "import my_arm.urdf --tool flange",
+        "import my_arm.xacro --arg length=0.4",
+        "import scene.xml --root-link base",
+    ),
 )
 def import_robot(args: argparse.Namespace) -> int:
     """Import a description, check it and write its bundle."""

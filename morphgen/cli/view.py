@@ -28,9 +28,9 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
         "words",
         nargs="*",
         metavar="TARGET",
-        help="a folder of robots, a bundle, a URDF or xacro, a split's name or file, a grammar, "
-        "words of morphgen compose, a checkpoint or a run's folder (its policy is run), or an "
-        "episode that was saved from the page",
+        help="a folder of robots, a bundle, a URDF, xacro or MJCF, a split's name or file, a "
+        "grammar, words of morphgen compose, a checkpoint or a run's folder (its policy is run), "
+        "or an episode that was saved from the page",
     ),
     option("--host", default="127.0.0.1", help="address to listen on"),
     option("--port", type=whole_number(1, 65535), default=8080, help="default: 8080"),

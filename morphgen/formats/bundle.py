@@ -16,6 +16,7 @@ from trimesh.exchange.stl import export_stl
 from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
+from morphgen.formats.description import read_description
 from morphgen.formats.files import file_sha256, replacing_folder
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf import mjcf_text
@@ -169,7 +170,9 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
 def read_robot(
     path: Path, args: dict[str, str] | None = None, *, root: Path | None = None
 ) -> Robot:
-    """Read a bundle's folder, a URDF or a xacro.
+    """Read a bundle's folder, a URDF, a xacro or an MJCF.
+
+    The URDF or MJCF of a bundle stands for the bundle.
 
     Args:
         path: The file or folder.
@@ -182,10 +185,10 @@ def read_robot(
     """
     if path.is_dir():
         return read_bundle(path, root=root)
-    if path.name == URDF and (path.parent / CARD).is_file():
+    if path.name in (URDF, MJCF) and (path.parent / CARD).is_file():
         return read_bundle(path.parent, root=root)
     is_xacro = path.suffix == XACRO
-    return read_urdf(path, args, default_finder(root=root), written_frames=not is_xacro)
+    return read_description(path, args, default_finder(root=root), written_frames=not is_xacro)
 
 
 def split_colours(robot: Robot) -> Robot:

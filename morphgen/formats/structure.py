@@ -102,7 +102,7 @@ def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
 
 def _wrong_root(root: etree._Element, origin: str) -> Finding:
     name = etree.QName(root)
-    fix = "give a URDF or xacro, whose root element is <robot>"
+    fix = "give a URDF or xacro, whose root element is <robot>, or an MJCF, whose is <mujoco>"
     if name.localname == "robot":
         fix = f"remove the default namespace {name.namespace!r}"
     why = f"the root element is <{name.localname}>, not <robot>"

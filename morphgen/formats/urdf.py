@@ -81,11 +81,7 @@ def read_urdf(
         UnsoundError: If the tree is broken or a mesh is not found.
         FormatError: If the file cannot be read, is not XML or does not expand.
     """
-    if not path.is_file():
-        why = "not a regular file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {why}")
-    if str(path).encode(errors="replace").decode() != str(path):
-        raise FormatError(f"{str(path)!a}: the file's name is not UTF-8 text")
+    require_description_file(path)
     finder = finder or default_finder()
     if path.suffix == ".xacro":
         data = expand(path, args or {}, finder)
@@ -96,6 +92,19 @@ def read_urdf(
     else:
         data = read_bytes(path, MAX_URDF_BYTES)
     return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
+
+
+def require_description_file(path: Path) -> None:
+    """Require that a path is a regular file whose name can be printed.
+
+    Raises:
+        FormatError: If it is not.
+    """
+    if not path.is_file():
+        why = "not a regular file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {why}")
+    if str(path).encode(errors="replace").decode() != str(path):
+        raise FormatError(f"{str(path)!a}: the file's name is not UTF-8 text")
 
 
 def robot_from_xml(

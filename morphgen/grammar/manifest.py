@@ -49,12 +49,12 @@ class Scaling(Record, frozen=True):
 
 
 class PackageSource(Record, frozen=True):
-    """A URDF or xacro file of an installed data package."""
+    """A URDF, xacro or MJCF file of an installed data package."""
 
     package: str
     """Name of the pip package."""
     file: str
-    """URDF or xacro, relative to the folder in which pip installed the package."""
+    """URDF, xacro or MJCF, relative to the folder in which pip installed the package."""
     raw_args: Mapping[str, str | bool | int | float] = field(default_factory=dict, name="args")
     """Arguments of the xacro, by name."""
 
@@ -88,7 +88,7 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     package_source: PackageSource | None = field(default=None, name="source")
     """File of an installed data package."""
     file: str = ""
-    """URDF or xacro, relative to the YAML file."""
+    """URDF, xacro or MJCF, relative to the YAML file."""
     without: tuple[str, ...] = ()
     """Links that are left out, with everything below them."""
     mount: FrameSpec | None = None

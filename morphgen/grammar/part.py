@@ -11,9 +11,10 @@ from weakref import WeakSet
 
 from morphgen.checks.names import safe_names
 from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
+from morphgen.formats.description import is_mjcf, read_description
 from morphgen.formats.resolve import PackageFinder, distribution_file, file_stamp
 from morphgen.formats.rounding import format_number
-from morphgen.formats.urdf import read_urdf, robot_from_xml
+from morphgen.formats.urdf import robot_from_xml
 from morphgen.formats.xacro import evaluate, expand
 from morphgen.formats.xacro_compile import CompiledXacro, compile_xacro
 from morphgen.grammar.manifest import FrameSpec, Manifest, Number, PackageSource
@@ -114,7 +115,9 @@ class _Loader:
         source = self._manifest.source
         try:
             if isinstance(source, PackageSource):
-                return read_urdf(distribution_file(source.package, source.file), source.args)
+                return read_description(distribution_file(source.package, source.file), source.args)
+            if is_mjcf(source):
+                return read_description(source)
             return self._read_template(source)
         except FormatError as error:
             raise PartError(f"part {self._manifest.name!r}: {error}") from error

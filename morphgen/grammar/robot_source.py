@@ -13,8 +13,8 @@ from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import CompositionError, FormatError, nearest
 from morphgen.formats.bundle import CARD, read_robot
 from morphgen.formats.data_files import read_text
+from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import read_urdf
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX as GRAMMAR_SUFFIX
@@ -24,9 +24,6 @@ from morphgen.grammar.request import known_grammars, parse_words
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS, read_index
 from morphgen.model.robot import TOOL, Frame, Robot
 from morphgen.model.tree import rename, subtree
-
-DESCRIPTION_SUFFIXES = (".urdf", ".xacro")
-"""File name suffixes of robot descriptions."""
 
 RobotLike: TypeAlias = Robot | str | PathLike[str]
 """A robot, or its name: words of ``morphgen compose``, parts joined by dashes, or a path."""
@@ -39,7 +36,7 @@ class RobotSource:
     label: str
     """The path or the words, as printed in messages and tables."""
     path: Path | None = None
-    """A bundle's folder, a robot's folder in a light set, a URDF or a xacro."""
+    """A bundle's folder, a robot's folder in a light set, a URDF, a xacro or an MJCF."""
     words: tuple[str, ...] = ()
     """Words of ``morphgen compose``."""
 
@@ -47,8 +44,8 @@ class RobotSource:
 def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
     """Return the robots that the words of a command line name, without reading them.
 
-    Each word is one of: a bundle's folder, a URDF or a xacro; a set of ``morphgen sample`` or a
-    folder of bundles, which stand for all their robots; parts joined by dashes, such as
+    Each word is one of: a bundle's folder, a URDF, a xacro or an MJCF; a set of ``morphgen sample``
+    or a folder of bundles, which stand for all their robots; parts joined by dashes, such as
     ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
     ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
     spaces is a request of its own. Each robot is returned once.
@@ -182,12 +179,12 @@ def is_robot_file(text: str) -> bool:
     A folder without robots does not hide a grammar or a part of the same name.
     """
     path = Path(text)
-    is_description = text.endswith(DESCRIPTION_SUFFIXES) and path.is_file()
+    is_description = text.endswith(SUFFIXES) and path.is_file()
     if is_description or (path.is_dir() and holds_robots(path)):
         return True
     if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
         return False
-    return "/" in text or text in (".", "..") or text.endswith(DESCRIPTION_SUFFIXES)
+    return "/" in text or text in (".", "..") or text.endswith(SUFFIXES)
 
 
 def holds_robots(folder: Path) -> bool:
@@ -240,12 +237,14 @@ def import_robot(
     """Read any robot description, and add what it lacks: a tool frame and ignored pairs.
 
     Args:
-        path: A URDF, or a xacro (by its suffix).
+        path: A URDF, a xacro (by its suffix), or an MJCF (by its root element).
         args: xacro arguments.
         root: A folder that meshes, includes and YAML may come from, besides the description's own
             folder and package.
-        root_link: Link that becomes the robot's root; by default the file's root.
-        tool: Link whose frame becomes the frame ``tool``; by default there is none.
+        root_link: Link that becomes the robot's root; by default the file's root. The rest of an
+            MJCF is not read, so that it may hold other bodies.
+        tool: Link whose frame becomes the frame ``tool``; by default a URDF has none, and an MJCF
+            the one that ``read_frames`` finds.
         name: Name of the robot; by default the file's.
         repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
             loaders refuse the robot. The provenance lists them, and all that was corrected to read
@@ -254,7 +253,7 @@ def import_robot(
     Raises:
         FormatError: If the file cannot be read, or does not have a named link.
     """
-    robot = read_urdf(path, args, default_finder(root=root))
+    robot = read_description(path, args, default_finder(root=root), root_link=root_link)
     for option, link in (("root link", root_link), ("tool", tool)):
         if link is not None and link not in robot.link_index:
             raise FormatError(

@@ -1,0 +1,248 @@
+"""Read MJCF documents from untrusted sources: one text without files, and the meshes it names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from lxml import etree
+
+from morphgen.errors import FormatError
+from morphgen.formats.data_files import read_bytes
+from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolve_uri
+from morphgen.formats.urdf import UnsoundError
+from morphgen.formats.xacro_functions import RefusedError
+from morphgen.formats.xml import parse_description
+from morphgen.model.findings import Finding
+
+MAX_MJCF_BYTES = 8 * 2**20
+"""Largest MJCF that is read, with all its includes [bytes]."""
+MAX_INCLUDES = 100
+"""Largest number of files that an MJCF includes."""
+MAX_DEPTH = 40
+"""Deepest nesting of includes."""
+MAX_COPIES = 10_000
+"""Largest number of elements that the ``<replicate>`` elements of an MJCF make."""
+
+_REFUSED = {
+    "plugin": "plugins are code",
+    "extension": "plugins are code",
+    "attach": "a robot is read from one model; put its bodies into this file",
+    "composite": "a robot has rigid links",
+    "flexcomp": "a robot has rigid links",
+    "flex": "a robot has rigid links",
+}
+"""Elements that are refused, and why."""
+_IGNORED = ("option", "size", "visual", "statistic", "custom", "sensor", "deformable")
+"""Sections without a counterpart in ``Robot``. Some allocate memory as the file demands."""
+_ASSETS = ("mesh", "material", "hfield")
+"""Assets that are kept; textures, skins and models would be read from files."""
+_LINE = re.compile(r",? line \d+(, column \d+)?")
+
+
+@dataclass(frozen=True)
+class MjcfDocument:
+    """An MJCF document that names no file."""
+
+    path: Path
+    """The file that it was read from."""
+    name: str
+    """Name of the model; that of the file if the document has none."""
+    text: str
+    """The document with includes inserted, without the sections that a robot does not need."""
+    meshes: Mapping[str, Path]
+    """File of every mesh asset by name; assets with vertices in the document have none."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired to parse the document."""
+
+    def error(self, why: str) -> FormatError:
+        """Return an error about the document, without the lines of the text with includes."""
+        return FormatError(f"{self.path}: {' '.join(_LINE.sub('', why).split())}")
+
+
+def read_document(path: Path, finder: PackageFinder) -> MjcfDocument:
+    """Read an MJCF with its includes, and resolve the files of its meshes.
+
+    Included files come from the folders that ``require_allowed_text`` allows, meshes from those of
+    ``resolve_uri``. Their names are relative to the folder of ``path``; those of a nested include
+    also to the folder of the file that includes it. Textures, height fields and skins are not read.
+
+    Raises:
+        UnsoundError: If a mesh is not found; it lists all of them.
+        FormatError: If a file is missing, too large, not XML or elsewhere, or the document has an
+            element that cannot be read.
+    """
+    root, findings = _Includes(path, finder).read(path, 0)
+    _require_supported(root, path)
+    for section in [*root.iterchildren(*_IGNORED)]:
+        root.remove(section)
+    for asset in [*root.iterfind("asset/*")]:
+        if asset.tag not in _ASSETS:
+            _remove(asset)
+    for element in root.iter():
+        # MuJoCo allocates the longest ``user`` of an element for all elements of its kind.
+        _drop(element, "user")
+    for element in root.iter("material", "light"):
+        _drop(element, "texture")
+        for layer in [*element]:
+            element.remove(layer)
+    for field in root.iterfind("asset/hfield"):
+        field.set("name", field.get("name") or PurePosixPath(field.get("file", "")).stem)
+        _drop(field, "file", "content_type", "elevation")
+        field.set("nrow", "2")
+        field.set("ncol", "2")
+    meshes = _take_mesh_files(root, path, finder)
+    where = str(path)
+    return MjcfDocument(
+        path,
+        root.get("model") or path.stem,
+        etree.tostring(root, encoding="unicode"),
+        meshes,
+        tuple(replace(f, where=f"{path.name}{f.where.removeprefix(where)}") for f in findings),
+    )
+
+
+class _Includes:
+    """Reads a document and inserts the files that it includes, each at most once."""
+
+    def __init__(self, main: Path, finder: PackageFinder) -> None:
+        self._main = main
+        self._finder = finder
+        self._seen: set[Path] = set()
+        self._bytes_left = MAX_MJCF_BYTES
+
+    def read(self, path: Path, depth: int) -> tuple[etree._Element, tuple[Finding, ...]]:
+        """Return the root of a file with its includes inserted, and what was repaired."""
+        self._require_bounded(path, depth)
+        if self._bytes_left <= 0:
+            raise FormatError(
+                f"{path}: holds more than {MAX_MJCF_BYTES} bytes with its includes, the most that "
+                "is read"
+            )
+        data = read_bytes(path, self._bytes_left)
+        self._bytes_left -= len(data)
+        root, findings = parse_description(data, str(path))
+        for element in [*root.iter("include")]:
+            included = self._file(element, path)
+            child, more = self.read(included, depth + 1)
+            findings = (*findings, *more)
+            parent = element.getparent()
+            if parent is None:
+                raise FormatError(f"{path}: the root element is <include>, not <mujoco>")
+            at = parent.index(element)
+            parent[at : at + 1] = [*child]
+        return root, findings
+
+    def _require_bounded(self, path: Path, depth: int) -> None:
+        real = path.resolve()
+        if real in self._seen:
+            raise FormatError(f"{path}: is included twice; MJCF includes a file once")
+        if depth > MAX_DEPTH:
+            raise FormatError(f"{path}: includes are nested deeper than {MAX_DEPTH} levels")
+        if len(self._seen) > MAX_INCLUDES:
+            raise FormatError(f"{self._main}: includes more than {MAX_INCLUDES} files")
+        self._seen.add(real)
+
+    def _file(self, element: etree._Element, includer: Path) -> Path:
+        where = f"{includer}:{element.sourceline}"
+        name = element.get("file", "")
+        if not name.strip():
+            raise FormatError(f"{where}: <include> names no file")
+        # MuJoCo searches the folder of the main file, then that of the file with the <include>.
+        bases = [self._main]
+        if not (self._main.parent / name).is_file() and (includer.parent / name).is_file():
+            bases = [includer]
+        file = resolve_uri(name, bases[0], self._finder)
+        try:
+            require_allowed_text(file, self._finder, self._main, includer)
+        except RefusedError as error:
+            raise FormatError(f"{where}: {error}") from error
+        return file
+
+
+def _require_supported(root: etree._Element, path: Path) -> None:
+    if root.tag != "mujoco":
+        raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
+    for element in root.iter(*_REFUSED):
+        name = element.get("name") or element.get("plugin") or element.get("model")
+        label = f"<{element.tag}>" if name is None else f"<{element.tag}> {name!r}"
+        raise FormatError(f"{path}: {label} is refused: {_REFUSED[str(element.tag)]}")
+    for mesh in root.iterfind("asset/mesh[@builtin]"):
+        raise FormatError(
+            f"{path}: mesh {mesh.get('name')!r} is built in MuJoCo; give it a file, or use a "
+            "primitive geom"
+        )
+    copies = sum(_copies(element, path) for element in root.iter("replicate"))
+    if copies > MAX_COPIES:
+        raise FormatError(
+            f"{path}: <replicate> makes {copies} elements; at most {MAX_COPIES} are read"
+        )
+
+
+def _copies(replicate: etree._Element, path: Path) -> int:
+    """Return how many elements a ``<replicate>`` makes, with those around it."""
+    copies = sum(1 for _ in replicate.iterdescendants())
+    for element in (replicate, *replicate.iterancestors("replicate")):
+        text = element.get("count", "")
+        if not text.strip().isdecimal():
+            raise FormatError(
+                f"{path}: <replicate> has count {text!r}; expected a whole number of at least 1"
+            )
+        copies *= int(text[:12])
+    return copies
+
+
+def _take_mesh_files(root: etree._Element, path: Path, finder: PackageFinder) -> dict[str, Path]:
+    """Remove the files of the mesh assets from the document, and return them by name."""
+    folder = ""
+    strip = False
+    for compiler in root.iterfind("compiler"):
+        folder = compiler.get("meshdir", compiler.get("assetdir", folder))
+        strip = compiler.get("strippath", str(strip).lower()) == "true"
+        _drop(compiler, "meshdir", "assetdir", "texturedir", "strippath")
+    meshes: dict[str, Path] = {}
+    missing: list[Finding] = []
+    for element in root.iterfind("asset/mesh[@file]"):
+        uri = element.get("file", "")
+        _drop(element, "file", "content_type")
+        parts = PurePosixPath(uri.replace("\\", "/"))
+        name = element.get("name") or parts.stem
+        element.set("name", name)
+        try:
+            inside = parts.name if strip else uri
+            meshes[name] = resolve_uri(_joined(folder, inside), path, finder)
+        except FormatError as error:
+            where = f"{path}: mesh {name!r}"
+            missing.append(
+                Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
+            )
+    if missing:
+        raise UnsoundError(str(path), missing)
+    return meshes
+
+
+def _joined(folder: str, name: str) -> str:
+    """Return a file's name below a folder, both as an MJCF writes them."""
+    return (PurePosixPath(folder.replace("\\", "/")) / name.replace("\\", "/")).as_posix()
+
+
+def _drop(element: etree._Element, *keys: str) -> None:
+    """Remove attributes, if the element has them."""
+    for key in keys:
+        if key in element.attrib:
+            del element.attrib[key]
+
+
+def _remove(element: etree._Element) -> None:
+    parent = element.getparent()
+    if parent is not None:
+        parent.remove(element)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return quoted names, at most five, for an error."""
+    names = [*names]
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(repr(name) for name in names[:5]) + more

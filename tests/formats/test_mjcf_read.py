@@ -1,0 +1,371 @@
+"""MJCF becomes the robot that MuJoCo simulates, or is refused with the reason."""
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from helpers.composed import composed
+from helpers.mjcf import TWO_JOINTS, read, refusal, write
+from helpers.robots import arm
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.mjcf import mjcf_text
+from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Sphere
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    movable_positions,
+    random_configurations,
+)
+from morphgen.model.mesh import load_mesh
+
+
+def positions(robot, q):
+    """Return the position of every movable joint by name."""
+    names = (robot.joints[k].name for k in robot.movable_joints)
+    return dict(zip(names, movable_positions(robot, q).tolist(), strict=True))
+
+
+def assert_poses_agree(robot, path, seed=0):
+    """Compare centres of mass and sites with MuJoCo at random configurations."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    for q in random_configurations(robot, 10, np.random.default_rng(seed)):
+        for name, value in positions(robot, q).items():
+            data.joint(name).qpos[0] = value
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        T_root_link = forward_kinematics(robot, q)
+        for T, link in zip(T_root_link, robot.links, strict=True):
+            if link.inertial is None:
+                continue
+            com = T @ [*link.inertial.com, 1]
+            np.testing.assert_allclose(com[:3], data.body(link.name).xipos, atol=1e-9)
+            R = T[:3, :3]
+            R_com = data.body(link.name).ximat.reshape(3, 3)
+            np.testing.assert_allclose(
+                R @ link.inertial.matrix @ R.T,
+                R_com @ np.diag(model.body(link.name).inertia) @ R_com.T,
+                atol=1e-9,
+            )
+        for frame in robot.frames:
+            T = T_root_link[robot.link_index[frame.link]] @ frame.T_link_frame.matrix
+            if frame.name == "tool":
+                continue
+            np.testing.assert_allclose(T[:3, 3], data.site(frame.name).xpos, atol=1e-9)
+            np.testing.assert_allclose(T[:3, :3].ravel(), data.site(frame.name).xmat, atol=1e-9)
+
+
+def assert_same(robot, other):
+    """Compare what an MJCF holds of a robot."""
+    assert other.name == robot.name
+    assert set(other.link_index) == set(robot.link_index)
+    for link in robot.links:
+        inertial = other.link(link.name).inertial
+        if link.inertial is None or link.inertial.mass == 0:
+            assert inertial is None
+            continue
+        assert inertial.mass == pytest.approx(link.inertial.mass, rel=1e-9)
+        np.testing.assert_allclose(inertial.com, link.inertial.com, atol=1e-9)
+        np.testing.assert_allclose(inertial.matrix, link.inertial.matrix, rtol=1e-6, atol=1e-11)
+        for kind in ("visuals", "collisions"):
+            shapes, read_shapes = getattr(link, kind), getattr(other.link(link.name), kind)
+            assert [type(s.geometry) for s in shapes] == [type(s.geometry) for s in read_shapes]
+            for shape, read_shape in zip(shapes, read_shapes, strict=True):
+                T, T_read = shape.T_link_shape.matrix, read_shape.T_link_shape.matrix
+                np.testing.assert_allclose(T, T_read, atol=1e-6)
+    for joint in (robot.joints[k] for k in robot.movable_joints):
+        read_joint = other.joints[other.joint_index[joint.name]]
+        assert (read_joint.is_independent, read_joint.is_continuous) == (
+            joint.is_independent,
+            joint.is_continuous,
+        )
+        if joint.limits is not None and not joint.is_continuous:
+            assert read_joint.limits == pytest.approx(joint.limits, abs=1e-9)
+        if joint.is_independent and joint.effort:
+            assert read_joint.effort == pytest.approx(joint.effort)
+    assert positions(other, other.home) == pytest.approx(positions(robot, robot.home), abs=1e-9)
+    assert other.ignore_pairs == robot.ignore_pairs
+    assert {frame.name for frame in other.frames} == {frame.name for frame in robot.frames}
+    assert_same_poses(robot, other)
+
+
+def assert_same_poses(robot, other):
+    """Compare links, mimic joints and frames of two robots at random configurations."""
+    order = {robot.joints[k].name: i for i, k in enumerate(robot.independent_joints)}
+    columns = [order[other.joints[k].name] for k in other.independent_joints]
+    for q in random_configurations(robot, 5, np.random.default_rng(1)):
+        T, T_read = forward_kinematics(robot, q), forward_kinematics(other, q[columns])
+        assert positions(other, q[columns]) == pytest.approx(positions(robot, q), abs=1e-9)
+        for name, i in robot.link_index.items():
+            np.testing.assert_allclose(T_read[other.link_index[name]], T[i], atol=1e-9)
+        for frame in robot.frames:
+            other_frame = other.frame(frame.name)
+            np.testing.assert_allclose(
+                T_read[other.link_index[other_frame.link]] @ other_frame.T_link_frame.matrix,
+                T[robot.link_index[frame.link]] @ frame.T_link_frame.matrix,
+                atol=1e-9,
+            )
+
+
+def test_written_arm_with_a_mimic_joint_reads_the_same(tmp_path):
+    robot = arm()
+    path = tmp_path / "arm.xml"
+    path.write_text(mjcf_text(robot, lambda mesh: ""), encoding="utf-8")
+    assert_same(robot, read_mjcf(path))
+
+
+@pytest.mark.parametrize(
+    "words", ["arm=ur5 ee=plane", "arm=arm3 ee=panda_hand", "base=gantry arm=arm3 ee=plane"]
+)
+def test_mjcf_of_composed_bundles_reads_the_same(words, tmp_path):
+    folder = write_bundle(composed(words), tmp_path / "arm", picture=False)
+    robot = read_bundle(folder)
+    assert_same(robot, read_mjcf(folder / "robot.xml"))
+
+
+def test_defaults_degrees_and_several_joints_of_a_body_agree_with_mujoco(tmp_path):
+    path = write(
+        tmp_path,
+        """
+        <compiler angle="degree" eulerseq="zyx"/>
+        <default>
+          <joint damping="0.5" frictionloss="0.1"/>
+          <default class="arm"><joint axis="0 1 0" range="-90 45"/>
+            <geom type="capsule" size="0.02 0.1" rgba="1 0 0 1"/></default>
+        </default>
+        <worldbody>
+          <geom type="plane" size="1 1 1"/>
+          <body name="base" pos="0.1 0 0.2" euler="10 20 30">
+            <geom type="box" size="0.1 0.2 0.3"/>
+            <body name="upper" pos="0 0 0.3" childclass="arm">
+              <joint name="pan" axis="0 0 1"/>
+              <joint name="lift" pos="0.05 0 0.02"/>
+              <joint name="reach" type="slide" axis="1 0 1" range="0 0.2"/>
+              <geom name="u" pos="0 0 0.1"/>
+              <site name="elbow" pos="0 0.1 0.2" euler="0 45 0"/>
+              <body name="lower" pos="0 0 0.25" euler="0 0 90">
+                <joint name="bend" pos="0 0.03 -0.02" ref="15" range="-30 60"/>
+                <joint name="turn" axis="1 1 0" limited="false"/>
+                <geom fromto="0 0 0 0.1 0.2 0.3"/>
+                <body name="tip" pos="0 0 0.2">
+                  <joint name="last" pos="0.1 0 0" axis="0 0 1" range="-20 20"/>
+                  <geom type="cylinder"/><geom type="sphere" pos="0.1 0 0" mass="2"/>
+                  <site name="grip_site" pos="0 0 0.1"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </worldbody>""",
+    )
+    robot = read_mjcf(path)
+    assert_poses_agree(robot, path)
+    assert [link.name for link in robot.links] == [
+        *("world", "base", "upper_pan", "upper_lift", "upper"),
+        *("lower_bend", "lower", "tip"),
+    ]
+    joints = {joint.name: joint for joint in robot.joints}
+    kinds = {name: joint.kind for name, joint in joints.items()}
+    assert kinds == {
+        "base_joint": "fixed",
+        "pan": "revolute",
+        "lift": "revolute",
+        "reach": "prismatic",
+        "bend": "revolute",
+        "turn": "continuous",
+        "last": "revolute",
+    }
+    assert joints["lift"].limits == pytest.approx((-np.pi / 2, np.pi / 4))
+    assert (joints["pan"].damping, joints["pan"].friction) == (0.5, 0.1)
+    upper = robot.link("upper")
+    assert upper.visuals[0].rgba == (1.0, 0.0, 0.0, 1.0)
+    assert isinstance(upper.collisions[0].geometry, Capsule)
+    assert upper.collisions[0].geometry == Capsule(0.02, 0.2)
+    assert robot.link("world").collisions == ()
+    assert isinstance(robot.link("base").collisions[0].geometry, Box)
+    tip = [type(shape.geometry) for shape in robot.link("tip").collisions]
+    assert tip == [Cylinder, Sphere]
+    tool = robot.frame("tool")
+    assert (tool.link, tool.T_link_frame) == ("tip", robot.frame("grip_site").T_link_frame)
+
+
+def test_meshes_lie_where_mujoco_has_them(tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
+    box.apply_translation((0.5, -0.2, 0.1))
+    (tmp_path / "meshes").mkdir()
+    box.export(tmp_path / "meshes" / "box.stl")
+    path = write(
+        tmp_path,
+        """
+        <compiler meshdir="meshes"/>
+        <asset>
+          <mesh file="box.stl" scale="1 2 -1" refpos="0.1 0.2 0.3"/>
+          <mesh name="turned" file="box.stl" scale="2 2 2" refpos="0 1 0" refquat="1 1 0 0"/>
+        </asset>
+        <worldbody><body name="base">
+          <geom type="mesh" mesh="box" pos="0.1 0.2 0.3" euler="10 20 30"/>
+          <geom type="mesh" mesh="turned" pos="0 0 1" euler="0 0 30"/>
+        </body></worldbody>""",
+    )
+    robot = read_mjcf(path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for geom, shape in enumerate(robot.root.collisions):
+        mesh = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+        in_world = vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        assert isinstance(shape.geometry, Mesh)
+        T = shape.T_link_shape.matrix
+        own = load_mesh(shape.geometry).vertices @ T[:3, :3].T + T[:3, 3]
+        distances = np.linalg.norm(own[:, None] - in_world[None], axis=2).min(axis=1)
+        assert distances.max() < 1e-6
+    assert robot.root.collisions[0].geometry.scale == (1.0, 2.0, -1.0)
+
+
+def test_visual_and_collision_geoms_are_told_apart(tmp_path):
+    robot = read(
+        tmp_path,
+        """
+        <asset><material name="blue" rgba="0 0 1 1"/></asset>
+        <worldbody><body name="a">
+          <geom size="0.1" contype="0" conaffinity="0" material="blue"/>
+          <geom size="0.2"/><geom size="0.3" group="3"/>
+          <geom size="0.4" group="4" contype="0" conaffinity="0"/>
+          <body name="b"><geom size="0.5" rgba="0 1 0 0.5"/><geom size="0.6" group="3"/></body>
+        </body></worldbody>""",
+    )
+
+    def radii(shapes):
+        return [shape.geometry.radius for shape in shapes]
+
+    a, b = robot.links
+    assert (radii(a.visuals), radii(a.collisions)) == ([0.1], [0.2, 0.3])
+    assert (radii(b.visuals), radii(b.collisions)) == ([0.5], [0.5, 0.6])
+    assert a.visuals[0].rgba == (0, 0, 1, 1)
+    assert b.visuals[0].rgba == (0, 1, 0, 0.5)
+    assert b.collisions[0].rgba is None
+
+
+def test_joint_equalities_become_mimic_and_fixed_joints(tmp_path):
+    path = write(
+        tmp_path,
+        """
+        <compiler angle="radian"/>
+        <worldbody><body name="base"><geom size="0.1"/>
+          <body name="left"><joint name="a" ref="0.2" range="-1 1"/><geom size="0.1"/></body>
+          <body name="right"><joint name="b" ref="0.1" range="-3 3"/><geom size="0.1"/></body>
+          <body name="held"><joint name="c" ref="0.3" range="-1 1"/>
+            <geom size="0.1" pos="0.5 0.1 0"/></body>
+        </body></worldbody>
+        <equality><joint joint1="b" joint2="a" polycoef="0.5 -2 0 0 0"/>
+          <joint joint1="c" polycoef="0.4 0 0 0 0"/></equality>
+        <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed>
+        </tendon>
+        <actuator><position tendon="both" kp="1"/>
+          <motor joint="a" gear="3" ctrlrange="-2 2"/></actuator>
+        <contact><exclude body1="right" body2="left"/></contact>
+        <keyframe><key qpos="0.9 0 0"/><key name="home" qpos="0.5 0 0"/></keyframe>""",
+    )
+    robot = read_mjcf(path)
+    _, b, c = robot.joints
+    assert (b.mimic.joint, b.mimic.multiplier) == ("a", -2.0)
+    assert b.mimic.offset == pytest.approx(0.1 + 0.5 + 2 * 0.2)
+    assert c.kind == "fixed"
+    assert robot.home == (0.5,)
+    assert robot.ignore_pairs == (("left", "right"),)
+    assert robot.joints[0].effort == 6.0
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.joint("c").qpos[0] = 0.3 + 0.4
+    mujoco.mj_kinematics(model, data)
+    held = forward_kinematics(robot, robot.home)[3] @ [*robot.link("held").inertial.com, 1]
+    np.testing.assert_allclose(held[:3], data.body("held").xipos, atol=1e-12)
+
+
+def test_fixed_tendon_of_two_joints_held_by_an_equality_is_a_mimic(tmp_path):
+    robot = read(
+        tmp_path,
+        TWO_JOINTS
+        + """<tendon><fixed name="t"><joint joint="a" coef="2"/><joint joint="b" coef="4"/></fixed>
+        </tendon><equality><tendon tendon1="t" polycoef="0.4 0 0 0 0"/></equality>""",
+    )
+    mimic = robot.joints[1].mimic
+    assert (mimic.joint, mimic.multiplier, mimic.offset) == ("a", -0.5, pytest.approx(0.1))
+
+
+def test_joint_that_follows_a_held_joint_is_held(tmp_path):
+    path = write(
+        tmp_path,
+        """<compiler angle="radian"/><worldbody><body name="base"><geom size="0.1"/>
+        <body name="x"><joint name="a"/><geom size="0.1" pos="1 0 0"/></body>
+        <body name="y"><joint name="b" axis="1 0 0"/><geom size="0.1" pos="0 1 0"/></body>
+        </body></worldbody><equality><joint joint1="b" joint2="a" polycoef="0.1 2 0 0 0"/>
+        <joint joint1="a" polycoef="0.3 0 0 0 0"/></equality>""",
+    )
+    robot = read_mjcf(path)
+    assert robot.dof == 0
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:] = (0.3, 0.7)
+    mujoco.mj_kinematics(model, data)
+    T_root_link = forward_kinematics(robot, robot.home)
+    for i in (1, 2):
+        com = T_root_link[i] @ [*robot.links[i].inertial.com, 1]
+        np.testing.assert_allclose(com[:3], data.body(robot.links[i].name).xipos, atol=1e-12)
+
+
+def test_free_base_becomes_the_root(tmp_path):
+    robot = read(
+        tmp_path,
+        """<worldbody><geom type="box" size="1 1 1"/><body name="trunk" pos="0 0 1"><freejoint/>
+        <geom size="0.1"/><body name="leg"><joint name="hip"/><geom size="0.1"/></body></body>
+        </worldbody><keyframe><key qpos="0 0 1 1 0 0 0 0.5"/></keyframe>""",
+    )
+    assert (robot.root.name, robot.dof, robot.home) == ("trunk", 1, (0.5,))
+    assert [finding.code for finding in robot.source_findings] == ["world-shapes"]
+
+
+def test_keyframe_outside_the_limits_is_left_out(tmp_path):
+    robot = read(
+        tmp_path,
+        """<compiler angle="radian"/>
+        <worldbody><body name="base"><geom size="0.1"/><body name="tip">
+        <joint name="a" range="1 2"/><geom size="0.1"/></body></body></worldbody>
+        <keyframe><key name="rest" qpos="3"/></keyframe>""",
+    )
+    assert robot.home == (1.5,)
+    (finding,) = robot.source_findings
+    assert (finding.code, finding.where) == ("keyframe-outside-limits", "robot.xml: key 'rest'")
+
+
+def test_root_body_cuts_the_robot_out_of_a_scene(tmp_path):
+    scene = """<worldbody><body name="table"><geom size="0.1"/></body>
+        <body name="handle" mocap="true"/>
+        <body name="arm"><geom size="0.1"/><body name="tip"><joint name="a"/><geom size="0.1"/>
+        </body></body><body name="ball"><freejoint name="fly"/><geom size="0.1"/></body></worldbody>
+        <equality><weld name="drag" body1="handle" body2="tip"/></equality>"""
+    assert refusal(tmp_path, scene) == (
+        "the world holds the bodies 'table', 'handle', 'arm', 'ball', of which 'table' has no "
+        "joints; name the robot's by --root-link BODY of morphgen import"
+    )
+    robot = read(tmp_path, scene, root_body="arm")
+    assert [link.name for link in robot.links] == ["arm", "tip"]
+    assert [finding.code for finding in robot.source_findings] == ["mocap-constraint"]
+    assert refusal(tmp_path, scene, root_body="amr") == (
+        "no body 'amr' for root link; did you mean 'arm'? valid: arm, ball, handle, table, tip, "
+        "world"
+    )
+
+
+def test_names_are_unique_and_sites_do_not_take_those_of_links(tmp_path):
+    robot = read(
+        tmp_path,
+        """<worldbody><body name="a"><geom size="0.1"/><site name="a"/>
+        <body name="b"><joint/><joint name="b_joint" axis="1 0 0"/><geom size="0.1"/></body>
+        <body><joint/><geom size="0.1"/></body></body></worldbody>""",
+    )
+    assert [link.name for link in robot.links] == ["a", "b_b_joint_2", "b", "body_3"]
+    assert [joint.name for joint in robot.joints] == ["b_joint_2", "b_joint", "body_3_joint"]
+    assert [frame.name for frame in robot.frames] == ["a_site"]
