@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from morphgen.model.findings import Finding
 from morphgen.model.robot import TOOL, Robot
+from morphgen.model.tree import take_name
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.\-]")
 _WORLD = "world"
@@ -104,11 +105,5 @@ def safe_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, 
     taken = {*kept, *reserved}
     new_names: dict[str, str] = {}
     for name in names:
-        stem = new = name if name in kept else _UNSAFE.sub("_", name) or "_"
-        k = 1
-        while name not in kept and new in taken:
-            k += 1
-            new = f"{stem}_{k}"
-        taken.add(new)
-        new_names[name] = new
+        new_names[name] = name if name in kept else take_name(_UNSAFE.sub("_", name) or "_", taken)
     return new_names

@@ -44,7 +44,7 @@ def read_description(
         FormatError: If the file cannot be read, is of no such format, or does not expand.
     """
     require_description_file(path)
-    if path.suffix != ".xacro" and is_mjcf(path):
+    if is_mjcf(path):
         if args:
             raise FormatError(
                 f"{path}: xacro arguments {', '.join(args)} for a file that is not a xacro"
@@ -54,12 +54,14 @@ def read_description(
 
 
 def is_mjcf(path: Path) -> bool:
-    """Return whether the root element of a regular file is ``<mujoco>``, and the XML so far valid.
+    """Return whether a file is an MJCF: its root element is ``<mujoco>``, and the XML so far valid.
+
+    A file with the suffix ``.xacro`` is none; it is not opened.
 
     Raises:
         OSError: If the file cannot be read.
     """
-    if not path.is_file():
+    if path.suffix == ".xacro" or not path.is_file():
         return False
     parser = etree.XMLPullParser(
         ("start",), resolve_entities=False, no_network=True, load_dtd=False

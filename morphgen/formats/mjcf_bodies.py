@@ -1,4 +1,4 @@
-"""Bodies of compiled MuJoCo models that are the robot, and unique names for them."""
+"""Bodies of compiled MuJoCo models that are the robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RobotBodies:
     joints: frozenset[int]
     """Indices of the joints between these bodies."""
     findings: tuple[Finding, ...] = ()
-    """What was left out."""
+    """Findings about shapes of the world that were left out of the robot."""
 
     @property
     def root(self) -> int:
@@ -85,23 +85,6 @@ def joint_label(model: mujoco.MjModel, joint: int) -> str:
 def body_label(model: mujoco.MjModel, body: int) -> str:
     """Return a body's name, or for one without a name its number."""
     return model.body(body).name or f"(body {body})"
-
-
-class Names:
-    """Gives every element its own name, and elements without one a name after their body."""
-
-    def __init__(self, taken: set[str]) -> None:
-        """Begin with the names that are taken."""
-        self._taken = taken
-
-    def unique(self, name: str) -> str:
-        """Return the name, with a number if it is taken, and take it."""
-        result, k = name, 1
-        while result in self._taken:
-            k += 1
-            result = f"{name}_{k}"
-        self._taken.add(result)
-        return result
 
 
 def _root(

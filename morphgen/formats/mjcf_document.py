@@ -55,7 +55,7 @@ class MjcfDocument:
     meshes: Mapping[str, Path]
     """File of every mesh asset by name; assets with vertices in the document have none."""
     findings: tuple[Finding, ...] = ()
-    """What was repaired to parse the document."""
+    """Repairs without which the document could not be parsed."""
 
     def error(self, why: str) -> FormatError:
         """Return an error about the document, without the lines of the text with includes."""

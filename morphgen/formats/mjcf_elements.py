@@ -13,6 +13,7 @@ from lxml import etree
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Joint
+from morphgen.model.tree import take_name
 from morphgen.typing import Array
 
 MeshFile = Callable[[Mesh], str]
@@ -86,12 +87,7 @@ class Meshes:
         return name
 
     def _free_name(self, stem: str) -> str:
-        taken = {*self._names.values(), *self._files, *self._vertices}
-        name, k = stem, 1
-        while name in taken:
-            k += 1
-            name = f"{stem}_{k}"
-        return name
+        return take_name(stem, {*self._names.values(), *self._files, *self._vertices})
 
 
 def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[str, str]:

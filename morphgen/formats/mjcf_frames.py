@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 
-from morphgen.formats.mjcf_bodies import Names
 from morphgen.formats.mjcf_shapes import pose_of
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import TOOL, Frame, Joint
+from morphgen.model.tree import take_name
 
 _TOOL_WORDS = ("tool", "tcp", "attachment", "pinch", "grip", "grasp", "ee", "eef", "end_effector")
 """Words in the name of a site that make it the tool, the most specific first."""
@@ -43,11 +43,11 @@ def read_frames(
         if model.site(site).name and body in links:
             T_body_site = pose_of(model.site_pos[site], model.site_quat[site])
             sites.append((model.site(site).name, links[body], T_link_body[body] @ T_body_site))
-    names = Names({*taken, *(name for name, _, _ in sites)})
+    names = {*taken, *(name for name, _, _ in sites)}
     frames = []
     for name, link, T_link_site in sites:
         is_taken = name in taken or f"{name}_joint" in joint_names
-        own = names.unique(f"{name}_site") if is_taken else name
+        own = take_name(f"{name}_site", names) if is_taken else name
         frames.append(Frame(own, link, T_link_site))
     if TOOL in taken or any(frame.name == TOOL for frame in frames):
         return tuple(frames)

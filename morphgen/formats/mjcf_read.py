@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from morphgen.formats.mjcf_actuators import read_efforts
-from morphgen.formats.mjcf_bodies import WORLD, Names, RobotBodies, robot_bodies
+from morphgen.formats.mjcf_bodies import WORLD, RobotBodies, robot_bodies
 from morphgen.formats.mjcf_compile import compile_document
 from morphgen.formats.mjcf_couplings import Couplings, read_couplings
 from morphgen.formats.mjcf_document import MjcfDocument, read_document
@@ -22,6 +22,7 @@ from morphgen.model.findings import Finding
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Inertial, Joint, JointKind, Link, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
+from morphgen.model.tree import take_name
 
 _HOME = "home"
 """Name of the keyframe that is the home configuration."""
@@ -106,18 +107,18 @@ class _Tree:
 
     def __init__(self, model: mujoco.MjModel, chosen: RobotBodies, couplings: Couplings) -> None:
         names = {model.body(body).name for body in chosen.bodies}
-        self._link_names = Names(set(names))
-        self._joint_names = Names({model.joint(j).name for j in chosen.joints})
+        self._link_names = names
+        self._joint_names = {model.joint(j).name for j in chosen.joints}
         self._model = model
         self._couplings = couplings
         self._efforts = read_efforts(model)
         self.link = {
-            body: model.body(body).name or self._link_names.unique(f"body_{body}")
+            body: model.body(body).name or take_name(f"body_{body}", self._link_names)
             for body in chosen.bodies
         }
         self._names = {
             joint: model.joint(joint).name
-            or self._joint_names.unique(f"{self.link[int(model.jnt_bodyid[joint])]}_joint")
+            or take_name(f"{self.link[int(model.jnt_bodyid[joint])]}_joint", self._joint_names)
             for joint in sorted(chosen.joints)
         }
         self.joint_index = {name: joint for joint, name in self._names.items()}
@@ -136,12 +137,12 @@ class _Tree:
         for joint in range(first, first + count):
             is_last = joint == first + count - 1
             own = self._names[joint]
-            child = name if is_last else self._link_names.unique(f"{name}_{own}")
+            child = name if is_last else take_name(f"{name}_{own}", self._link_names)
             step, T = self._joint(joint, own, link, child, T)
             self.steps[body].append(step)
             link = child
         if count == 0:
-            own = self._joint_names.unique(f"{name}_joint")
+            own = take_name(f"{name}_joint", self._joint_names)
             self.steps[body].append(Joint(own, "fixed", link, name, T))
             T = IDENTITY
         self.T_link_body[body] = T

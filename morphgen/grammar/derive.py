@@ -17,6 +17,7 @@ from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, evaluate, typical_value
+from morphgen.model.tree import take_name
 
 DEFAULT_PORTS = ("top", "flange", "end")
 """Ports that the next part is attached to when none is named; the first one that exists."""
@@ -225,18 +226,10 @@ class _Run:
             values[name] = argument(item, name, expression, parameters, scope)
         if values[MOUNT_YAW] == 0.0:
             del values[MOUNT_YAW]  # derivations from before the parameter existed stay equal
-        node = _Node(self._unique(label), item.name, values, tuple(manifest.ports))
+        node = _Node(take_name(label, self._labels), item.name, values, tuple(manifest.ports))
         self._pending -= 1
         self._require_size(len(self._labels), item)
         return node
-
-    def _unique(self, label: str) -> str:
-        unique, k = label, 1
-        while unique in self._labels:
-            k += 1
-            unique = f"{label}_{k}"
-        self._labels.add(unique)
-        return unique
 
 
 def count_fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:

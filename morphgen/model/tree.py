@@ -51,6 +51,16 @@ def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
     )
 
 
+def take_name(name: str, taken: set[str]) -> str:
+    """Return a name, with a number from 2 on if it is taken, and add it to the taken names."""
+    unique, k = name, 1
+    while unique in taken:
+        k += 1
+        unique = f"{name}_{k}"
+    taken.add(unique)
+    return unique
+
+
 def rename(
     robot: Robot, links: Mapping[str, str] | None = None, joints: Mapping[str, str] | None = None
 ) -> Robot:
