@@ -1,14 +1,20 @@
-"""``morphgen export``: web pages and turntable videos of robots."""
+"""``morphgen export``: robots as files and folders of other tools, web pages and videos."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option
+from morphgen.cli.command import command, flag, option, path_option, whole_number
+from morphgen.cli.export_formats import (
+    FORMATS,
+    SAMPLES,
+    ExportSettings,
+    FileFormat,
+    FolderFormat,
+)
 from morphgen.cli.progress import track
 from morphgen.errors import FormatError
 
@@ -16,69 +22,102 @@ if TYPE_CHECKING:
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.robot import Robot
 
-FORMATS = ("html", "mp4", "gif")
+_DEFAULT = "html"
 
 
 @command(
     "export",
-    "write robots as web pages or as videos in which they turn",
+    "write robots for other tools, as web pages, or as videos in which they turn",
     opt.ROBOTS,
     option(
         "--format",
-        choices=FORMATS,
-        default="html",
-        help="html: a page with the robot in 3D that needs no server and no network; mp4, gif: a "
-        "video of a turn (default: html)",
+        choices=tuple(FORMATS),
+        default=_DEFAULT,
+        help="; ".join(f"{name}: {row.summary}" for name, row in FORMATS.items())
+        + f" (default: {_DEFAULT})",
     ),
     path_option(
         "--out",
         "DIR",
-        "output folder (default: the robot's bundle, or this folder for robots without a bundle)",
+        "output folder (default: for files the robot's bundle, else this folder)",
     ),
     flag("--dark", "a dark page (html only)"),
+    option(
+        "--samples",
+        type=whole_number(1),
+        metavar="N",
+        help="number of configurations in which pairs of links are tested (srdf and ros2 only; "
+        f"default: {SAMPLES:,})",
+    ),
+    option(
+        "--seed",
+        type=whole_number(0),
+        metavar="N",
+        help="seed of these configurations (srdf and ros2 only; default: 0)",
+    ),
     opt.ROOT,
     *opt.LIBRARY_JSON,
-    details="In a bundle the file is robot.html, robot.mp4 or robot.gif, elsewhere it has the name "
-    "of the robot.",
+    details="In a bundle a file is robot.html, robot.glb and so on, elsewhere it has the name of "
+    "the robot. Folders are NAME-urdf and so on. An existing folder is replaced only if all its "
+    "files are those of an earlier export.",
     examples=(
         "export robots/ur5-plane --format html",
         "export arm=ur5 ee=plane --format gif --out figures",
+        "export arm=ur5 ee=plane --format ros2 --out src",
     ),
 )
 def export(args: argparse.Namespace) -> None:
-    """Write a file for each robot."""
-    from morphgen.formats.files import write_atomic
+    """Write a file or a folder for each robot."""
     from morphgen.grammar.robot_source import read_source
 
-    if args.dark and args.format != "html":
-        raise FormatError(f"--dark: a {args.format} has no dark page; expected --format html")
+    row, settings = FORMATS[args.format], _settings(args)
     sources, library = opt.sources_of(args), opt.library_of(args)
     if args.out is not None and not args.out.is_dir():
         raise FormatError(f"--out {args.out}: no such folder; create it first")
-    make, paths = _exporter(args.format, dark=args.dark), []
+    paths: list[Path] = []
     for source in track(sources, args, "exporting", "robot", len(sources)):
         robot = read_source(source, library, args.root)
-        paths.append(_target(source, robot, args))
-        write_atomic(paths[-1], make(robot))
+        paths.append(_write(row, source, robot, args, settings))
     opt.print_result(args, [str(path) for path in paths], lambda: "\n".join(map(str, paths)))
 
 
-def _exporter(name: str, *, dark: bool) -> Callable[[Robot], bytes]:
-    """Return the function that makes the content of a file."""
-    if name == "html":
-        from morphgen.viewer.web_page import robot_page
+def _settings(args: argparse.Namespace) -> ExportSettings:
+    """Return the values of the options that only some formats have.
 
-        return lambda robot: robot_page(robot, dark=dark)
-    from morphgen.viewer.turntable import turntable
+    Raises:
+        FormatError: If one is given that the format does not have.
+    """
+    given = {"samples": args.samples, "seed": args.seed, "dark": args.dark or None}
+    values = {name: value for name, value in given.items() if value is not None}
+    for name in values:
+        if name not in FORMATS[args.format].options:
+            valid = " or ".join(key for key, row in FORMATS.items() if name in row.options)
+            raise FormatError(
+                f"--{name} has no effect on --format {args.format}; expected --format {valid}"
+            )
+    return ExportSettings(**values)
 
-    return lambda robot: turntable(robot, f".{name}")
 
-
-def _target(source: RobotSource, robot: Robot, args: argparse.Namespace) -> Path:
-    """Return the path of a robot's file."""
+def _write(
+    row: FileFormat | FolderFormat,
+    source: RobotSource,
+    robot: Robot,
+    args: argparse.Namespace,
+    settings: ExportSettings,
+) -> Path:
+    """Write a robot's file or folder; return its path."""
     from morphgen.formats.bundle import CARD, bundle_folder
+    from morphgen.formats.export_folder import writing_export
+    from morphgen.formats.files import write_atomic
 
+    path = bundle_folder(args.out or Path(), robot.name)
+    if isinstance(row, FolderFormat):
+        path = path.with_name(row.folder_name(robot.name))
+        with writing_export(path, args.format, robot.name) as partial:
+            row.write(robot, partial, settings)
+        return path
+    path = path.with_name(f"{path.name}.{args.format}")
     if args.out is None and source.path is not None and (source.path / CARD).is_file():
-        return source.path / f"robot.{args.format}"
-    name = bundle_folder(args.out or Path(), robot.name)
-    return name.with_name(f"{name.name}.{args.format}")
+        path = source.path / f"robot.{args.format}"
+    write_atomic(path, row.content(robot, settings))
+    return path

@@ -84,7 +84,7 @@ def write_bundle(
     require_replaceable(folder)
     robot = split_colours(robot)
     with replacing_folder(folder) as partial:
-        files = _write_meshes(robot, partial / MESHES)
+        files = write_meshes(robot, partial / MESHES)
         (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         _write_fits(robot, partial)
@@ -218,8 +218,20 @@ def _split_shape(shape: Shape) -> tuple[Shape, ...]:
     )
 
 
-def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
-    """Write every mesh once, in metres; return the paths in the bundle."""
+def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
+    """Write every mesh of a robot once, in metres, as STL or, if it is large, as OBJ.
+
+    Args:
+        robot: The robot.
+        folder: A folder named ``MESHES``, which is created if there is a mesh.
+
+    Returns:
+        The file of every mesh, such as ``meshes/hand-1a2b3c4d.stl``: relative to the parent of
+        ``folder``.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
     files: dict[Mesh, str] = {}
     for link in robot.links:
         for shape in (*link.visuals, *link.collisions):

@@ -1,0 +1,170 @@
+"""The SRDF of a robot: its groups, home and end-effectors, and the pairs that need no test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from morphgen.checks.collision_matrix import MATRIX_SAMPLES, CollisionMatrix, collision_matrix
+from morphgen.checks.self_collision import ALWAYS_SHARE
+from morphgen.errors import FormatError
+from morphgen.formats.srdf import (
+    Chain,
+    EndEffector,
+    Group,
+    GroupState,
+    LinkPair,
+    Srdf,
+    srdf_text,
+)
+from morphgen.model.robot import TOOL, Frame, Robot
+
+HOME = "home"
+"""Name of the group states that hold the home configuration."""
+
+
+@dataclass(frozen=True)
+class _Limb:
+    """The groups of an arm, and of its end-effector if it has one."""
+
+    arm: Group
+    end_effector: Group | None
+
+
+def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0) -> str:
+    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
+
+    Args:
+        robot: The robot.
+        samples: Number of sampled configurations.
+        seed: Seed of the configurations.
+
+    Raises:
+        FormatError: As ``robot_srdf``.
+        MeshError: If a collision mesh cannot be read.
+        RobotError: As ``collision_matrix``.
+    """
+    _require_tool(robot)
+    matrix = collision_matrix(robot, samples=samples, seed=seed)
+    return srdf_text(robot_srdf(robot, matrix), _evidence(matrix))
+
+
+def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
+    """Return the SRDF of a robot; its names are those of the URDF that morphgen writes.
+
+    Every tool has a group ``arm``: the chain from the root to the tool. It has a group ``ee`` if
+    the robot has an end-effector there: the links of its part, or in a robot that was not composed
+    of parts, the links around the joints that do not move the tool, such as those of a gripper.
+    The groups of a robot with several limbs are named after them, such as ``left_arm``.
+
+    Args:
+        robot: The robot, with a frame ``tool``.
+        matrix: The pairs of its links whose collisions need no test.
+
+    Raises:
+        FormatError: If the robot has no frame ``tool``.
+    """
+    _require_tool(robot)
+    groups: list[Group] = []
+    end_effectors = []
+    for limb in _limbs(robot):
+        groups.append(limb.arm)
+        if limb.end_effector is not None:
+            groups.append(limb.end_effector)
+            parent = robot.parents[robot.link_index[limb.end_effector.links[0]]]
+            name, carrier = limb.end_effector.name, robot.links[parent].name
+            end_effectors.append(EndEffector(name, carrier, name, limb.arm.name))
+    disabled = (LinkPair(a, b, reason) for (a, b), reason in matrix.reasons.items())
+    return Srdf(
+        robot.name,
+        groups=tuple(groups),
+        group_states=tuple(_home_states(robot, groups)),
+        end_effectors=tuple(end_effectors),
+        disabled_pairs=tuple(disabled),
+    )
+
+
+def _require_tool(robot: Robot) -> None:
+    if all(frame.name != TOOL for frame in robot.frames):
+        raise FormatError(
+            f"robot {robot.name!r} has no frame {TOOL!r}, where the chain of its arm ends; import "
+            "it with a tool (morphgen import FILE --tool LINK)"
+        )
+
+
+def _evidence(matrix: CollisionMatrix) -> str:
+    counts = ", ".join(f"{count} {reason}" for reason, count in matrix.counts.items())
+    return (
+        f"{matrix.num_pairs} pairs of links with collision shapes, "
+        f"{matrix.samples} configurations sampled with seed {matrix.seed}. Disabled: {counts}. "
+        f"Always: in collision in at least {ALWAYS_SHARE:.0%} of the configurations. "
+        "Never: in collision in none of them. User: ignored by the robot for another reason. "
+        "Meshes count as their convex hulls."
+    )
+
+
+def _limbs(robot: Robot) -> Iterator[_Limb]:
+    """Yield the limbs; ``tool`` of a robot with several is the tool of the last and left out."""
+    tools = [frame for frame in robot.frames if frame.name.endswith(f"_{TOOL}")]
+    for tool in tools or [robot.frame(TOOL)]:
+        prefix = tool.name.removesuffix(TOOL).removesuffix("arm_")
+        arm = Group(f"{prefix}arm", chains=(Chain(robot.root.name, tool.name),))
+        names = _part_links(robot, f"{prefix}ee") or _gripper_links(robot, tool)
+        has_parent = bool(names) and names[0] != robot.root.name
+        yield _Limb(arm, Group(f"{prefix}ee", tuple(names)) if has_parent else None)
+
+
+def _part_links(robot: Robot, label: str) -> list[str]:
+    """Return the links of a part of a composed robot; none if the robot has no such part."""
+    parts = robot.provenance.get("parts")
+    if not isinstance(parts, list) or all(part["label"] != label for part in parts):
+        return []
+    return [link.name for link in robot.links if link.name.startswith(f"{label}_")]
+
+
+def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
+    """Return the links of a gripper, from the hand that carries its joints on; none without one.
+
+    Joints of the gripper are behind the last joint that moves the tool, but do not move it. A hand
+    that this last joint moves directly is a link of the arm: MoveIt adds to a group the joints
+    above its links.
+    """
+    chain = robot.joint_chain(tool.link)
+    moving = [k for k in chain if robot.joints[k].is_movable]
+    if not moving:
+        return []
+    hand = _below(robot, moving[-1] + 1)
+    gripper = [k for k in robot.movable_joints if k + 1 in hand and k not in chain]
+    if not gripper:
+        return []
+    chains = [(0, *(i + 1 for i in robot.joint_chain(robot.joints[k].parent))) for k in gripper]
+    shared = [links[0] for links in zip(*chains, strict=False) if len(set(links)) == 1]
+    links = _below(robot, shared[-1])
+    if links[0] == moving[-1] + 1:
+        links = links[1:]
+    return [robot.links[i].name for i in links]
+
+
+def _below(robot: Robot, root: int) -> list[int]:
+    """Return the indices of a link and of all links below it, in their order."""
+    below = [root]
+    for i in range(root + 1, len(robot.links)):
+        if robot.parents[i] in below:
+            below.append(i)
+    return below
+
+
+def _home_states(robot: Robot, groups: Iterable[Group]) -> Iterator[GroupState]:
+    """Yield the home configuration of every group that has independent joints."""
+    home = {
+        robot.joints[k].name: position
+        for k, position in zip(robot.independent_joints, robot.home, strict=True)
+    }
+    for group in groups:
+        names = [joint.name for joint in robot.joints if joint.child in group.links]
+        for chain in group.chains:
+            indices = robot.joint_chain(robot.frame(chain.tip_link).link)
+            names += (robot.joints[k].name for k in indices)
+        positions = tuple((name, (home[name],)) for name in names if name in home)
+        if positions:
+            yield GroupState(HOME, group.name, positions)

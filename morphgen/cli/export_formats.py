@@ -1,0 +1,148 @@
+"""The formats of ``morphgen export``, one row each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from morphgen.model.robot import Robot
+
+SAMPLES = 10_000
+"""Sampled configurations of an SRDF, as ``morphgen.checks.collision_matrix.MATRIX_SAMPLES``."""
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Values of the options that only some formats have."""
+
+    dark: bool = False
+    """Whether a page is dark."""
+    samples: int = SAMPLES
+    """Number of configurations in which pairs of links are tested."""
+    seed: int = 0
+    """Seed of these configurations."""
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """A format whose robots are one file each, named after the robot with the format as suffix."""
+
+    summary: str
+    """What a file contains, for the help."""
+    content: Callable[[Robot, ExportSettings], bytes]
+    """Function that returns the content of a robot's file."""
+    options: tuple[str, ...] = ()
+    """Fields of ``ExportSettings`` that have an effect."""
+
+
+@dataclass(frozen=True)
+class FolderFormat:
+    """A format whose robots are one folder each."""
+
+    summary: str
+    """What a folder contains, for the help."""
+    write: Callable[[Robot, Path, ExportSettings], None]
+    """Function that writes a robot's files into an empty folder."""
+    folder_name: Callable[[str], str]
+    """Function that returns the name of the folder for the name of a robot."""
+    options: tuple[str, ...] = ()
+    """Fields of ``ExportSettings`` that have an effect."""
+
+
+def _html(robot: Robot, settings: ExportSettings) -> bytes:
+    from morphgen.viewer.web_page import robot_page
+
+    return robot_page(robot, dark=settings.dark)
+
+
+def _video(suffix: str) -> Callable[[Robot, ExportSettings], bytes]:
+    def content(robot: Robot, settings: ExportSettings) -> bytes:
+        from morphgen.viewer.turntable import turntable
+
+        return turntable(robot, suffix)
+
+    return content
+
+
+def _glb(robot: Robot, settings: ExportSettings) -> bytes:
+    from morphgen.formats.bundle import split_colours
+    from morphgen.formats.glb import glb_bytes
+
+    return glb_bytes(split_colours(robot))
+
+
+def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
+    from morphgen.checks.robot_srdf import robot_srdf_text
+
+    return robot_srdf_text(robot, samples=settings.samples, seed=settings.seed).encode()
+
+
+def _urdf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.formats.bundle import MESHES, URDF, split_colours, write_meshes
+    from morphgen.formats.urdf_text import urdf_text
+
+    robot = split_colours(robot)
+    files = write_meshes(robot, folder / MESHES)
+    text = urdf_text(robot, lambda mesh: files[mesh])
+    (folder / URDF).write_text(text, encoding="utf-8")
+
+
+def _mjcf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.formats.bundle import MESHES, MJCF, split_colours, write_meshes
+    from morphgen.formats.mjcf import mjcf_text
+
+    robot = split_colours(robot)
+    files = write_meshes(robot, folder / MESHES)
+    text = mjcf_text(robot, lambda mesh: files[mesh])
+    (folder / MJCF).write_text(text, encoding="utf-8")
+
+
+def _sdf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.formats.bundle import MESHES, split_colours, write_meshes
+    from morphgen.formats.sdf import MODEL_CONFIG, MODEL_SDF, model_config_text, sdf_text
+
+    robot = split_colours(robot)
+    files = write_meshes(robot, folder / MESHES)
+    text = sdf_text(robot, lambda mesh: files[mesh])
+    (folder / MODEL_SDF).write_text(text, encoding="utf-8")
+    (folder / MODEL_CONFIG).write_text(model_config_text(robot), encoding="utf-8")
+
+
+def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.checks.robot_srdf import robot_srdf_text
+    from morphgen.formats.ros_package import write_ros_package
+
+    srdf = robot_srdf_text(robot, samples=settings.samples, seed=settings.seed)
+    write_ros_package(robot, folder, srdf)
+
+
+def _ros2_name(robot_name: str) -> str:
+    from morphgen.formats.ros_package import ros_package_name
+
+    return ros_package_name(robot_name)
+
+
+FORMATS: dict[str, FileFormat | FolderFormat] = {
+    "html": FileFormat(
+        "a page with the robot in 3D that needs no server and no network", _html, ("dark",)
+    ),
+    "mp4": FileFormat("a video of a turn", _video(".mp4")),
+    "gif": FileFormat("a video of a turn", _video(".gif")),
+    "glb": FileFormat("the visual shapes at home, a node per link", _glb),
+    "srdf": FileFormat(
+        "groups, home and disabled pairs for MoveIt, with reasons", _srdf, ("samples", "seed")
+    ),
+    "urdf": FolderFormat("URDF and meshes", _urdf, "{}-urdf".format),
+    "mjcf": FolderFormat("MJCF and meshes", _mjcf, "{}-mjcf".format),
+    "sdf": FolderFormat("a model of Gazebo: SDFormat and meshes", _sdf, "{}-sdf".format),
+    "ros2": FolderFormat(
+        "a ROS 2 package NAME_description with URDF, meshes, SRDF and launch file",
+        _ros2,
+        _ros2_name,
+        ("samples", "seed"),
+    ),
+}
+"""The formats by name; a new format is one row."""
