@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -17,6 +16,7 @@ from morphgen.model.robot import Pair, Robot, sorted_pair
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
 REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
 """Reasons in the order in which they apply; a pair gets the first one."""
+_ANY_AXIS = (1.0, 0.0, 0.0)
 MATRIX_SAMPLES = 10_000
 """Number of sampled configurations, the default of MoveIt's setup assistant."""
 
@@ -65,16 +65,15 @@ def collision_matrix(
         MeshError: If a collision mesh cannot be read.
         RobotError: If MuJoCo refuses the shapes, or contacts exceed its memory.
     """
-    loose = _with_loose_joints(robot)
+    loose, columns = _with_loose_joints(robot)
     collidable = [link.name for link in robot.links if link.collisions]
     pairs = sorted({sorted_pair(a, b) for a, b in combinations(collidable, 2)})
     checker = SelfCollisionChecker(loose, ())
-    at_home = next(checker.penetrations([loose.home]))
-    collisions: Counter[Pair] = Counter()
-    for depths in checker.penetrations(
-        random_configurations(loose, samples, np.random.default_rng(seed))
-    ):
-        collisions.update(depths.keys())
+    q = np.zeros((samples + 1, loose.dof))
+    q[0, columns] = robot.home
+    q[1:, columns] = random_configurations(robot, samples, np.random.default_rng(seed))
+    at_home, *sampled = map(frozenset, checker.penetrations(q))
+    collisions = Counter(pair for colliding in sampled for pair in colliding)
     adjacent = linked_pairs(robot)
     reasons: dict[Pair, Reason] = dict.fromkeys(robot.ignore_pairs, "User")
     for pair in pairs:
@@ -108,21 +107,17 @@ def linked_pairs(robot: Robot) -> frozenset[Pair]:
     return frozenset(pairs)
 
 
-def _with_loose_joints(robot: Robot) -> Robot:
-    """Return the robot with slides without travel instead of fixed joints.
+def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
+    """Replace fixed joints by slides, because MuJoCo never tests links on fixed joints.
 
-    MuJoCo never tests links on fixed joints against each other.
+    Returns:
+        The robot with slides, which stay at zero, and the columns of its ``q`` that hold the
+        independent joints of the original.
     """
     joints = tuple(
-        joint
-        if joint.is_movable
-        else replace(joint, kind="prismatic", axis=(1.0, 0.0, 0.0), limits=(0.0, 0.0), mimic=None)
+        joint if joint.is_movable else replace(joint, kind="prismatic", axis=_ANY_AXIS, mimic=None)
         for joint in robot.joints
     )
-    home = dict(zip(_independent_names(robot), robot.home, strict=True))
-    loose = replace(robot, joints=joints, home=(0.0,) * sum(j.is_independent for j in joints))
-    return replace(loose, home=tuple(home.get(name, 0.0) for name in _independent_names(loose)))
-
-
-def _independent_names(robot: Robot) -> Iterable[str]:
-    return [robot.joints[k].name for k in robot.independent_joints]
+    independent = [k for k, joint in enumerate(joints) if joint.is_independent]
+    loose = replace(robot, joints=joints, home=(0.0,) * len(independent))
+    return loose, [independent.index(k) for k in robot.independent_joints]

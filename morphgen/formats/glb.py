@@ -30,8 +30,8 @@ def glb_bytes(robot: Robot) -> bytes:
     """Return a robot at home as binary glTF; the same robot gives the same bytes.
 
     Every link is a node of its name below the node of its parent link, frames are nodes, too, and
-    visual shapes are nodes ``LINK_visual_0`` and so on with their colour as base colour. A frame
-    that is named like a link gets ``_frame`` appended.
+    visual shapes are nodes ``LINK_visual_0`` and so on with their colour as base colour. A node
+    whose name is taken gets ``_`` appended.
 
     Args:
         robot: The robot; a mesh of several colours needs ``split_colours`` before.
@@ -42,7 +42,7 @@ def glb_bytes(robot: Robot) -> bytes:
     """
     if not any(link.visuals for link in robot.links):
         raise FormatError(f"robot {robot.name!r} has no visual shape, so a GLB would be empty")
-    names = {*(link.name for link in robot.links), *(frame.name for frame in robot.frames)}
+    names = set(robot.link_index)
     scene = trimesh.Scene(base_frame=_free_name("scene", names))
     for link, parent, T in zip(robot.links, robot.parents, _home_transforms(robot), strict=True):
         above = robot.links[parent].name if parent >= 0 else scene.graph.base_frame
@@ -57,17 +57,17 @@ def glb_bytes(robot: Robot) -> bytes:
                 transform=shape.T_link_shape.matrix,
             )
     for frame in robot.frames:
-        name = f"{frame.name}_frame" if frame.name in robot.link_index else frame.name
-        matrix = frame.T_link_frame.matrix
+        name, matrix = _free_name(frame.name, names), frame.T_link_frame.matrix
         scene.graph.update(frame_from=frame.link, frame_to=name, matrix=matrix)
     data: bytes = export_glb(scene, include_normals=True)
     return data
 
 
-def _free_name(name: str, names: set[str]) -> str:
-    """Return the name, with underscores appended until no other node has it."""
-    while name in names:
+def _free_name(name: str, taken: set[str]) -> str:
+    """Return the name, with underscores appended until no other node has it, and add it to them."""
+    while name in taken:
         name += "_"
+    taken.add(name)
     return name
 
 

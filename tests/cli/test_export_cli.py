@@ -1,9 +1,18 @@
 """``morphgen export``."""
 
+from dataclasses import replace
+
+import mujoco
+import numpy as np
 import pytest
 
 from helpers.robots import arm
+from morphgen.checks.robot_srdf import robot_srdf_text
 from morphgen.formats.bundle import file_findings, write_bundle
+from morphgen.formats.export_folder import MANIFEST
+from morphgen.formats.srdf_reader import read_srdf
+from morphgen.formats.urdf import read_urdf
+from morphgen.model.kinematics import forward_kinematics
 
 
 def test_bundles_get_their_web_page_and_stay_valid(run, tmp_path):
@@ -28,12 +37,101 @@ def test_other_robots_are_written_into_the_output_folder(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--format", "gif", "--dark"), "--dark: a gif has no dark page"),
+        (
+            ("--format", "gif", "--dark"),
+            "--dark has no effect on --format gif; expected --format html",
+        ),
+        (
+            ("--format", "glb", "--samples", "9"),
+            "--samples has no effect on --format glb; expected --format srdf or ros2",
+        ),
+        (("--format", "srdf", "--samples", "0"), "0: expected a whole number, 1 or more"),
+        (("--format", "srdf", "--seed", "-1"), "-1: expected a whole number, 0 or more"),
         (("--out", "nowhere"), "--out nowhere: no such folder"),
-        (("--format", "pdf"), "gif, html, mp4"),
+        (("--format", "pdf"), "gif, glb, html, mjcf, mp4, ros2, sdf, srdf, urdf"),
     ],
 )
 def test_invalid_options_are_refused(run, words, message):
     code, _, err = run("export", "base=planar", "ee=cube", *words)
     assert code == 2
     assert message in err.replace("'", "")
+
+
+def files(folder):
+    paths = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return {path.as_posix() for path in paths if path.suffix != ".stl"}
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "expected"),
+    [
+        ("urdf", "arm-urdf", {"robot.urdf"}),
+        ("mjcf", "arm-mjcf", {"robot.xml"}),
+        ("sdf", "arm-sdf", {"model.sdf", "model.config"}),
+        (
+            "ros2",
+            "arm_description",
+            {
+                "package.xml",
+                "CMakeLists.txt",
+                "urdf/arm.urdf",
+                "config/arm.srdf",
+                "config/display.rviz",
+                "launch/display.launch.py",
+            },
+        ),
+    ],
+)
+def test_folders_are_written_into_the_output_folder_and_again(
+    run, tmp_path, name, folder, expected
+):
+    bundle = write_bundle(arm(), tmp_path / "bundle", picture=False)
+    options = ("--samples", "20") if name == "ros2" else ()
+    for _ in range(2):
+        code, out, _ = run("export", bundle, "--format", name, "--out", tmp_path, *options)
+        assert (code, out.strip()) == (0, str(tmp_path / folder))
+    assert files(tmp_path / folder) == {*expected, MANIFEST}
+    (tmp_path / folder / "mine").write_text("")
+    code, _, err = run("export", bundle, "--format", name, "--out", tmp_path, *options)
+    assert code == 2
+    assert "mine is not of the export" in err
+    assert {path.name for path in tmp_path.iterdir()} == {"bundle", folder}
+
+
+def test_urdf_and_mjcf_hold_the_robot_and_its_meshes(run, tmp_path):
+    for name in ("urdf", "mjcf"):
+        code, out, _ = run("export", "arm=xarm6", "ee=none", "--format", name, "--out", tmp_path)
+        assert code == 0
+        (folder,) = tmp_path.glob(f"*-{name}")
+        assert out.strip() == str(folder)
+        assert any((folder / "meshes").iterdir())
+    (urdf,) = tmp_path.glob("*/robot.urdf")
+    (mjcf,) = tmp_path.glob("*/robot.xml")
+    robot = read_urdf(urdf, written_frames=True)
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.home
+    mujoco.mj_kinematics(model, data)
+    for link, T in zip(robot.links, forward_kinematics(robot, robot.home), strict=True):
+        np.testing.assert_allclose(data.body(link.name).xpos, T[:3, 3], atol=1e-9)
+    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-6)
+
+
+def test_files_of_a_bundle_are_written_into_it(run, tmp_path):
+    bundle = write_bundle(arm(), tmp_path / "a", picture=False)
+    for name, options in (("srdf", ("--samples", "30", "--seed", "2")), ("glb", ())):
+        code, out, _ = run("export", bundle, "--format", name, *options)
+        assert (code, out.strip()) == (0, str(bundle / f"robot.{name}"))
+    assert (bundle / "robot.srdf").read_text() == robot_srdf_text(arm(), samples=30, seed=2)
+    assert read_srdf(bundle / "robot.srdf").groups[0].name == "arm"
+    assert (bundle / "robot.glb").read_bytes()[:4] == b"glTF"
+    assert file_findings(bundle) == ()
+
+
+@pytest.mark.parametrize("name", ["srdf", "ros2"])
+def test_failed_export_leaves_nothing(run, tmp_path, name):
+    bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)
+    code, _, err = run("export", bundle, "--format", name, "--out", tmp_path)
+    assert code == 2
+    assert "robot 'arm' has no frame 'tool'" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
