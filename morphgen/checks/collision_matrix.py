@@ -72,8 +72,9 @@ def collision_matrix(
     q = np.zeros((samples + 1, loose.dof))
     q[0, columns] = robot.home
     q[1:, columns] = random_configurations(robot, samples, np.random.default_rng(seed))
-    at_home, *sampled = map(frozenset, checker.penetrations(q))
-    collisions = Counter(pair for colliding in sampled for pair in colliding)
+    penetrations = checker.penetrations(q)
+    at_home = next(penetrations)
+    collisions = Counter(pair for depths in penetrations for pair in depths)
     adjacent = linked_pairs(robot)
     reasons: dict[Pair, Reason] = dict.fromkeys(robot.ignore_pairs, "User")
     for pair in pairs:

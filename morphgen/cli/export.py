@@ -10,10 +10,11 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option, whole_number
 from morphgen.cli.export_formats import (
     FORMATS,
+    MAX_SAMPLES,
     SAMPLES,
     ExportSettings,
-    FileFormat,
     FolderFormat,
+    formats_with,
 )
 from morphgen.cli.progress import track
 from morphgen.errors import FormatError
@@ -41,19 +42,19 @@ _DEFAULT = "html"
         "DIR",
         "output folder (default: for files the robot's bundle, else this folder)",
     ),
-    flag("--dark", "a dark page (html only)"),
+    flag("--dark", f"a dark page ({formats_with('dark')} only)"),
     option(
         "--samples",
-        type=whole_number(1),
+        type=whole_number(1, MAX_SAMPLES),
         metavar="N",
-        help="number of configurations in which pairs of links are tested (srdf and ros2 only; "
-        f"default: {SAMPLES:,})",
+        help="number of configurations in which pairs of links are tested "
+        f"({formats_with('samples')} only; default: {SAMPLES:,})",
     ),
     option(
         "--seed",
         type=whole_number(0),
         metavar="N",
-        help="seed of these configurations (srdf and ros2 only; default: 0)",
+        help=f"seed of these configurations ({formats_with('seed')} only; default: 0)",
     ),
     opt.ROOT,
     *opt.LIBRARY_JSON,
@@ -70,14 +71,18 @@ def export(args: argparse.Namespace) -> None:
     """Write a file or a folder for each robot."""
     from morphgen.grammar.robot_source import read_source
 
-    row, settings = FORMATS[args.format], _settings(args)
+    settings = _settings(args)
     sources, library = opt.sources_of(args), opt.library_of(args)
     if args.out is not None and not args.out.is_dir():
         raise FormatError(f"--out {args.out}: no such folder; create it first")
     paths: list[Path] = []
     for source in track(sources, args, "exporting", "robot", len(sources)):
         robot = read_source(source, library, args.root)
-        paths.append(_write(row, source, robot, args, settings))
+        path = _target(source, robot, args)
+        if path in paths:
+            raise FormatError(f"{source.label}: {path} is of another robot of this command already")
+        _write(robot, path, args.format, settings)
+        paths.append(path)
     opt.print_result(args, [str(path) for path in paths], lambda: "\n".join(map(str, paths)))
 
 
@@ -91,33 +96,34 @@ def _settings(args: argparse.Namespace) -> ExportSettings:
     values = {name: value for name, value in given.items() if value is not None}
     for name in values:
         if name not in FORMATS[args.format].options:
-            valid = " or ".join(key for key, row in FORMATS.items() if name in row.options)
             raise FormatError(
-                f"--{name} has no effect on --format {args.format}; expected --format {valid}"
+                f"--{name} has no effect on --format {args.format}; expected --format "
+                + formats_with(name)
             )
     return ExportSettings(**values)
 
 
-def _write(
-    row: FileFormat | FolderFormat,
-    source: RobotSource,
-    robot: Robot,
-    args: argparse.Namespace,
-    settings: ExportSettings,
-) -> Path:
-    """Write a robot's file or folder; return its path."""
+def _target(source: RobotSource, robot: Robot, args: argparse.Namespace) -> Path:
+    """Return the path of a robot's file or folder."""
     from morphgen.formats.bundle import CARD, bundle_folder
+
+    row = FORMATS[args.format]
+    path = bundle_folder(args.out or Path(), robot.name)
+    if isinstance(row, FolderFormat):
+        return path.with_name(row.folder_name(robot.name))
+    if args.out is None and source.path is not None and (source.path / CARD).is_file():
+        return source.path / f"robot.{args.format}"
+    return path.with_name(f"{path.name}.{args.format}")
+
+
+def _write(robot: Robot, path: Path, format_name: str, settings: ExportSettings) -> None:
+    """Write a robot's file or folder atomically."""
     from morphgen.formats.export_folder import writing_export
     from morphgen.formats.files import write_atomic
 
-    path = bundle_folder(args.out or Path(), robot.name)
+    row = FORMATS[format_name]
     if isinstance(row, FolderFormat):
-        path = path.with_name(row.folder_name(robot.name))
-        with writing_export(path, args.format, robot.name) as partial:
+        with writing_export(path, format_name, robot.name) as partial:
             row.write(robot, partial, settings)
-        return path
-    path = path.with_name(f"{path.name}.{args.format}")
-    if args.out is None and source.path is not None and (source.path / CARD).is_file():
-        path = source.path / f"robot.{args.format}"
-    write_atomic(path, row.content(robot, settings))
-    return path
+    else:
+        write_atomic(path, row.content(robot, settings))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from morphgen.model.robot import Robot
 
-SAMPLES = 10_000
-"""Sampled configurations of an SRDF, as ``morphgen.checks.collision_matrix.MATRIX_SAMPLES``."""
+SAMPLES, MAX_SAMPLES = 10_000, 1_000_000
+"""Default and largest number of sampled configurations of an SRDF; the default is
+``morphgen.checks.collision_matrix.MATRIX_SAMPLES``."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class FolderFormat:
     """Function that returns the name of the folder for the name of a robot."""
     options: tuple[str, ...] = ()
     """Fields of ``ExportSettings`` that have an effect."""
+
+
+def formats_with(option: str) -> str:
+    """Return the formats in which an option has an effect, such as ``srdf or ros2``."""
+    return " or ".join(name for name, row in FORMATS.items() if option in row.options)
 
 
 def _html(robot: Robot, settings: ExportSettings) -> bytes:

@@ -29,9 +29,9 @@ def writing_export(folder: Path, format_name: str, robot_name: str) -> Iterator[
 
     Raises:
         FormatError: If the folder cannot be written, or exists with files that are not of an
-            export or were changed since.
+            export of this robot or were changed since.
     """
-    _require_replaceable(folder)
+    _require_replaceable(folder, robot_name)
     with replacing_folder(folder) as partial:
         yield partial
         manifest = {"format": format_name, "robot": robot_name, "files": _hashes(partial)}
@@ -39,7 +39,7 @@ def writing_export(folder: Path, format_name: str, robot_name: str) -> Iterator[
         (partial / MANIFEST).write_text(text, encoding="utf-8")
 
 
-def _require_replaceable(folder: Path) -> None:
+def _require_replaceable(folder: Path, robot_name: str) -> None:
     if not folder.exists() and not folder.is_symlink():
         return
     manifest = folder / MANIFEST
@@ -52,6 +52,11 @@ def _require_replaceable(folder: Path) -> None:
     written = data.get("files") if isinstance(data, dict) else None
     if not isinstance(written, dict):
         raise FormatError(f"{manifest}: files: expected an object with the SHA-256 of every file")
+    if data.get("robot") != robot_name:
+        raise FormatError(
+            f"{folder} is an export of robot {data.get('robot')!r}, not of {robot_name!r}; move it "
+            "away, or choose another --out"
+        )
     for name, digest in _hashes(folder).items():
         if name != MANIFEST and written.get(name) != digest:
             why = "was changed after the export" if name in written else "is not of the export"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lxml import etree
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import MESHES, bundle_folder, split_colours, write_meshes
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.robot import Robot
@@ -141,7 +141,9 @@ def _licences(robot: Robot) -> tuple[str, ...]:
     parts = robot.provenance.get("parts")
     rows = parts if isinstance(parts, list) else []
     names = [
-        str(part["licence"]) for part in rows if isinstance(part, Mapping) and "licence" in part
+        one_line(str(part["licence"]))
+        for part in rows
+        if isinstance(part, Mapping) and "licence" in part
     ]
     return tuple(dict.fromkeys(names)) or (_UNKNOWN_LICENCE,)
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from helpers.robots import arm
+from morphgen.checks.collision_matrix import MATRIX_SAMPLES
 from morphgen.checks.robot_srdf import robot_srdf_text
+from morphgen.cli.export_formats import SAMPLES
 from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.export_folder import MANIFEST
 from morphgen.formats.srdf_reader import read_srdf
@@ -45,7 +47,7 @@ def test_other_robots_are_written_into_the_output_folder(run, tmp_path):
             ("--format", "glb", "--samples", "9"),
             "--samples has no effect on --format glb; expected --format srdf or ros2",
         ),
-        (("--format", "srdf", "--samples", "0"), "0: expected a whole number, 1 or more"),
+        (("--format", "srdf", "--samples", "0"), "0: expected a whole number, 1 to 1000000"),
         (("--format", "srdf", "--seed", "-1"), "-1: expected a whole number, 0 or more"),
         (("--out", "nowhere"), "--out nowhere: no such folder"),
         (("--format", "pdf"), "gif, glb, html, mjcf, mp4, ros2, sdf, srdf, urdf"),
@@ -126,6 +128,17 @@ def test_files_of_a_bundle_are_written_into_it(run, tmp_path):
     assert read_srdf(bundle / "robot.srdf").groups[0].name == "arm"
     assert (bundle / "robot.glb").read_bytes()[:4] == b"glTF"
     assert file_findings(bundle) == ()
+
+
+def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):
+    folders = [write_bundle(arm(), tmp_path / name, picture=False) for name in ("a", "b")]
+    code, _, err = run("export", *folders, "--format", "sdf", "--out", tmp_path)
+    assert code == 2
+    assert f"b: {tmp_path / 'arm-sdf'} is of another robot of this command already" in err
+
+
+def test_default_number_of_samples_is_that_of_the_matrix():
+    assert SAMPLES == MATRIX_SAMPLES
 
 
 @pytest.mark.parametrize("name", ["srdf", "ros2"])

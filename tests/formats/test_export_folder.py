@@ -44,6 +44,13 @@ def test_edited_export_is_not_replaced(tmp_path, file, message):
     assert tree(tmp_path) == before
 
 
+def test_export_of_another_robot_is_not_replaced(tmp_path):
+    folder = export(tmp_path / "x")
+    message = r"x is an export of robot 'arm', not of 'leg'"
+    with pytest.raises(FormatError, match=message), writing_export(folder, "urdf", "leg"):
+        pass
+
+
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
 def test_other_things_are_not_replaced(tmp_path, kind):
     path = tmp_path / "arm-urdf"

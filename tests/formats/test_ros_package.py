@@ -37,12 +37,12 @@ def test_package_names_are_those_of_ros(robot, package):
 
 
 def test_package_describes_itself(tmp_path):
-    parts = [{"label": "arm", "licence": "BSD-3-Clause"}, {"label": "ee", "licence": "MIT"}]
+    parts = [{"label": "arm", "licence": "BSD-3-Clause"}, {"label": "ee", "licence": "MIT\x00"}]
     folder = written(replace(arm(), provenance={"parts": parts}), tmp_path)
     package = ET.parse(folder / "package.xml").getroot()
     assert package.get("format") == "3"
     assert package.findtext("name") == folder.name == "arm_description"
-    assert [e.text for e in package.findall("license")] == ["BSD-3-Clause", "MIT"]
+    assert [e.text for e in package.findall("license")] == ["BSD-3-Clause", "MIT\\x00"]
     depends = {element.text for element in package.findall("exec_depend")}
     assert {"robot_state_publisher", "joint_state_publisher_gui", "rviz2"} <= depends
     assert package.findtext("export/build_type") == "ament_cmake"
