@@ -51,6 +51,16 @@ class Couplings:
         return joint
 
 
+@dataclass(frozen=True)
+class _Scope:
+    """The part of a compiled model that becomes a robot."""
+
+    model: mujoco.MjModel
+    joints: Collection[int]
+    bodies: Collection[int]
+    document: MjcfDocument
+
+
 def read_couplings(
     model: mujoco.MjModel, joints: Collection[int], bodies: Collection[int], document: MjcfDocument
 ) -> Couplings:
@@ -72,20 +82,18 @@ def read_couplings(
     Raises:
         FormatError: If a constraint or tendon has no counterpart.
     """
-    couplings = Couplings()
+    scope, couplings = _Scope(model, joints, bodies, document), Couplings()
     resolved_tendons = set()
     for k in range(model.neq):
         kind = _EQ(model.eq_type[k])
-        if not model.eq_active0[k] or not _touches(model, k, kind, joints, bodies):
+        if not model.eq_active0[k] or not _touches(scope, k, kind):
             continue
         name = model.equality(k).name or _ends(model, k, kind)
         if kind == _EQ.mjEQ_JOINT:
-            _add_joint_equality(couplings, model, k, name, joints, document)
-        elif kind == _EQ.mjEQ_TENDON and _add_tendon_equality(
-            couplings, model, k, name, joints, document
-        ):
+            _add_joint_equality(scope, couplings, k, name)
+        elif kind == _EQ.mjEQ_TENDON and _add_tendon_equality(scope, couplings, k, name):
             resolved_tendons.add(int(model.eq_obj1id[k]))
-        elif _is_handle(model, k, kind, bodies):
+        elif _is_handle(scope, k, kind):
             couplings.findings.append(_handle_finding(name, document))
         else:
             word = kind.name.removeprefix("mjEQ_").lower()
@@ -96,24 +104,19 @@ def read_couplings(
     _lock_followers(couplings)
     for tendon in range(model.ntendon):
         if tendon not in resolved_tendons:
-            _require_actuation_only(model, tendon, couplings, joints, bodies, document)
+            _require_actuation_only(scope, couplings, tendon)
     return couplings
 
 
-def _touches(
-    model: mujoco.MjModel,
-    equality: int,
-    kind: mujoco.mjtEq,
-    joints: Collection[int],
-    bodies: Collection[int],
-) -> bool:
+def _touches(scope: _Scope, equality: int, kind: mujoco.mjtEq) -> bool:
     """Return whether a constraint acts on a joint or body of the robot."""
+    model = scope.model
     ends = [int(k) for k in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if k >= 0]
     if kind == _EQ.mjEQ_JOINT:
-        return any(end in joints for end in ends)
+        return any(end in scope.joints for end in ends)
     if kind == _EQ.mjEQ_TENDON:
-        return any(_tendon_touches(model, end, joints, bodies) for end in ends)
-    return any(body in bodies for body in _connected_bodies(model, equality))
+        return any(_tendon_touches(scope, end) for end in ends)
+    return any(body in scope.bodies for body in _connected_bodies(model, equality))
 
 
 def _connected_bodies(model: mujoco.MjModel, equality: int) -> list[int]:
@@ -126,13 +129,11 @@ def _connected_bodies(model: mujoco.MjModel, equality: int) -> list[int]:
     return ends
 
 
-def _is_handle(
-    model: mujoco.MjModel, equality: int, kind: mujoco.mjtEq, bodies: Collection[int]
-) -> bool:
+def _is_handle(scope: _Scope, equality: int, kind: mujoco.mjtEq) -> bool:
     """Return whether a constraint connects the robot to a mocap body that is not of the robot."""
     return kind in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD) and any(
-        body not in bodies and model.body_mocapid[body] >= 0
-        for body in _connected_bodies(model, equality)
+        body not in scope.bodies and scope.model.body_mocapid[body] >= 0
+        for body in _connected_bodies(scope.model, equality)
     )
 
 
@@ -157,41 +158,29 @@ def _ends(model: mujoco.MjModel, equality: int, kind: mujoco.mjtEq) -> str:
     return " - ".join(names)
 
 
-def _add_joint_equality(
-    couplings: Couplings,
-    model: mujoco.MjModel,
-    k: int,
-    name: str,
-    joints: Collection[int],
-    document: MjcfDocument,
-) -> None:
+def _add_joint_equality(scope: _Scope, couplings: Couplings, k: int, name: str) -> None:
     """Add q1 - ref1 = a0 + a1 (q2 - ref2), or a1 = 0 without a second joint."""
+    model = scope.model
     follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
     a0, a1, *higher = (float(value) for value in model.eq_data[k, :5])
     if leader < 0:
-        _claim(couplings, follower, model, name, document)
+        _claim(scope, couplings, follower, name)
         couplings.locks[follower] = _ref(model, follower) + a0
         return
     if any(higher):
-        raise document.error(
+        raise scope.document.error(
             f"equality {name!r}: its polycoef has degree {_degree(higher)}; expected degree 1, as "
             "of a mimic joint"
         )
-    _require_own_joints(model, (follower, leader), name, joints, document)
-    _claim(couplings, follower, model, name, document)
+    _require_own_joints(scope, (follower, leader), name)
+    _claim(scope, couplings, follower, name)
     offset = _ref(model, follower) + a0 - a1 * _ref(model, leader)
     couplings.mimics[follower] = (leader, a1, offset)
 
 
-def _add_tendon_equality(
-    couplings: Couplings,
-    model: mujoco.MjModel,
-    k: int,
-    name: str,
-    joints: Collection[int],
-    document: MjcfDocument,
-) -> bool:
+def _add_tendon_equality(scope: _Scope, couplings: Couplings, k: int, name: str) -> bool:
     """Add c1 q1 + c2 q2 = length0 + a0 of a fixed tendon; return False if it is something else."""
+    model = scope.model
     terms = _terms(model, int(model.eq_obj1id[k]))
     if model.eq_obj2id[k] >= 0 or terms is None or len({joint for joint, _ in terms}) != 2:
         return False
@@ -199,23 +188,19 @@ def _add_tendon_equality(
     follower, c_follower = others[0]
     if len(others) > 1 or c_follower == 0:
         return False
-    _require_own_joints(model, (follower, leader), name, joints, document)
-    _claim(couplings, follower, model, name, document)
+    _require_own_joints(scope, (follower, leader), name)
+    _claim(scope, couplings, follower, name)
     length = float(model.tendon_length0[model.eq_obj1id[k]]) + float(model.eq_data[k, 0])
     couplings.mimics[follower] = (leader, -c_leader / c_follower, length / c_follower)
     return True
 
 
-def _require_own_joints(
-    model: mujoco.MjModel,
-    ends: Iterable[int],
-    name: str,
-    joints: Collection[int],
-    document: MjcfDocument,
-) -> None:
-    outside = [joint_label(model, joint) for joint in ends if joint not in joints]
+def _require_own_joints(scope: _Scope, ends: Iterable[int], name: str) -> None:
+    outside = [joint_label(scope.model, joint) for joint in ends if joint not in scope.joints]
     if outside:
-        raise document.error(f"equality {name!r}: joint {listed(outside)} is not of the robot")
+        raise scope.document.error(
+            f"equality {name!r}: joint {listed(outside)} is not of the robot"
+        )
 
 
 def _lock_followers(couplings: Couplings) -> None:
@@ -227,16 +212,10 @@ def _lock_followers(couplings: Couplings) -> None:
             locks[joint] = multiplier * locks[leader] + offset
 
 
-def _require_actuation_only(
-    model: mujoco.MjModel,
-    tendon: int,
-    couplings: Couplings,
-    joints: Collection[int],
-    bodies: Collection[int],
-    document: MjcfDocument,
-) -> None:
-    if not _tendon_touches(model, tendon, joints, bodies):
+def _require_actuation_only(scope: _Scope, couplings: Couplings, tendon: int) -> None:
+    if not _tendon_touches(scope, tendon):
         return
+    model, document = scope.model, scope.document
     name = model.tendon(tendon).name
     terms = _terms(model, tendon)
     if terms is None:
@@ -261,30 +240,27 @@ def _terms(model: mujoco.MjModel, tendon: int) -> list[tuple[int, float]] | None
     return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
 
 
-def _tendon_touches(
-    model: mujoco.MjModel, tendon: int, joints: Collection[int], bodies: Collection[int]
-) -> bool:
+def _tendon_touches(scope: _Scope, tendon: int) -> bool:
+    model = scope.model
     terms = _terms(model, tendon)
     if terms is not None:
-        return any(joint in joints for joint, _ in terms)
+        return any(joint in scope.joints for joint, _ in terms)
     first = int(model.tendon_adr[tendon])
     for w in range(first, first + int(model.tendon_num[tendon])):
         item = int(model.wrap_objid[w])
         kind = _WRAP(model.wrap_type[w])
-        if kind == _WRAP.mjWRAP_SITE and int(model.site_bodyid[item]) in bodies:
+        if kind == _WRAP.mjWRAP_SITE and int(model.site_bodyid[item]) in scope.bodies:
             return True
-        if kind in _WRAPPED_GEOMS and int(model.geom_bodyid[item]) in bodies:
+        if kind in _WRAPPED_GEOMS and int(model.geom_bodyid[item]) in scope.bodies:
             return True
     return False
 
 
-def _claim(
-    couplings: Couplings, joint: int, model: mujoco.MjModel, name: str, document: MjcfDocument
-) -> None:
+def _claim(scope: _Scope, couplings: Couplings, joint: int, name: str) -> None:
     """Require that no other constraint determines a joint."""
     if joint in couplings.mimics or joint in couplings.locks:
-        raise document.error(
-            f"equality {name!r}: another one couples joint {model.joint(joint).name!r}, too; "
+        raise scope.document.error(
+            f"equality {name!r}: another one couples joint {scope.model.joint(joint).name!r}, too; "
             "expected one"
         )
 
