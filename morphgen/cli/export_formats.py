@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from morphgen.formats.urdf_text import MeshUri
     from morphgen.model.robot import Robot
 
 SAMPLES, MAX_SAMPLES = 10_000, 1_000_000
@@ -86,35 +87,40 @@ def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
     return robot_srdf_text(robot, samples=settings.samples, seed=settings.seed).encode()
 
 
-def _urdf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-    from morphgen.formats.bundle import MESHES, URDF, split_colours, write_meshes
+def _with_meshes(
+    texts: Callable[[Robot, MeshUri], Mapping[str, str]],
+) -> Callable[[Robot, Path, ExportSettings], None]:
+    """Return a function that writes meshes and the texts that name them by relative paths."""
+
+    def write(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+        from morphgen.formats.bundle import MESHES, split_colours, write_meshes
+
+        robot = split_colours(robot)
+        files = write_meshes(robot, folder / MESHES)
+        for name, text in texts(robot, files.__getitem__).items():
+            (folder / name).write_text(text, encoding="utf-8")
+
+    return write
+
+
+def _urdf(robot: Robot, mesh_uri: MeshUri) -> Mapping[str, str]:
+    from morphgen.formats.bundle import URDF
     from morphgen.formats.urdf_text import urdf_text
 
-    robot = split_colours(robot)
-    files = write_meshes(robot, folder / MESHES)
-    text = urdf_text(robot, lambda mesh: files[mesh])
-    (folder / URDF).write_text(text, encoding="utf-8")
+    return {URDF: urdf_text(robot, mesh_uri)}
 
 
-def _mjcf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-    from morphgen.formats.bundle import MESHES, MJCF, split_colours, write_meshes
+def _mjcf(robot: Robot, mesh_uri: MeshUri) -> Mapping[str, str]:
+    from morphgen.formats.bundle import MJCF
     from morphgen.formats.mjcf import mjcf_text
 
-    robot = split_colours(robot)
-    files = write_meshes(robot, folder / MESHES)
-    text = mjcf_text(robot, lambda mesh: files[mesh])
-    (folder / MJCF).write_text(text, encoding="utf-8")
+    return {MJCF: mjcf_text(robot, mesh_uri)}
 
 
-def _sdf(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-    from morphgen.formats.bundle import MESHES, split_colours, write_meshes
+def _sdf(robot: Robot, mesh_uri: MeshUri) -> Mapping[str, str]:
     from morphgen.formats.sdf import MODEL_CONFIG, MODEL_SDF, model_config_text, sdf_text
 
-    robot = split_colours(robot)
-    files = write_meshes(robot, folder / MESHES)
-    text = sdf_text(robot, lambda mesh: files[mesh])
-    (folder / MODEL_SDF).write_text(text, encoding="utf-8")
-    (folder / MODEL_CONFIG).write_text(model_config_text(robot), encoding="utf-8")
+    return {MODEL_SDF: sdf_text(robot, mesh_uri), MODEL_CONFIG: model_config_text(robot)}
 
 
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
@@ -141,9 +147,11 @@ FORMATS: dict[str, FileFormat | FolderFormat] = {
     "srdf": FileFormat(
         "groups, home and disabled pairs for MoveIt, with reasons", _srdf, ("samples", "seed")
     ),
-    "urdf": FolderFormat("URDF and meshes", _urdf, "{}-urdf".format),
-    "mjcf": FolderFormat("MJCF and meshes", _mjcf, "{}-mjcf".format),
-    "sdf": FolderFormat("a model of Gazebo: SDFormat and meshes", _sdf, "{}-sdf".format),
+    "urdf": FolderFormat("URDF and meshes", _with_meshes(_urdf), "{}-urdf".format),
+    "mjcf": FolderFormat("MJCF and meshes", _with_meshes(_mjcf), "{}-mjcf".format),
+    "sdf": FolderFormat(
+        "a model of Gazebo: SDFormat and meshes", _with_meshes(_sdf), "{}-sdf".format
+    ),
     "ros2": FolderFormat(
         "a ROS 2 package NAME_description with URDF, meshes, SRDF and launch file",
         _ros2,

@@ -14,6 +14,7 @@ from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
+from morphgen.model.tree import take_name
 from morphgen.typing import Array
 
 GREY: Rgba = (0.7, 0.7, 0.7, 1.0)
@@ -31,7 +32,7 @@ def glb_bytes(robot: Robot) -> bytes:
 
     Every link is a node of its name below the node of its parent link, frames are nodes, too, and
     visual shapes are nodes ``LINK_visual_0`` and so on with their colour as base colour. A node
-    whose name is taken gets ``_`` appended.
+    whose name is taken gets a number.
 
     Args:
         robot: The robot; a mesh of several colours needs ``split_colours`` before.
@@ -43,12 +44,12 @@ def glb_bytes(robot: Robot) -> bytes:
     if not any(link.visuals for link in robot.links):
         raise FormatError(f"robot {robot.name!r} has no visual shape, so a GLB would be empty")
     names = set(robot.link_index)
-    scene = trimesh.Scene(base_frame=_free_name("scene", names))
+    scene = trimesh.Scene(base_frame=take_name("scene", names))
     for link, parent, T in zip(robot.links, robot.parents, _home_transforms(robot), strict=True):
         above = robot.links[parent].name if parent >= 0 else scene.graph.base_frame
         scene.graph.update(frame_from=above, frame_to=link.name, matrix=T)
         for i, shape in enumerate(link.visuals):
-            name = _free_name(f"{link.name}_visual_{i}", names)
+            name = take_name(f"{link.name}_visual_{i}", names)
             scene.add_geometry(
                 _mesh(shape),
                 node_name=name,
@@ -57,18 +58,10 @@ def glb_bytes(robot: Robot) -> bytes:
                 transform=shape.T_link_shape.matrix,
             )
     for frame in robot.frames:
-        name, matrix = _free_name(frame.name, names), frame.T_link_frame.matrix
+        name, matrix = take_name(frame.name, names), frame.T_link_frame.matrix
         scene.graph.update(frame_from=frame.link, frame_to=name, matrix=matrix)
     data: bytes = export_glb(scene, include_normals=True)
     return data
-
-
-def _free_name(name: str, taken: set[str]) -> str:
-    """Return the name, with underscores appended until no other node has it, and add it to them."""
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
 
 
 def _home_transforms(robot: Robot) -> list[Array]:

@@ -73,7 +73,7 @@ def test_colours_are_kept():
 def test_frame_named_like_a_link_gets_a_free_name():
     robot = replace(arm(), frames=(Frame("upper", "slider"),))
     graph = loaded(robot).graph
-    assert {"upper", "upper_"} <= set(graph.nodes)
+    assert {"upper", "upper_2"} <= set(graph.nodes)
 
 
 def test_robot_without_visuals_is_refused():
