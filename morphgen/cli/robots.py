@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, repeated
+from morphgen.cli.command import command, flag, option, path_option, repeated
 from morphgen.cli.progress import status
 from morphgen.errors import CompositionError, FormatError
 
@@ -66,6 +66,7 @@ def compose(args: argparse.Namespace) -> int:
         help="link where the robot begins (default: the root of the file)",
     ),
     option("--tool", metavar="LINK", help="link whose frame is the tool"),
+    path_option("--srdf", "FILE", "an SRDF; the pairs of links that it disables are ignored, too"),
     repeated("--arg", "a xacro argument", metavar="NAME=VALUE"),
     flag(
         "--as-is",
@@ -81,6 +82,7 @@ def compose(args: argparse.Namespace) -> int:
         "import my_arm.urdf --tool flange",
         "import my_arm.xacro --arg length=0.4",
         "import scene.xml --root-link base",
+        "import my_arm.urdf --tool flange --srdf my_arm.srdf",
     ),
 )
 def import_robot(args: argparse.Namespace) -> int:
@@ -106,6 +108,7 @@ def import_robot(args: argparse.Namespace) -> int:
             root=args.root,
             root_link=args.root_link,
             tool=args.tool,
+            srdf=args.srdf,
             name=args.name,
             repair=not args.as_is,
         )

@@ -15,6 +15,8 @@ from morphgen.formats.bundle import CARD, read_robot
 from morphgen.formats.data_files import read_text
 from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
+from morphgen.formats.srdf import with_disabled_pairs
+from morphgen.formats.srdf_reader import read_srdf
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX as GRAMMAR_SUFFIX
@@ -231,6 +233,7 @@ def import_robot(
     root: Path | None = None,
     root_link: str | None = None,
     tool: str | None = None,
+    srdf: Path | None = None,
     name: str | None = None,
     repair: bool = True,
 ) -> Robot:
@@ -245,15 +248,18 @@ def import_robot(
             MJCF is not read, so that it may hold other bodies.
         tool: Link whose frame becomes the frame ``tool``; by default a URDF has none, and an MJCF
             the one that ``read_frames`` finds.
+        srdf: An SRDF of the robot; the pairs of links that it disables are ignored as well.
         name: Name of the robot; by default the file's.
         repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
             loaders refuse the robot. The provenance lists them, and all that was corrected to read
             the file.
 
     Raises:
-        FormatError: If the file cannot be read, or does not have a named link.
+        FormatError: If a file cannot be read, or names a link that the description does not have.
     """
     robot = read_description(path, args, default_finder(root=root), root_link=root_link)
+    if srdf is not None:
+        robot = with_disabled_pairs(robot, read_srdf(srdf), str(srdf))
     for option, link in (("root link", root_link), ("tool", tool)):
         if link is not None and link not in robot.link_index:
             raise FormatError(
@@ -273,7 +279,8 @@ def import_robot(
     robot = record_repairs(robot, robot.source_findings)
     if repair:
         robot, _ = fix(robot)
-    return replace(robot, ignore_pairs=survey_collisions(robot).ignore_pairs)
+    survey = survey_collisions(robot, known_pairs=robot.ignore_pairs)
+    return replace(robot, ignore_pairs=survey.ignore_pairs)
 
 
 def _free_tool_name(robot: Robot) -> Robot:

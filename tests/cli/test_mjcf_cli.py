@@ -27,6 +27,15 @@ def test_import_converts_an_mjcf_to_a_bundle(run, tmp_path):
     assert read_bundle(tmp_path / "robots" / "test").frame("tool").link == "right"
 
 
+def test_import_keeps_the_excluded_pairs_of_an_mjcf(run, tmp_path):
+    apart = TWO_JOINTS.replace('name="right"', 'name="right" pos="1 0 0"')
+    for exclude, is_ignored in (("", False), ('<exclude body1="left" body2="right"/>', True)):
+        path = write(tmp_path, f"{apart}<contact>{exclude}</contact>")
+        assert run("import", path, "--no-picture", "--out", "robots")[0] == 0
+        pairs = read_bundle(tmp_path / "robots" / "test").ignore_pairs
+        assert (("left", "right") in pairs) == is_ignored
+
+
 def test_refused_mjcf_is_one_line_and_exit_code_2(refused, tmp_path):
     path = write(tmp_path, BALL)
     message = (
