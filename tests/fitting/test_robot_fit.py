@@ -9,7 +9,8 @@ import trimesh
 import morphgen
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.cli import main
-from morphgen.errors import FitError
+from morphgen.errors import FitError, FormatError
+from morphgen.fitting import robot_fit
 from morphgen.fitting import token_shapes as token_shapes_module
 from morphgen.fitting.agreement import agreement
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
@@ -34,9 +35,9 @@ from morphgen.model.robot import Joint, Link, Robot
 LIBRARY = default_library()
 
 
-def mesh_shape(folder, mesh, name="part.stl", pose=IDENTITY):
+def mesh_shape(folder, mesh, name="part.stl", pose=IDENTITY, scale=(1.0, 1.0, 1.0)):
     mesh.export(folder / name)
-    return Shape(Mesh(folder / name), pose)
+    return Shape(Mesh(folder / name, scale), pose)
 
 
 def arm(*links):
@@ -181,12 +182,21 @@ def test_visuals_are_replaced_on_request(tmp_path, wedge):
     assert replaced.visuals == (dataclasses.replace(box[0], rgba=(1, 0, 0, 1)),)
 
 
-def test_links_without_stored_fits_are_fitted(tmp_path):
-    robot = arm([mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)))])
+def test_links_without_stored_fits_are_fitted_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    shape = mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)), scale=(3.0, 3.0, 3.0))
+    robot = arm([shape])
     assert stored_primitives(robot, read_stored_fits(LIBRARY.folders)) == ({}, ["l0"])
     primitive_robot = as_primitives(robot, LIBRARY.folders)
     worth = quality(solid_of(robot.links[0].collisions), primitive_robot.links[0].collisions)
     assert worth.iou > 0.95
+    assert [record.args[:2] for record in caplog.records] == [(1, robot.name)]
+    monkeypatch.setattr(robot_fit, "fit_links", lambda *given: pytest.fail("fitted again"))
+    assert as_primitives(robot, ()).links == primitive_robot.links
+    (kept,) = (tmp_path / "cache").rglob("*.json")
+    kept.write_text("{}")
+    with pytest.raises(FormatError, match=f"{kept}.*; delete the file"):
+        as_primitives(robot, ())
 
 
 def test_a_link_that_cannot_be_fitted_is_an_error(tmp_path):
