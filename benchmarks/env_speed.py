@@ -249,7 +249,7 @@ def _hasty(rate: Rate, seconds: float) -> float:
 def _raw(task: str, robot: str, envs: int, seconds: float) -> float:
     """Return the steps per second of PyBullet alone, stepped as the environments step it."""
     spent, calls = 0.0, 0
-    with closing(make_batch(task, [robot], envs)) as batch:
+    with closing(make_batch(task, [robot], envs, sim="pybullet")) as batch:
         batch.reset(seed=0)
         step = pybullet.stepSimulation
 

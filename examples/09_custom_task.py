@@ -1,7 +1,7 @@
 """A task of your own, follow a moving goal, with which the script runs the command line.
 
-    python examples/09_custom_task.py train ur5-stick task=follow --sim mujoco --out runs/1
-    python examples/09_custom_task.py play follow ur5-stick --policy runs/1 --sim mujoco --out 1.mp4
+    python examples/09_custom_task.py train ur5-stick task=follow --out runs/1
+    python examples/09_custom_task.py play follow ur5-stick --policy runs/1 --out 1.mp4
 
 Prints what the command prints. Goal sets are those of reach; `11_goal_set.py` samples its own.
 """

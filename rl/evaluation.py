@@ -25,7 +25,7 @@ from morphgen.rl.scores import Score
 from morphgen.rl.training import checkpoint_files
 from morphgen.tasks.env_specs import GoalConfig, default_configs
 from morphgen.tasks.make import batch_from_specs
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator, evaluation_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 MAX_ENVS_PER_ROBOT = 34
@@ -60,7 +60,7 @@ class EvalConfig:
 
     episodes: int = 34
     """Minimum number of complete episodes per robot."""
-    sim: str = field(default_factory=default_simulator)
+    sim: str = DEFAULT_SIMULATOR
     """Name of the simulator."""
     seed: int = 0
     """Seed of the episodes."""

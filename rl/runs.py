@@ -23,7 +23,7 @@ from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.collision_geometry import require_geometry
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig, observation_config
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import CollisionGeometry
 from morphgen.tasks.task import TaskConfig
 
@@ -72,7 +72,7 @@ class RunConfig:
     """Hyperparameters of PPO."""
     seed: int = 0
     """Seed of weights, actions, minibatches and episodes."""
-    sim: str = field(default_factory=default_simulator)
+    sim: str = DEFAULT_SIMULATOR
     """Name of the simulator."""
     geometry: CollisionGeometry = "primitive"
     """Collision shapes of the robots in training; evaluations have all of them."""

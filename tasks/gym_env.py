@@ -21,7 +21,7 @@ from morphgen.tasks.make import make_batch
 from morphgen.tasks.numpy_step import EnvStep, numpy_stepper, pad_action
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.obstacles import LayoutSide
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
@@ -98,7 +98,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
                 ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
                 fitted primitives.
             sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
-                ``default_simulator()``.
+                ``DEFAULT_SIMULATOR``.
             obstacles: Whether there are obstacles.
             layouts: Layouts of obstacles that episodes draw from: those of training or of
                 evaluation.
@@ -122,7 +122,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             hint = nearest(render_mode, RENDER_MODES)
             raise TaskError(f"unknown render mode {render_mode!r}{hint}")
-        sim = sim or default_simulator()
+        sim = sim or DEFAULT_SIMULATOR
         self._self_collision = (contacts or Contacts()).self_collision
         self._self_collision &= SIMULATORS[sim].simulates_contacts
         config_type = TASKS[task].config_type

@@ -22,7 +22,7 @@ from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_sp
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.random_numbers import require_seed
-from morphgen.tasks.registry import SIMULATORS, default_simulator, installed_simulators
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, installed_simulators
 from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import CollisionGeometry, Contacts, Simulator
 from morphgen.tasks.split_goals import read_goals, shipped_goal_set
@@ -172,7 +172,7 @@ def batch_from_specs(
         specs: Specifications; environment i has specification i modulo their number.
         num_envs: Number of environments, n.
         sim: Name of a simulator: ``pybullet``, ``mujoco``, ``warp`` (on a GPU), ``kinematic``
-            (no contacts) or another of ``SIMULATORS``; by default ``default_simulator()``.
+            (no contacts) or another of ``SIMULATORS``; by default ``DEFAULT_SIMULATOR``.
         seed: Seed of the episodes.
         kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
         workers: Number of processes of PyBullet, or of threads of MuJoCo.
@@ -202,7 +202,7 @@ def batch_from_specs(
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
     require_geometry(geometry)
-    simulator = SIMULATORS[sim or default_simulator()]
+    simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
     require_simulator_device(simulator.name, device)
     if workers > 1 and not simulator.takes_workers:
         raise TaskError(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from functools import cache, cached_property
+from functools import cached_property
 from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from morphgen.errors import MissingDependencyError, TaskError, nearest
@@ -132,18 +130,9 @@ SIMULATORS: Registry[Simulator] = Registry(
     },
 )
 """Simulators; see ``morphgen.tasks.sim.base.Simulator``."""
-
-
-@cache
-def default_simulator() -> str:
-    """Return the simulator to use unless one is named: PyBullet if installed, else MuJoCo.
-
-    Logs a warning once if it is MuJoCo: seeds then give other episodes than with PyBullet.
-    """
-    if find_spec("pybullet") is not None:
-        return "pybullet"
-    logging.getLogger(__name__).warning("PyBullet is not installed; using simulator MuJoCo")
-    return "mujoco"
+DEFAULT_SIMULATOR = "mujoco"
+"""Simulator to use unless one is named. Every installation has it, so that a command gives the same
+episodes everywhere."""
 
 
 def installed_simulators(condition: Callable[[Simulator], bool] = lambda _: True) -> list[str]:

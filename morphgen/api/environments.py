@@ -82,14 +82,14 @@ def make_env(
     """Make a Gymnasium environment of a robot at a task, or a vector environment of several.
 
     Examples:
-        >>> env = morphgen.make_env("reach", "arm=ur5 ee=plane", sim="mujoco")
+        >>> env = morphgen.make_env("reach", "arm=ur5 ee=plane")
         >>> observation, info = env.reset(seed=0)
         >>> action = env.action_space.sample()
         >>> observation, reward, terminated, truncated, info = env.step(action)
         >>> terminated, truncated
         (False, False)
         >>> env.close()
-        >>> envs = morphgen.make_env("reach", ["ur5-plane", "arm3-stick"], num_envs=4, sim="mujoco")
+        >>> envs = morphgen.make_env("reach", ["ur5-plane", "arm3-stick"], num_envs=4)
         >>> envs.reset(seed=0)[0]["tokens"].shape
         (4, 23, 48)
         >>> envs.close()
@@ -101,7 +101,7 @@ def make_env(
             their number.
         num_envs: None for one environment without a batch axis, ``TaskEnv``; a number, also 1, for
             that many in a vector environment, ``TaskVector``.
-        **options: The simulator (``sim="mujoco"``), ``obstacles=True``, ``kind="discrete"``,
+        **options: The simulator (``sim="pybullet"``), ``obstacles=True``, ``kind="discrete"``,
             ``library`` and others: for one environment those of ``TaskEnv``, such as
             ``render_mode="rgb_array"``; for vector environments those of ``make_batch``, such as
             ``workers=2``.

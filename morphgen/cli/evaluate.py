@@ -24,7 +24,7 @@ from morphgen.cli.training_robots import (
 from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
-from morphgen.tasks.registry import default_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
@@ -115,7 +115,7 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
     sources = _sources(args)
     config = EvalConfig(
         _num_episodes(args),
-        _simulator(args) or default_simulator(),
+        _simulator(args) or DEFAULT_SIMULATOR,
         args.seed,
         args.workers,
         _with_goal(default_configs(), sources, args),

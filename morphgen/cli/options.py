@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError
 from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
     from morphgen.grammar.grammar_file import Grammar
@@ -70,7 +70,7 @@ TASK_NAMES = f"{', '.join(TASKS.builtin)}, or a task of an installed package"
 TASK = option("task", choices=TASKS, metavar="TASK", help=TASK_NAMES)
 
 
-def sim_option(default: str = "pybullet if installed, else mujoco") -> Option:
+def sim_option(default: str = DEFAULT_SIMULATOR) -> Option:
     """Return the option ``--sim``; its value is None if it is not given."""
     names = f"{', '.join(SIMULATORS.builtin)}, or a simulator of an installed package"
     return option(

@@ -16,7 +16,7 @@ from morphgen.cli.command import command, flag, number, option, path_option, pos
 from morphgen.cli.progress import bar, print_line, status
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
@@ -148,7 +148,7 @@ def speed(args: argparse.Namespace) -> None:
         from morphgen.tasks.make import make_batch
         from morphgen.tasks.speed import measure_speed
 
-    robot, sim = " ".join(args.words), args.sim or default_simulator()
+    robot, sim = " ".join(args.words), args.sim or DEFAULT_SIMULATOR
     with bar(args, f"preparing {robot} and its goals") as progress:
         batch = make_batch(
             args.task,

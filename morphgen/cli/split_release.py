@@ -50,7 +50,7 @@ if TYPE_CHECKING:
         metavar="PATH",
         help="reference scores: submissions (morphgen eval --submission), or folders of studies",
     ),
-    opt.sim_option("mujoco"),
+    opt.sim_option(),
     number("--episodes", "least number of episodes per robot of a submission (default: 34)"),
     flag("--light", "write the URDF and the derivation of robots only, without meshes"),
     flag("--no-goals", "ship no goal sets"),

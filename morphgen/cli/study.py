@@ -16,7 +16,7 @@ from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
 from morphgen.cli.training_robots import robots_to_train
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
-from morphgen.tasks.registry import default_simulator, evaluation_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, evaluation_simulator
 
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell
@@ -107,7 +107,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
-    sim = evaluation_simulator(args.sim or default_simulator())
+    sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
     here_on_gpu = args.device != "cpu" and args.ray is None

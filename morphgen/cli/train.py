@@ -25,7 +25,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.presets import PRESETS, preset_of
 from morphgen.tasks.channels import CHANNELS
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def train(args: argparse.Namespace) -> None:
         from morphgen.tasks.device import batch_device, require_simulator_device
 
     require_robots_for_options(args)
-    sim = args.sim or default_simulator()
+    sim = args.sim or DEFAULT_SIMULATOR
     require_simulator_device(sim, batch_device(sim, args.device))
     with status(args, "reading the robots"):
         spec = agent_spec(args)
@@ -260,7 +260,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
         policy,
         ppo,
         seed=args.seed,
-        sim=args.sim or default_simulator(),
+        sim=args.sim or DEFAULT_SIMULATOR,
         geometry=args.geometry,
         num_envs=args.envs or preset.num_envs,
         device=args.device,

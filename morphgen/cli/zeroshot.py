@@ -32,7 +32,7 @@ FILM_EPISODES = 3
     opt.OBSTACLES,
     opt.goal_option("that of the policy's training; of the policies here, position"),
     opt.SEED,
-    opt.sim_option("mujoco"),
+    opt.sim_option(),
     opt.WORKERS,
     path_option(
         "--out",
@@ -62,7 +62,7 @@ def zeroshot(args: argparse.Namespace) -> None:
     from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
     from morphgen.rl.zeroshot import zero_shot
     from morphgen.tasks.reach import GOAL_KINDS
-    from morphgen.tasks.registry import TASKS
+    from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
     from morphgen.tasks.renderer import require_video_path
 
     if args.out is not None:
@@ -81,7 +81,7 @@ def zeroshot(args: argparse.Namespace) -> None:
         run, _ = read_checkpoint(policy)
     config = eval_config_of(run, args.episodes, seed=args.seed, workers=args.workers)
     tasks = opt.with_goal(config.tasks, args.goal, [args.task])
-    config = replace(config, sim=args.sim or "mujoco", tasks=tasks)
+    config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)
     with bar(args, "running the episodes") as progress:
         results = zero_shot(
             source,

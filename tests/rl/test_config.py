@@ -7,10 +7,6 @@ import pytest
 from morphgen.errors import TaskError
 from morphgen.rl.agents import mlp, transformer
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.evaluation import EvalConfig
-from morphgen.rl.robot_source import RobotSource
-from morphgen.rl.runs import RunConfig
-from morphgen.tasks import registry
 
 
 def test_transitions_are_rounded_up_to_whole_updates():
@@ -40,13 +36,3 @@ def test_transitions_are_rounded_up_to_whole_updates():
 def test_invalid_configurations_are_rejected(make, words):
     with pytest.raises(TaskError, match=words):
         make()
-
-
-def test_without_pybullet_a_run_uses_mujoco_and_records_it(monkeypatch, caplog):
-    monkeypatch.setattr(registry, "find_spec", lambda name: None)
-    registry.default_simulator.cache_clear()
-    configs = [RunConfig(RobotSource("ur5", task="reach"), PolicyConfig(), PPOConfig())] * 2
-    assert [config.as_data()["sim"] for config in configs] == ["mujoco"] * 2
-    assert EvalConfig().sim == "mujoco"
-    assert caplog.text.count("PyBullet is not installed") == 1
-    registry.default_simulator.cache_clear()

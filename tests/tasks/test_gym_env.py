@@ -21,8 +21,8 @@ from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.registry import default_simulator
 from morphgen.tasks.sim.base import Contacts
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 STEPS = 8
 REACH, PUSH = (
@@ -325,26 +325,7 @@ def test_invalid_options_are_rejected(task, options, error, message, cache):
         TaskEnv(task, **given)
 
 
-@pytest.mark.slow
-def test_mujoco_is_the_default_where_pybullet_is_missing(cache):
-    code = (
-        "import sys; from pathlib import Path; sys.modules['pybullet'] = None\n"
-        "import gymnasium, morphgen.tasks\n"
-        "from morphgen.tasks.reach.config import ReachConfig\n"
-        "options = {'cache': Path(sys.argv[1]), 'config': ReachConfig(num_goals=5)}\n"
-        "for _ in range(2):\n"
-        "    env = gymnasium.make('morphgen/Reach-v0', robot='arm3-stick', **options)\n"
-        "    print(type(env.unwrapped.batch.simulation).__name__)\n"
-        "    env.reset(seed=0); env.close()\n"
+def test_mujoco_is_the_default_whatever_is_installed(make):
+    assert isinstance(
+        make("morphgen/Reach-v0", sim=None).unwrapped.batch.simulation, MujocoSimulation
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(cache)], check=True, capture_output=True, text=True
-    )
-    assert done.stdout.split() == ["MujocoSimulation"] * 2
-    warning = "PyBullet is not installed; using simulator MuJoCo"
-    assert [line for line in done.stderr.splitlines() if "PyBullet" in line] == [warning]
-
-
-@needs_pybullet
-def test_pybullet_is_the_default_where_it_is_installed():
-    assert default_simulator() == "pybullet"
