@@ -1,6 +1,6 @@
 """Success on unseen robots against the number of procedural robots that a policy was trained on.
 
-    python benchmarks/robot_curve.py [--variants reach obstacles pose push]
+    python benchmarks/robot_curve.py [--variants reach obstacles pose push push-long]
         [--robots 10 30 100 300 1000] [--seeds 0 1] [--steps N] [--agent me-graph]
         [--out results/robot-curve] [--report]
 
@@ -8,9 +8,9 @@ Each policy is trained in MuJoCo with robots of the grammar ``serial``, none of 
 on one variant of a task: reach, reach among obstacles, reach with a goal pose, or push. It is
 judged on the test robots of splits, and on ten real arms with a stick, 20 episodes each. Robots and
 training of a seed have this seed. Finished evaluations are kept in one file for each policy;
-``--report`` only prints the tables of what is there. A cell has the mean score over the seeds, in
-brackets the lowest and the highest score, and the mean success; push, whose score is the success,
-has the latter alone.
+tables are of all seeds that are there, and ``--report`` only prints them. A cell has the mean score
+over the seeds, in brackets the lowest and the highest score, and the mean success; push, whose
+score is the success, has the latter alone.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from typing import Any
 from tabulate import tabulate
 
 from morphgen.formats.files import write_atomic
+from morphgen.rl.runs import CHECKPOINT, read_checkpoint
 
 REAL_ARMS = (
     *("ur5", "panda", "kinova_gen3", "xarm7", "iiwa14"),
@@ -48,6 +49,13 @@ class Variant:
     """Default number of transitions."""
 
 
+PUSH_SPLITS = (
+    "interpolation/arm3/push",
+    "interpolation/panda/push",
+    "composition/ee-arm/push",
+    "extrapolation/primitives/push",
+    "extrapolation/arms/push",
+)
 VARIANTS = {
     "reach": Variant(
         "reach",
@@ -67,18 +75,8 @@ VARIANTS = {
         ("interpolation/arm3/reach", "extrapolation/primitives/reach"),
         1e6,
     ),
-    "push": Variant(
-        "push",
-        (),
-        (
-            "interpolation/arm3/push",
-            "interpolation/panda/push",
-            "composition/ee-arm/push",
-            "extrapolation/primitives/push",
-            "extrapolation/arms/push",
-        ),
-        1.5e6,
-    ),
+    "push": Variant("push", (), PUSH_SPLITS, 1.5e6),
+    "push-long": Variant("push", (), PUSH_SPLITS, 4e6),
 }
 
 
@@ -112,13 +110,15 @@ def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace)
     if not missing:
         return
     run = Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}"
-    morphgen(
-        *("train", f"task={variant.task}", *variant.options),
-        *("--robots", f"serial:{robots}", "--robot-seed", str(seed)),
-        *("--agent", args.agent, "--seed", str(seed), "--steps", str(args.steps or variant.steps)),
-        *("--sim", "mujoco", "--envs", "160", "--train-goals", "50", "--workers", "2"),
-        *("--no-tensorboard", "--out", str(run), "--resume"),
-    )
+    if not is_trained(run):  # else train would draw the robots again before it finds that out
+        morphgen(
+            *("train", f"task={variant.task}", *variant.options),
+            *("--robots", f"serial:{robots}", "--robot-seed", str(seed)),
+            *("--agent", args.agent, "--seed", str(seed)),
+            *("--steps", str(args.steps or variant.steps)),
+            *("--sim", "mujoco", "--envs", "160", "--train-goals", "50", "--workers", "2"),
+            *("--no-tensorboard", "--out", str(run), "--resume"),
+        )
     for test, words in missing.items():
         with tempfile.TemporaryDirectory() as folder:
             rows = Path(folder) / "rows.json"
@@ -128,6 +128,14 @@ def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace)
             )
             scores[test] = json.loads(rows.read_text("utf-8"))["deterministic"]
         write_atomic(path, json.dumps(scores, indent=1) + "\n")
+
+
+def is_trained(run: Path) -> bool:
+    """Return whether the training of a run has ended."""
+    if not (run / CHECKPOINT).is_file():
+        return False
+    config, state = read_checkpoint(run)
+    return bool(state["update"] >= config.num_updates)
 
 
 def cell(seeds: list[list[dict[str, Any]]]) -> str:
@@ -143,8 +151,8 @@ def cell(seeds: list[list[dict[str, Any]]]) -> str:
 
 def stored_scores(name: str, robots: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the rows of each test, for each seed that has scores."""
-    paths = [file_of(args.out, name, robots, seed) for seed in args.seeds]
-    return [json.loads(path.read_text("utf-8")) for path in paths if path.exists()]
+    paths = sorted(args.out.glob(f"{name}-serial{robots}-seed*.json"))
+    return [json.loads(path.read_text("utf-8")) for path in paths]
 
 
 def real_arm_rows(stored: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
@@ -170,7 +178,9 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--robots", type=int, nargs="+", default=[10, 30, 100, 300, 1000])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--steps", type=float, help="transitions (default: 1e6, push: 1.5e6)")
+    parser.add_argument(
+        "--steps", type=float, help="transitions (default: 1e6, push: 1.5e6, push-long: 4e6)"
+    )
     parser.add_argument("--agent", default="me-graph")
     parser.add_argument("--out", type=Path, default=Path("results/robot-curve"))
     parser.add_argument("--report", action="store_true", help="only print the tables")

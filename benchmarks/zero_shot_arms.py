@@ -1,13 +1,15 @@
-"""Success of a policy on every arm of the library with a stick, beside untrained controllers.
+"""Success of a policy on every arm of the library with a stick, or on other robots.
 
     python benchmarks/zero_shot_arms.py [--task reach] [--goal position] [--obstacles]
-        [--policy CHECKPOINT] [--episodes 50] [--only ur] [--seed 0] [--jobs 2] [--json rows.json]
+        [--policy CHECKPOINT] [--episodes 50] [--only ur | --robots FILE ...] [--seed 0] [--jobs 2]
+        [--json rows.json]
 
-The arms are those in use: not the templates of which robots are drawn for training, not the Panda
-with other sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in
-MuJoCo. At reach, the controller "path" follows the straight path of the observation channel ``ik``,
-to which policies with ``--residual`` add their actions. A cell is the success rate with its 95%
-Wilson interval. The last rows are the mean over the arms, and the number of arms below 80%.
+Beside the policy are the untrained controllers of the task, in the same episodes. The arms are
+those in use: not the templates of which robots are drawn for training, not the Panda with other
+sizes, and not the YuMi with both arms. Episodes are those of ``morphgen zeroshot``, in MuJoCo. At
+reach, the controller "path" follows the straight path of the observation channel ``ik``, to which
+policies with ``--residual`` add their actions. A cell is the success rate with its 95% Wilson
+interval. The last rows are the mean over the arms, and the number of arms below 80%.
 """
 
 from __future__ import annotations
@@ -58,18 +60,19 @@ class Measuring:
     policy: Path
     config: EvalConfig
 
-    def __call__(self, arm: str) -> tuple[str, list[ZeroShotResult]]:
-        """Run the episodes of one arm."""
-        source = robot_source(f"arm={arm} ee=stick", self.task, obstacles=self.obstacles)
+    def __call__(self, robot: tuple[str, str]) -> tuple[str, list[ZeroShotResult]]:
+        """Run the episodes of one robot, given by its label and its words."""
+        label, words = robot
+        source = robot_source(words, self.task, obstacles=self.obstacles)
         results = zero_shot(source, self.policy, self.config)
         if self.task == "reach":
             (score,) = evaluate([FollowPath], source, self.config, Interface(channels=PATH))
             results.insert(1, result_of("path", score))
-        return arm, results
+        return label, results
 
 
 def main() -> None:
-    """Measure all arms and print the table."""
+    """Measure all robots and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="reach")
     parser.add_argument("--goal", choices=GOAL_KINDS, default=GOAL_KINDS[0])
@@ -77,34 +80,39 @@ def main() -> None:
     parser.add_argument("--obstacles", action="store_true")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--only", default="", help="arms whose name matches this expression")
+    parser.add_argument("--robots", nargs="+", help="files and bundles instead of the arms")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
-    arms = [
-        manifest.name
-        for manifest in default_library().manifests()
-        if manifest.kind == "arm"
-        and manifest.name not in LEFT_OUT
-        and re.search(args.only, manifest.name)
-    ]
+    if args.robots:
+        robots = {Path(file).stem: file for file in args.robots}
+    else:
+        robots = {
+            manifest.name: f"arm={manifest.name} ee=stick"
+            for manifest in default_library().manifests()
+            if manifest.kind == "arm"
+            and manifest.name not in LEFT_OUT
+            and re.search(args.only, manifest.name)
+        }
     shipped = zero_shot_policy(args.task, args.goal, obstacles=args.obstacles)
     policy = checkpoint_path(args.policy or shipped.name)
     run, _ = read_checkpoint(policy)
     config = replace(eval_config_of(run, args.episodes, seed=args.seed), sim="mujoco")
     work = Measuring(args.task, args.obstacles, policy, config)
-    measured = dict(tqdm(parallel_map(work, arms, args.jobs, chunk=1), total=len(arms), unit="arm"))
+    results = parallel_map(work, list(robots.items()), args.jobs, chunk=1)
+    measured = dict(tqdm(results, total=len(robots), unit="robot"))
     if args.json:
-        rows = {arm: [asdict(result) for result in results] for arm, results in measured.items()}
+        rows = {label: [asdict(result) for result in row] for label, row in measured.items()}
         args.json.write_text(json.dumps(finite_or_none(rows), indent=2) + "\n")
-    names = [result.controller for result in measured[arms[0]]]
-    rates = list(zip(*([r.success.value for r in measured[arm]] for arm in arms), strict=True))
+    names = [result.controller for result in next(iter(measured.values()))]
+    rates = list(zip(*([r.success.value for r in row] for row in measured.values()), strict=True))
     table: list[list[str]] = [
-        [arm, *(result.success.as_percent() for result in measured[arm])] for arm in arms
+        [label, *(result.success.as_percent() for result in row)] for label, row in measured.items()
     ]
     table.append(["mean", *(f"{mean(rate):.1%}" for rate in rates)])
     table.append(["below 80%", *(str(sum(x < ENOUGH for x in rate)) for rate in rates)])
-    print(tabulate(table, headers=["arm", *names]))
+    print(tabulate(table, headers=["robot", *names]))
 
 
 if __name__ == "__main__":

@@ -107,8 +107,8 @@ def find_robot(text: str | PathLike[str]) -> RobotSource:
 def read_source(source: RobotSource, library: Library, root: Path | None = None) -> Robot:
     """Return a robot: read from its file, or composed from its words.
 
-    A robot of a light set is composed from its derivation, since its URDF has no home. In a URDF, a
-    link named ``tool`` becomes the frame ``tool``.
+    A robot of a light set is composed from its derivation, since its URDF has no home. In a URDF,
+    the frame ``tool`` is that of the link ``tool``, which is renamed ``tool_link``.
 
     Args:
         source: The robot, as ``find_robots`` returns it.
@@ -127,9 +127,7 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
     if light := light_derivation(path):
         return compose(light, library, path.resolve().name)
     robot = read_robot(path, root=root)
-    if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
-        return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
-    return robot
+    return _with_tool(robot, TOOL) if _has_tool_link(robot) else robot
 
 
 def is_one_robot(robots: RobotLike | Iterable[RobotLike]) -> TypeGuard[RobotLike]:
@@ -246,8 +244,8 @@ def import_robot(
             folder and package.
         root_link: Link that becomes the robot's root; by default the file's root. The rest of an
             MJCF is not read, so that it may hold other bodies.
-        tool: Link whose frame becomes the frame ``tool``; by default a URDF has none, and an MJCF
-            the one that ``read_frames`` finds.
+        tool: Link whose frame becomes the frame ``tool``; by default the link ``tool`` if there is
+            one, else a URDF has none, and an MJCF the one that ``read_frames`` finds.
         srdf: An SRDF of the robot; the pairs of links that it disables are ignored as well.
         name: Name of the robot; by default the file's.
         repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
@@ -267,12 +265,10 @@ def import_robot(
             )
     if root_link is not None:
         robot = subtree(robot, root_link)
-    if tool is not None:
-        if tool not in robot.link_index:
-            raise FormatError(f"{path}: tool {tool!r} is not below the root link {root_link!r}")
-        robot = _free_tool_name(robot)
-        link = "tool_link" if tool == "tool" else tool
-        robot = replace(robot, frames=(Frame("tool", link),))
+    if tool is not None and tool not in robot.link_index:
+        raise FormatError(f"{path}: tool {tool!r} is not below the root link {root_link!r}")
+    if tool is not None or _has_tool_link(robot):
+        robot = _with_tool(robot, tool or TOOL)
     robot = replace(
         robot, name=robot.name if name is None else name, provenance={"source": path.name}
     )
@@ -283,10 +279,20 @@ def import_robot(
     return replace(robot, ignore_pairs=survey.ignore_pairs)
 
 
-def _free_tool_name(robot: Robot) -> Robot:
-    """Rename a link ``tool`` to ``tool_link``: a bundle's URDF has a link for the frame itself."""
-    return rename(
-        robot,
-        {"tool": "tool_link"} if "tool" in robot.link_index else {},
-        {"tool_joint": "tool_link_joint"} if "tool_joint" in robot.joint_index else {},
+def _has_tool_link(robot: Robot) -> bool:
+    """Return whether a robot has a link ``tool`` and no such frame."""
+    return TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames)
+
+
+def _with_tool(robot: Robot, link: str) -> Robot:
+    """Return the robot with the frame of a link as its frame ``tool``.
+
+    A link ``tool`` becomes ``tool_link``: a bundle's URDF has a link for the frame itself.
+    """
+    links = {TOOL: f"{TOOL}_link"} if TOOL in robot.link_index else {}
+    joint = f"{TOOL}_joint"
+    robot = rename(
+        robot, links, {joint: f"{TOOL}_link_joint"} if joint in robot.joint_index else {}
     )
+    others = (frame for frame in robot.frames if frame.name != TOOL)
+    return replace(robot, frames=(*others, Frame(TOOL, links.get(link, link))))

@@ -12,7 +12,8 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError
 from morphgen.formats.urdf_text import urdf_text
-from morphgen.grammar.robot_source import import_robot
+from morphgen.grammar.library import default_library
+from morphgen.grammar.robot_source import import_robot, resolve_robot
 from morphgen.model.geometry import IDENTITY, Box
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.tree import rename
@@ -87,6 +88,8 @@ def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(urdf):
     path = urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
     robot = import_robot(path, tool="tool")
     assert robot.frame("tool").link == "tool_link"
+    assert import_robot(path).frames == robot.frames
+    assert resolve_robot(path, default_library()).frame("tool").link == "tool_link"
     assert {"tool", "tool_joint"}.isdisjoint({*robot.link_index, *robot.joint_index})
     assert "frame-name-taken" not in {finding.code for finding in check(robot)}
     np.testing.assert_allclose(
