@@ -166,7 +166,8 @@ def table(name: str, args: argparse.Namespace) -> str:
     """Return the table of a variant: a row for each number of robots."""
     splits, lines = VARIANTS[name].splits, []
     for robots in args.robots:
-        stored = stored_scores(name, robots, args)
+        if not (stored := stored_scores(name, robots, args)):
+            continue
         cells = [cell([rows[split] for rows in stored if split in rows]) for split in splits]
         lines.append([robots, *cells, cell(real_arm_rows(stored))])
     return tabulate(lines, headers=["robots", *splits, "ten real arms"], tablefmt="github")

@@ -50,7 +50,7 @@ AGENTS = {
 }
 BASELINES = ("scripted", "ik", "jacobian", "random")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
-CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030")
+CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030", "#805ad5")
 sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve")])
