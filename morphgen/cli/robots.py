@@ -1,16 +1,15 @@
-"""``morphgen compose``, ``import``, ``list`` and ``show``: make robots and print their facts."""
+"""``morphgen compose``, ``list`` and ``show``: make robots and print their facts."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option, repeated
+from morphgen.cli.command import command, option
 from morphgen.cli.progress import status
-from morphgen.errors import CompositionError, FormatError
+from morphgen.errors import CompositionError
 
 if TYPE_CHECKING:
     from morphgen.model.robot import Joint, Robot
@@ -53,69 +52,10 @@ def compose(args: argparse.Namespace) -> int:
             from morphgen.fitting.replace_collision import as_primitives
 
             robot = as_primitives(robot, library.folders)
-    return _write_and_report(robot, args)
+    return write_and_report(robot, args)
 
 
-@command(
-    "import",
-    "turn a URDF, xacro or MJCF into a bundle",
-    option("file", type=Path, help="a URDF, an MJCF, or a xacro if its suffix is .xacro"),
-    option(
-        "--root-link",
-        metavar="LINK",
-        help="link where the robot begins (default: the root of the file)",
-    ),
-    option("--tool", metavar="LINK", help="link whose frame is the tool"),
-    path_option("--srdf", "FILE", "an SRDF; the pairs of links that it disables are ignored, too"),
-    repeated("--arg", "a xacro argument", metavar="NAME=VALUE"),
-    flag(
-        "--as-is",
-        "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
-        "robot",
-    ),
-    opt.ROOT,
-    *opt.BUNDLE_OUT,
-    opt.JSON,
-    details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
-    "no safe repair removes (see morphgen check); the bundle is written all the same.",
-    examples=(
-        "import my_arm.urdf --tool flange",
-        "import my_arm.xacro --arg length=0.4",
-        "import scene.xml --root-link base",
-        "import my_arm.urdf --tool flange --srdf my_arm.srdf",
-    ),
-)
-def import_robot(args: argparse.Namespace) -> int:
-    """Import a description, check it and write its bundle."""
-    from morphgen.formats.bundle import bundle_folder
-    from morphgen.grammar.robot_source import import_robot
-
-    if args.name is not None:
-        bundle_folder(args.out, args.name)  # refuses an invalid name before the work
-    pairs = [entry.partition("=") for entry in args.arg]
-    for name, equals, value in pairs:
-        if not name or not equals:
-            raise FormatError(f"--arg {name}{equals}{value}: expected NAME=VALUE")
-    if args.root is not None and not args.root.is_dir():
-        raise FormatError(
-            f"--root {args.root}: no such folder; the link where the robot begins is named by "
-            "--root-link"
-        )
-    with status(args, f"importing {args.file}"):
-        robot = import_robot(
-            args.file,
-            {name: value for name, _, value in pairs},
-            root=args.root,
-            root_link=args.root_link,
-            tool=args.tool,
-            srdf=args.srdf,
-            name=args.name,
-            repair=not args.as_is,
-        )
-    return _write_and_report(robot, args)
-
-
-def _write_and_report(robot: Robot, args: argparse.Namespace) -> int:
+def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     """Write ``args.out / robot.name`` and print a summary.
 
     Returns:

@@ -1,0 +1,148 @@
+"""``morphgen import``: bundles and parts from the files of other tools."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, option, path_option, repeated
+from morphgen.cli.progress import status, track
+from morphgen.cli.robots import write_and_report
+from morphgen.errors import FormatError, MorphgenError, one_line
+
+if TYPE_CHECKING:
+    from morphgen.formats.named_descriptions import NamedDescription
+
+PART_KINDS = ("arm", "ee", "body")
+"""Keys of ``morphgen.grammar.imported_part.PART_KINDS``."""
+_PARTS = Path("parts")
+
+
+@command(
+    "import",
+    "turn a URDF, xacro or MJCF into a bundle, or several",
+    option(
+        "files",
+        nargs="+",
+        metavar="FILE",
+        help="a URDF, an MJCF, or a xacro if its suffix is .xacro; or menagerie:NAME or "
+        "robot_descriptions:NAME, a robot of one of these pip packages",
+    ),
+    option(
+        "--root-link",
+        metavar="LINK",
+        help="link where the robot begins (default: the root of the file)",
+    ),
+    option("--tool", metavar="LINK", help="link whose frame is the tool"),
+    path_option("--srdf", "FILE", "an SRDF; the pairs of links that it disables are ignored, too"),
+    repeated("--arg", "a xacro argument", metavar="NAME=VALUE"),
+    flag(
+        "--as-is",
+        "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
+        "robot",
+    ),
+    option("--part", choices=PART_KINDS, help="also write a manifest: the robot becomes a part"),
+    path_option("--parts", "DIR", f"with --part: folder of the manifests (default: {_PARTS})"),
+    option(
+        "--licence", metavar="TEXT", help="with --part: licence, if the robot's source has none"
+    ),
+    opt.ROOT,
+    *opt.BUNDLE_OUT,
+    opt.JSON,
+    details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
+    "no safe repair removes (see morphgen check); the bundle is written all the same. Robots of "
+    "several files are named after their files; those that are refused are named with the reason, "
+    "and the exit code is 2.",
+    examples=(
+        "import my_arm.urdf --tool flange",
+        "import my_arm.xacro --arg length=0.4",
+        "import scene.xml --root-link base",
+        "import my_arm.urdf --tool flange --srdf my_arm.srdf",
+        "import menagerie:universal_robots_ur5e --part arm --licence BSD-3-Clause",
+        "import bodies/*.xml --part body --licence MIT --out imported",
+    ),
+)
+def import_robots(args: argparse.Namespace) -> int:
+    """Import descriptions, check them and write their bundles."""
+    from morphgen.formats.bundle import bundle_folder
+    from morphgen.formats.named_descriptions import find_description
+
+    if args.part is None:
+        given = {"--parts": args.parts is not None, "--licence": args.licence is not None}
+        opt.reject_idle(given, "only with --part")
+    if args.name is not None:
+        if len(args.files) > 1:
+            raise FormatError(f"--name {args.name}: {len(args.files)} robots cannot have one name")
+        bundle_folder(args.out, args.name)  # refuses an invalid name before the work
+    if args.root is not None and not args.root.is_dir():
+        raise FormatError(
+            f"--root {args.root}: no such folder; the link where the robot begins is named by "
+            "--root-link"
+        )
+    if len(args.files) == 1:
+        return _import(find_description(args.files[0]), args.name, args)
+    return _import_several(args)
+
+
+def _import_several(args: argparse.Namespace) -> int:
+    """Import every file that can be, and print what became of each; return the exit code."""
+    from morphgen.formats.named_descriptions import find_description
+
+    found = [find_description(file) for file in args.files]
+    names = [re.sub(r"\W", "_", each.path.stem, flags=re.ASCII) for each in found]
+    for name, count in Counter(names).items():
+        if count > 1:
+            files = [file for file, own in zip(args.files, names, strict=True) if own == name]
+            raise FormatError(
+                f"{', '.join(files)}: these would all be named {name!r}; import one at a time"
+            )
+    code = 0
+    for description, name in track(
+        list(zip(found, names, strict=True)), args, "importing", "robot", len(found)
+    ):
+        try:
+            code = max(code, _import(description, name, args))
+        except MorphgenError as error:
+            print(f"morphgen: {one_line(str(error))}", file=sys.stderr)
+            code = 2
+    return code
+
+
+def _import(description: NamedDescription, name: str | None, args: argparse.Namespace) -> int:
+    """Import a robot, write its bundle and, if asked for, its manifest; return the exit code."""
+    from morphgen.formats.bundle import URDF, bundle_folder
+    from morphgen.grammar.imported_part import require_part, write_part
+    from morphgen.grammar.robot_source import import_robot
+
+    pairs = [entry.partition("=") for entry in args.arg]
+    for key, equals, value in pairs:
+        if not key or not equals:
+            raise FormatError(f"--arg {key}{equals}{value}: expected NAME=VALUE")
+    licence = args.licence or description.licence
+    if args.part and not licence:
+        raise FormatError("--part: name the robot's licence by --licence, such as MIT")
+    with status(args, f"importing {description.path}"):
+        robot = import_robot(
+            description.path,
+            {**description.args, **{key: value for key, _, value in pairs}},
+            root=args.root,
+            root_link=args.root_link,
+            tool=args.tool,
+            srdf=args.srdf,
+            name=name,
+            repair=not args.as_is,
+        )
+    if args.part:
+        require_part(robot)
+    code = write_and_report(robot, args)
+    if args.part:
+        urdf = bundle_folder(args.out, robot.name) / URDF
+        path = write_part(robot, urdf, args.part, args.parts or _PARTS, licence)
+        if not args.json:
+            print(path)
+    return code

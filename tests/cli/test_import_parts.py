@@ -1,0 +1,125 @@
+"""Imported robots become parts; several files and robots of collections are imported."""
+
+import json
+import sys
+
+import pytest
+
+import morphgen
+from helpers.mjcf import TWO_JOINTS, write
+from morphgen.formats.named_descriptions import find_description
+
+SITE = '<site name="tool" pos="0 0 0.2" euler="0 90 0"/>'
+ARM = f"""<worldbody>
+  <body name="base"><geom size="0.1"/>
+    <body name="left" pos="0 0 0.2"><joint name="a" axis="0 1 0" range="-1 1"/><geom size="0.1"/>
+      <body name="right" pos="0 0 0.2"><joint name="b" axis="0 1 0" range="-1 1"/>
+        <geom size="0.1"/>{SITE}
+      </body>
+    </body>
+  </body>
+</worldbody>"""
+BALL = '<worldbody><body><joint type="ball"/><geom size="0.1"/></body></worldbody>'
+
+
+def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
+    write(tmp_path, ARM, "my_arm.xml")
+    words = ("import", "my_arm.xml", "--name", "my_arm", "--part", "arm", "--licence", "MIT")
+    code, out, err = run(*words, "--no-picture", "--out", "imported")
+    assert (code, err, out.splitlines()[-1]) == (0, "", "parts/my_arm.yaml")
+    robot = morphgen.compose("arm=my_arm ee=stick", library=[tmp_path / "parts"])
+    alone = morphgen.compose("arm=my_arm", library=[tmp_path / "parts"])
+    assert len(alone.links) == 4  # the base, and the three bodies without a link for the site
+    assert alone.frame("tool").link == "arm_right"
+    assert alone.frame("tool").T_link_frame.position == (0.0, 0.0, 0.2)
+    stick = robot.joints[robot.parents.index(robot.link_index["arm_right"]) - 1]
+    assert stick.T_parent_joint.rpy == pytest.approx((0, 1.5707963, 0), abs=1e-6)
+    (tmp_path / "parts" / "my_arm.yaml").write_text("# mine")
+    assert run(*words, "--no-picture", "--out", "imported")[0] == 2
+    assert (tmp_path / "parts" / "my_arm.yaml").read_text() == "# mine"
+
+
+def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
+    write(tmp_path, ARM, "body_1.xml")
+    write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.3"), "body_2.xml")
+    write(tmp_path, BALL, "body_3.xml")
+    files = [f"body_{k}.xml" for k in (1, 2, 3)]
+    code, _, err = run("import", *files, "--part", "body", "--licence", "MIT", "--no-picture")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "body_3.xml: joint" in err
+    assert "type ball" in err
+    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
+        *("body_1.yaml", "body_2.yaml"),
+    ]
+    (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
+    words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
+    code, _, err = run(
+        "split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words
+    )
+    assert (code, err) == (0, "")
+    assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("a.xml", "--part", "arm"), "--part: name the robot's licence by --licence, such as MIT"),
+        (("a.xml", "--licence", "MIT"), "--licence: only with --part"),
+        (
+            ("a.xml", "--part", "arm", "--licence", "MIT", "--name", "1st"),
+            "name '1st' of a part: expected letters, digits and underscores, no digit first; "
+            "choose one by --name",
+        ),
+        (
+            ("a.xml", "--part", "ee", "--licence", "MIT"),
+            "robot 'test' has no frame 'tool', which is the flange or the tool of a part; name its "
+            "link by --tool",
+        ),
+        (("a.xml", "b.xml", "--name", "x"), "--name x: 2 robots cannot have one name"),
+        (
+            ("a.xml", "b/a.xml"),
+            "a.xml, b/a.xml: these would all be named 'a'; import one at a time",
+        ),
+    ],
+)
+def test_invalid_requests_leave_no_part(refused, tmp_path, words, message):
+    write(tmp_path, TWO_JOINTS, "a.xml")
+    assert refused("import", *words, "--no-picture") == f"morphgen: {message}\n"
+    assert not (tmp_path / "parts").exists()
+
+
+def test_a_robot_of_the_menagerie_is_imported_with_its_licence(run, refused, tmp_path, monkeypatch):
+    pytest.importorskip("mujoco_menagerie")
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / "menagerie"))
+    write(tmp_path / "menagerie" / "universal_robots_ur5e", ARM, "ur5e.xml")
+    name = "menagerie:universal_robots_ur5e"
+    assert run("import", name, "--part", "arm", "--no-picture", "--json")[0] == 0
+    assert "licence: BSD-3-Clause" in (tmp_path / "parts" / "test.yaml").read_text()
+    assert "no robot 'universal_robots_ur5'; did you mean" in refused("import", name[:-1])
+    assert "no model 'scene'; valid: ur5e" in refused("import", f"{name}/scene")
+    assert "'agilex_piper' not found under MENAGERIE_ROOT" in refused(
+        "import", "menagerie:agilex_piper"
+    )
+
+
+def test_a_module_of_robot_descriptions_names_its_file(refused, tmp_path, monkeypatch):
+    folder = tmp_path / "packages" / "robot_descriptions"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "toy_description.py").write_text(
+        "XACRO_PATH = '/toys/toy.xacro'\nXACRO_ARGS = {'length': 2}\n"
+    )
+    (folder / "lost_description.py").write_text("raise OSError('no network')\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "packages"))
+    for module in [name for name in sys.modules if name.startswith("robot_descriptions")]:
+        monkeypatch.delitem(sys.modules, module)
+    found = find_description("robot_descriptions:toy_description")
+    assert (str(found.path), found.args, found.licence) == ("/toys/toy.xacro", {"length": "2"}, "")
+    assert "no such robot; did you mean 'toy_description'?" in refused(
+        "import", "robot_descriptions:toi_description"
+    )
+    assert "lost_description: cannot be loaded: no network" in refused(
+        "import", "robot_descriptions:lost_description"
+    )
+    assert json.dumps(find_description("C:robot.xml").path.name) == '"C:robot.xml"'
