@@ -25,6 +25,7 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
+from morphgen.errors import TaskError, one_line
 from morphgen.grammar.library import default_library
 from morphgen.processes import parallel_map
 from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate
@@ -60,11 +61,18 @@ class Measuring:
     policy: Path
     config: EvalConfig
 
-    def __call__(self, robot: tuple[str, str]) -> tuple[str, list[ZeroShotResult]]:
-        """Run the episodes of one robot, given by its label and its words."""
+    def __call__(self, robot: tuple[str, str]) -> tuple[str, list[ZeroShotResult] | str]:
+        """Return the label of a robot and its results, or why it cannot do the task.
+
+        Args:
+            robot: Its label and its words.
+        """
         label, words = robot
         source = robot_source(words, self.task, obstacles=self.obstacles)
-        results = zero_shot(source, self.policy, self.config)
+        try:
+            results = zero_shot(source, self.policy, self.config)
+        except TaskError as error:
+            return label, one_line(str(error))
         if self.task == "reach":
             (score,) = evaluate([FollowPath], source, self.config, Interface(channels=PATH))
             results.insert(1, result_of("path", score))
@@ -101,7 +109,12 @@ def main() -> None:
     config = replace(eval_config_of(run, args.episodes, seed=args.seed), sim="mujoco")
     work = Measuring(args.task, args.obstacles, policy, config)
     results = parallel_map(work, list(robots.items()), args.jobs, chunk=1)
-    measured = dict(tqdm(results, total=len(robots), unit="robot"))
+    measured: dict[str, list[ZeroShotResult]] = {}
+    for label, result in tqdm(results, total=len(robots), unit="robot"):
+        if isinstance(result, str):
+            tqdm.write(f"left out: {label}: {result}")
+        else:
+            measured[label] = result
     if args.json:
         rows = {label: [asdict(result) for result in row] for label, row in measured.items()}
         args.json.write_text(json.dumps(finite_or_none(rows), indent=2) + "\n")

@@ -41,7 +41,7 @@ def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
 
 def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
     write(tmp_path, ARM, "body_1.xml")
-    write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.3"), "body_2.xml")
+    write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.18"), "body_2.xml")
     write(tmp_path, BALL, "body_3.xml")
     files = [f"body_{k}.xml" for k in (1, 2, 3)]
     code, _, err = run("import", *files, "--part", "body", "--licence", "MIT", "--no-picture")
