@@ -1,5 +1,6 @@
 """The tables of docs/training.md and docs/results.md are those that the stored studies print."""
 
+import csv
 import json
 import re
 import runpy
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from morphgen.benchmark.split import sided_members
+from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.cli import main
 from morphgen.rl.leaderboard import relative_scores
 from morphgen.rl.score_tables import read_submissions
@@ -110,3 +113,32 @@ def test_the_docs_have_the_constants_of_the_stored_runs(page):
         for name, _, _ in RUNS
     }
     assert documented == stored
+
+
+DIFFICULTY = re.findall(
+    r"(?m)^morphgen split difficulty .*$", (ROOT / "results/README.md").read_text("utf-8")
+)
+
+
+@pytest.mark.parametrize(
+    "command", [pytest.param(command, marks=pytest.mark.slow) for command in DIFFICULTY]
+)
+def test_difficulty_of_robots_is_what_its_command_writes(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    *words, path = shlex.split(command)[1:]
+    assert main([*words, str(tmp_path / "rows.csv")]) == 0
+    assert (tmp_path / "rows.csv").read_bytes() == (ROOT / path).read_bytes()
+
+
+def test_difficulty_has_every_robot_of_the_shipped_splits():
+    rows = [
+        (row["split"], row["side"], row["robot"])
+        for path in (ROOT / "results/difficulty").iterdir()
+        for row in csv.DictReader(path.read_text("utf-8").splitlines())
+    ]
+    shipped = [
+        (name, side, member.name)
+        for name in split_names()
+        for side, member in sided_members(read_split(name))
+    ]
+    assert sorted(rows) == sorted(shipped)
