@@ -26,6 +26,7 @@ from morphgen.formats.fits import (
 )
 from morphgen.formats.records import read_record
 from morphgen.formats.rounding import rounded_shapes
+from morphgen.formats.urdf_capsules import urdf_pieces
 from morphgen.model.geometry import Shape, scale_shape
 from morphgen.model.inertia import union_integrals
 from morphgen.model.robot import Robot
@@ -72,7 +73,8 @@ def token_shapes(
     for link in robot.links:
         if not link.collisions:
             continue
-        shapes = rounded_shapes(link.collisions)
+        pieces = (piece for shape in link.collisions for piece in urdf_pieces(shape))
+        shapes = rounded_shapes(tuple(pieces))
         if fit := find_fit(link.collisions, robot, stored):
             primitives[link.name] = fit.token
         elif dominant := _dominant_primitive(shapes):

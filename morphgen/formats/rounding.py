@@ -69,19 +69,6 @@ def rounded_axis(joint: Joint) -> Vec3:
     return _vector(joint.axis if is_unit else joint.unit_axis)
 
 
-def urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
-    """Return a capsule, which URDF lacks, as a cylinder and two spheres, other shapes unchanged."""
-    if not isinstance(shape.geometry, Capsule):
-        return (shape,)
-    radius, length = shape.geometry.radius, shape.geometry.length
-    T = shape.T_link_shape
-    return (
-        Shape(Cylinder(radius, length), T, shape.rgba),
-        Shape(Sphere(radius), T @ Pose((0.0, 0.0, length / 2)), shape.rgba),
-        Shape(Sphere(radius), T @ Pose((0.0, 0.0, -length / 2)), shape.rgba),
-    )
-
-
 def as_written(robot: Robot) -> Robot:
     """Return the robot as read back from its bundle, except for meshes and visual shapes.
 
@@ -109,10 +96,9 @@ def rounded_shapes(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
     """Return shapes as a URDF holds them; meshes keep their files and scales."""
     return tuple(
         replace(
-            piece, geometry=_geometry(piece.geometry), T_link_shape=rounded_pose(piece.T_link_shape)
+            shape, geometry=_geometry(shape.geometry), T_link_shape=rounded_pose(shape.T_link_shape)
         )
         for shape in shapes
-        for piece in urdf_pieces(shape)
     )
 
 
@@ -131,7 +117,9 @@ def _geometry(geometry: Geometry) -> Geometry:
             return Sphere(round_number(radius))
         case Cylinder(radius, length):
             return Cylinder(round_number(radius), round_number(length))
-        case Capsule() | Mesh():
+        case Capsule(radius, length):
+            return Capsule(round_number(radius), round_number(length))
+        case Mesh():
             return geometry
 
 

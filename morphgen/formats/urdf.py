@@ -15,6 +15,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
+from morphgen.formats.urdf_capsules import joined_capsules
 from morphgen.formats.urdf_schema import CHILDREN
 from morphgen.formats.urdf_text import MORPHGEN_TAG
 from morphgen.formats.xacro import expand
@@ -273,13 +274,16 @@ def _link(
     return Link(
         element.get("name", ""),
         _inertial(element.find("inertial")),
-        tuple(
-            Shape(geometry, _origin(visual), _visual_rgba(visual, colours))
+        joined_capsules(
+            (
+                visual.get("name", ""),
+                Shape(geometry, _origin(visual), _visual_rgba(visual, colours)),
+            )
             for visual in element.iterfind("visual")
             if (geometry := _geometry(visual, meshes)) is not None
         ),
-        tuple(
-            Shape(geometry, _origin(collision))
+        joined_capsules(
+            (collision.get("name", ""), Shape(geometry, _origin(collision)))
             for collision in element.iterfind("collision")
             if (geometry := _geometry(collision, meshes)) is not None
         ),

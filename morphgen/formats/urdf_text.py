@@ -12,8 +12,8 @@ from morphgen.formats.rounding import (
     format_number,
     rounded_axis,
     rounded_pose,
-    urdf_pieces,
 )
+from morphgen.formats.urdf_capsules import CAPSULE_SUFFIX, urdf_pieces
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
@@ -42,9 +42,9 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     Frames become massless links of the same name on fixed joints. Links without mass get an
     explicit zero ``<inertial>``, because PyBullet reads a missing one as 1 kg. A ``<mujoco>``
     element makes MuJoCo keep names, masses and mesh paths. Capsules, which URDF lacks, become a
-    cylinder and two spheres. A revolute joint without limits becomes ``continuous``. A missing
-    effort or velocity becomes the default, because Pinocchio refuses an incomplete ``<limit>`` and
-    PyBullet reads it as zero.
+    cylinder and two spheres, which morphgen reads as a capsule. A revolute joint without limits
+    becomes ``continuous``. A missing effort or velocity becomes the default, because Pinocchio
+    refuses an incomplete ``<limit>`` and PyBullet reads it as zero.
 
     A ``<morphgen>`` element, which loaders ignore, holds what URDF cannot express: the home
     configuration, and which links are frames.
@@ -93,8 +93,10 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     values = {name: format_inertia(v) for name, v in zip(names, inertial.inertia, strict=True)}
     etree.SubElement(inertial_element, "inertia", values)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
-        for i, shape in enumerate(piece for whole in shapes for piece in urdf_pieces(whole)):
-            holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}")
+        pieces = ((whole, piece) for whole in shapes for piece in urdf_pieces(whole))
+        for i, (whole, shape) in enumerate(pieces):
+            suffix = CAPSULE_SUFFIX if isinstance(whole.geometry, Capsule) else ""
+            holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}{suffix}")
             _write_origin(holder, shape.T_link_shape)
             _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
             if shape.rgba is not None and kind == "visual":

@@ -107,10 +107,16 @@ def test_a_rotated_inertial_frame_is_expressed_in_link_axes(tmp_path):
     np.testing.assert_allclose(np.diag(inertial.matrix), [2, 1, 3], atol=1e-12)
 
 
-def test_a_capsule_is_written_as_cylinder_and_spheres(tmp_path):
+def test_a_capsule_is_written_as_cylinder_and_spheres_and_read_back(tmp_path):
     T = Pose.from_xyz_rpy((0.1, 0, 0), (1.0, 0, 0))
-    link = Link("a", collisions=(Shape(Capsule(0.05, 0.2), T),))
-    shapes = read_urdf(written(Robot("r", (link,)), tmp_path)).root.collisions
+    others = (Shape(Sphere(0.05)), Shape(Cylinder(0.05, 0.1)))
+    link = Link("a", collisions=(*others, Shape(Capsule(0.05, 0.2), T), *others))
+    path = written(Robot("r", (link,)), tmp_path)
+    kinds = [Sphere, Cylinder, Capsule, Sphere, Cylinder]
+    assert [type(shape.geometry) for shape in read_urdf(path).root.collisions] == kinds
+    assert read_urdf(path).root.collisions[2].geometry == Capsule(0.05, 0.2)
+    path.write_text(path.read_text().replace('length="0.2"', 'length="0.3"'))
+    shapes = read_urdf(path).root.collisions[2:5]
     assert [type(shape.geometry) for shape in shapes] == [Cylinder, Sphere, Sphere]
     ends = [np.array(shape.T_link_shape.position) for shape in shapes[1:]]
     assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(0.2)
