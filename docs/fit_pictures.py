@@ -1,11 +1,13 @@
 """Draw every real arm next to the same arm with its fitted primitives.
 
     python docs/fit_pictures.py [--only panda,ur5] [--out docs/images/fit]
+    python docs/fit_pictures.py --only panda,ur5 --spheres 8 --cover 0.995 --out docs/images/spheres
 
 Left: the visuals. Right: up to four primitives per link in place of its collision meshes, one
 colour per link. Both robots are at home, under the same camera. The mean intersection over union is
 over links with collision meshes; links whose source has primitives keep them. Stored fits are used;
-links without a stored fit are fitted now.
+links without a stored fit are fitted now. With `--spheres`, the right side has that number of
+spheres for each link.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 import morphgen
+from morphgen.fitting.link_fit import FitOptions
 from morphgen.fitting.part_fits import COLLISION_OPTIONS
 from morphgen.fitting.replace_collision import stored_primitives, with_primitives
 from morphgen.fitting.robot_fit import fit_links
@@ -53,12 +56,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "fit")
+    parser.add_argument("--spheres", type=int, help="spheres per link, in place of primitives")
+    parser.add_argument("--cover", type=float, help="share of each link that they cover")
     args = parser.parse_args()
+    options = None
+    if args.spheres is not None:
+        options = FitOptions(spheres=args.spheres, cover=args.cover)
     library = default_library()
     names = _names(library, args.only)
     args.out.mkdir(parents=True, exist_ok=True)
     for name in tqdm(names, unit="arm", file=sys.stderr):
-        picture = _picture(name, library)
+        picture = _picture(name, library, options)
         picture.quantize(PALETTE, kmeans=1, dither=Image.Dither.NONE).save(
             args.out / f"{name}.png", optimize=True
         )
@@ -72,9 +80,14 @@ def _names(library: Library, only: str | None) -> list[str]:
     return [m.name for m in library.manifests("arm") if not m.is_template and not m.scaling]
 
 
-def _picture(name: str, library: Library) -> Image.Image:
+def _picture(name: str, library: Library, options: FitOptions | None) -> Image.Image:
     robot = morphgen.compose(f"arm={name}")
-    primitives, ious = _fitted(robot, library)
+    if options is None:
+        primitives, ious = _fitted(robot, library)
+    else:
+        report = fit_links(robot, options)
+        primitives = {row.link: row.fit.primitives for row in report.links}
+        ious = [row.fit.quality.iou for row in report.links]
     fitted = _coloured(with_primitives(robot, primitives))
     sheet = Image.new("RGB", SIZE, "white")
     size = (SIZE[0] // 2, SIZE[1] - TITLE)
@@ -82,8 +95,11 @@ def _picture(name: str, library: Library) -> Image.Image:
         sheet.paste(half, (i * size[0], TITLE))
     count = sum(len(link.visuals) for link in fitted.links)
     quality = f"mean IoU {sum(ious) / len(ious):.2f}" if ious else "as in its source"
+    shapes = "primitives"
+    if options is not None:
+        shapes = "spheres" if options.cover is None else f"spheres, cover {options.cover:g}"
     draw = ImageDraw.Draw(sheet)
-    for i, text in enumerate((name, f"{count} primitives, {quality}")):
+    for i, text in enumerate((name, f"{count} {shapes}, {quality}")):
         draw.text(
             ((i + 0.5) * size[0], TITLE / 2),
             text,

@@ -23,6 +23,8 @@ def fit(
     max_primitives: int = 1,
     iou: float = 0.9,
     enclose: bool = False,
+    spheres: int | None = None,
+    cover: float | None = None,
     visual: bool = False,
     seed: int = 0,
     jobs: int = 1,
@@ -43,6 +45,9 @@ def fit(
         max_primitives: Largest number of primitives per link, 1 to 32.
         iou: Use the fewest primitives that reach this intersection over union.
         enclose: Enclose every point of a link, for conservative collision checks.
+        spheres: Number of spheres per link, 1 to 32, for a fit with spheres alone.
+        cover: Share of a link's volume that its spheres must cover, such as 0.995; by default they
+            have the largest intersection over union.
         visual: Replace the visual shapes, too.
         seed: Seed of the sample points.
         jobs: Number of processes; the result does not depend on it.
@@ -61,7 +66,7 @@ def fit(
     from morphgen.fitting.fitted_robot import fit_robot
     from morphgen.fitting.link_fit import FitOptions
 
-    options = FitOptions(max_primitives, iou, enclose, seed)
+    options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover)
     parts = open_library(library)
     target = _mesh_robot(robot) or resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)

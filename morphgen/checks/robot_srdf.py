@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from morphgen.checks.collision_matrix import MATRIX_SAMPLES, CollisionMatrix, collision_matrix
 from morphgen.checks.self_collision import ALWAYS_SHARE
@@ -14,6 +14,7 @@ from morphgen.formats.srdf import (
     Group,
     GroupState,
     LinkPair,
+    LinkSpheres,
     Srdf,
     srdf_text,
 )
@@ -31,13 +32,20 @@ class _Limb:
     end_effector: Group | None
 
 
-def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0) -> str:
+def robot_srdf_text(
+    robot: Robot,
+    *,
+    samples: int = MATRIX_SAMPLES,
+    seed: int = 0,
+    spheres: tuple[LinkSpheres, ...] = (),
+) -> str:
     """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
 
     Args:
         robot: The robot.
         samples: Number of sampled configurations.
         seed: Seed of the configurations.
+        spheres: Spheres that approximate links.
 
     Raises:
         FormatError: As ``robot_srdf``.
@@ -46,7 +54,8 @@ def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 
     """
     _require_tool(robot)
     matrix = collision_matrix(robot, samples=samples, seed=seed)
-    return srdf_text(robot_srdf(robot, matrix), _evidence(matrix))
+    srdf = replace(robot_srdf(robot, matrix), link_spheres=spheres)
+    return srdf_text(srdf, matrix_evidence(matrix))
 
 
 def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
@@ -92,7 +101,8 @@ def _require_tool(robot: Robot) -> None:
         )
 
 
-def _evidence(matrix: CollisionMatrix) -> str:
+def matrix_evidence(matrix: CollisionMatrix) -> str:
+    """Return sentences about how pairs that need no test were found, and how many."""
     counts = ", ".join(f"{count} {reason}" for reason, count in matrix.counts.items())
     return (
         f"{matrix.num_pairs} pairs of links with collision shapes, "

@@ -56,6 +56,19 @@ _DEFAULT = "html"
         metavar="N",
         help=f"seed of these configurations ({formats_with('seed')} only; default: 0)",
     ),
+    option(
+        "--spheres",
+        type=whole_number(1),
+        metavar="N",
+        help="replace the collision shapes of each link by N spheres; in an SRDF, add them "
+        f"({formats_with('spheres')} only; default: keep the shapes, for curobo 8)",
+    ),
+    option(
+        "--cover",
+        type=float,
+        metavar="SHARE",
+        help="with --spheres: share of each link's volume that they must cover, such as 0.995",
+    ),
     opt.ROOT,
     *opt.LIBRARY_JSON,
     details="In a bundle a file is robot.html, robot.glb and so on, elsewhere it has the name of "
@@ -65,6 +78,7 @@ _DEFAULT = "html"
         "export robots/ur5-plane --format html",
         "export arm=ur5 ee=plane --format gif --out figures",
         "export arm=ur5 ee=plane --format ros2 --out src",
+        "export arm=ur5 ee=plane --format curobo --spheres 16 --cover 0.995",
     ),
 )
 def export(args: argparse.Namespace) -> None:
@@ -92,7 +106,13 @@ def _settings(args: argparse.Namespace) -> ExportSettings:
     Raises:
         FormatError: If one is given that the format does not have.
     """
-    given = {"samples": args.samples, "seed": args.seed, "dark": args.dark or None}
+    given = {
+        "samples": args.samples,
+        "seed": args.seed,
+        "dark": args.dark or None,
+        "spheres": args.spheres,
+        "cover": args.cover,
+    }
     values = {name: value for name, value in given.items() if value is not None}
     for name in values:
         if name not in FORMATS[args.format].options:
@@ -100,7 +120,9 @@ def _settings(args: argparse.Namespace) -> ExportSettings:
                 f"--{name} has no effect on --format {args.format}; expected --format "
                 + formats_with(name)
             )
-    return ExportSettings(**values)
+    if args.spheres is None:
+        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
+    return ExportSettings(**values, folders=tuple(opt.library_of(args).folders))
 
 
 def _target(source: RobotSource, robot: Robot, args: argparse.Namespace) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,12 @@ class ExportSettings:
     """Number of configurations in which pairs of links are tested."""
     seed: int = 0
     """Seed of these configurations."""
+    spheres: int | None = None
+    """Number of spheres per link that replace its collision shapes; None to keep the shapes."""
+    cover: float | None = None
+    """Share of each link that its spheres must cover; None for the largest overlap."""
+    folders: tuple[Path, ...] = ()
+    """Folders of parts, for their stored fits."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +61,9 @@ class FolderFormat:
 
 
 def formats_with(option: str) -> str:
-    """Return the formats in which an option has an effect, such as ``srdf or ros2``."""
-    return " or ".join(name for name, row in FORMATS.items() if option in row.options)
+    """Return the formats in which an option has an effect, such as ``srdf, curobo or ros2``."""
+    *names, last = (name for name, row in FORMATS.items() if option in row.options)
+    return " or ".join([", ".join(names), last] if names else [last])
 
 
 def _html(robot: Robot, settings: ExportSettings) -> bytes:
@@ -81,10 +88,40 @@ def _glb(robot: Robot, settings: ExportSettings) -> bytes:
     return glb_bytes(split_colours(robot))
 
 
+def _with_spheres(robot: Robot, settings: ExportSettings) -> Robot:
+    """Return the robot with spheres as its collision shapes, if the settings have a number."""
+    if settings.spheres is None:
+        return robot
+    from morphgen.fitting.sphere_robot import as_spheres
+
+    return as_spheres(robot, settings.folders, spheres=settings.spheres, cover=settings.cover)
+
+
 def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
     from morphgen.checks.robot_srdf import robot_srdf_text
+    from morphgen.fitting.sphere_robot import link_spheres
 
-    return robot_srdf_text(robot, samples=settings.samples, seed=settings.seed).encode()
+    # The pairs are those of the robot's own shapes, which planners may test, too.
+    spheres = link_spheres(_with_spheres(robot, settings))
+    text = robot_srdf_text(robot, samples=settings.samples, seed=settings.seed, spheres=spheres)
+    return text.encode()
+
+
+def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.checks.collision_matrix import collision_matrix
+    from morphgen.checks.robot_srdf import matrix_evidence
+    from morphgen.fitting.sphere_robot import SPHERES, link_spheres
+    from morphgen.formats.bundle import URDF
+    from morphgen.formats.curobo import CONFIG, curobo_text
+
+    if settings.spheres is None:
+        settings = replace(settings, spheres=SPHERES)
+    robot = _with_spheres(robot, settings)
+    matrix = collision_matrix(robot, samples=settings.samples, seed=settings.seed)
+    spheres = link_spheres(robot)
+    text = curobo_text(robot, spheres, matrix.reasons, URDF, matrix_evidence(matrix))
+    _with_meshes(_urdf)(robot, folder, replace(settings, spheres=None))
+    (folder / CONFIG).write_text(text, encoding="utf-8")
 
 
 def _with_meshes(
@@ -95,7 +132,7 @@ def _with_meshes(
     def write(robot: Robot, folder: Path, settings: ExportSettings) -> None:
         from morphgen.formats.bundle import MESHES, split_colours, write_meshes
 
-        robot = split_colours(robot)
+        robot = split_colours(_with_spheres(robot, settings))
         files = write_meshes(robot, folder / MESHES)
         for name, text in texts(robot, files.__getitem__).items():
             (folder / name).write_text(text, encoding="utf-8")
@@ -125,9 +162,13 @@ def _sdf(robot: Robot, mesh_uri: MeshUri) -> Mapping[str, str]:
 
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.robot_srdf import robot_srdf_text
+    from morphgen.fitting.sphere_robot import link_spheres
     from morphgen.formats.ros_package import write_ros_package
 
-    srdf = robot_srdf_text(robot, samples=settings.samples, seed=settings.seed)
+    robot = _with_spheres(robot, settings)
+    srdf = robot_srdf_text(
+        robot, samples=settings.samples, seed=settings.seed, spheres=link_spheres(robot)
+    )
     write_ros_package(robot, folder, srdf)
 
 
@@ -137,6 +178,7 @@ def _ros2_name(robot_name: str) -> str:
     return ros_package_name(robot_name)
 
 
+_SPHERES = ("spheres", "cover")
 FORMATS: dict[str, FileFormat | FolderFormat] = {
     "html": FileFormat(
         "a page with the robot in 3D that needs no server and no network", _html, ("dark",)
@@ -145,18 +187,26 @@ FORMATS: dict[str, FileFormat | FolderFormat] = {
     "gif": FileFormat("a video of a turn", _video(".gif")),
     "glb": FileFormat("the visual shapes at home, a node per link", _glb),
     "srdf": FileFormat(
-        "groups, home and disabled pairs for MoveIt, with reasons", _srdf, ("samples", "seed")
+        "groups, home and disabled pairs for MoveIt, with reasons",
+        _srdf,
+        ("samples", "seed", *_SPHERES),
     ),
-    "urdf": FolderFormat("URDF and meshes", _with_meshes(_urdf), "{}-urdf".format),
-    "mjcf": FolderFormat("MJCF and meshes", _with_meshes(_mjcf), "{}-mjcf".format),
+    "urdf": FolderFormat("URDF and meshes", _with_meshes(_urdf), "{}-urdf".format, _SPHERES),
+    "mjcf": FolderFormat("MJCF and meshes", _with_meshes(_mjcf), "{}-mjcf".format, _SPHERES),
     "sdf": FolderFormat(
-        "a model of Gazebo: SDFormat and meshes", _with_meshes(_sdf), "{}-sdf".format
+        "a model of Gazebo: SDFormat and meshes", _with_meshes(_sdf), "{}-sdf".format, _SPHERES
+    ),
+    "curobo": FolderFormat(
+        "a robot of cuRobo: spheres, pairs to ignore and joints as YAML, and the URDF",
+        _curobo,
+        "{}-curobo".format,
+        ("samples", "seed", *_SPHERES),
     ),
     "ros2": FolderFormat(
         "a ROS 2 package NAME_description with URDF, meshes, SRDF and launch file",
         _ros2,
         _ros2_name,
-        ("samples", "seed"),
+        ("samples", "seed", *_SPHERES),
     ),
 }
 """The formats by name; a new format is one row."""

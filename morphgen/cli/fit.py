@@ -1,4 +1,4 @@
-"""``morphgen fit``: meshes to boxes, cylinders and spheres."""
+"""``morphgen fit``: meshes to boxes, cylinders and spheres, or to spheres alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option
+from morphgen.cli.command import command, flag, number, option, path_option, whole_number
 from morphgen.cli.progress import bar, print_line, status, track
 from morphgen.errors import FitError, FormatError, MorphgenError
 
@@ -29,6 +29,7 @@ COLUMNS = {
     "IoU": ".3f",
     "coverage": ".3f",
     "volume ratio": ".2f",
+    "protruding": ".2f",
     "protrusion mm": ".1f",
     "protrusion p95": ".1f",
     "gap mm": ".1f",
@@ -69,6 +70,19 @@ class Target:
         default=DEFAULT_IOU,
         help="use the fewest primitives that reach this intersection over union",
     ),
+    option(
+        "--spheres",
+        type=whole_number(1),
+        metavar="N",
+        help="fit N spheres to each link, and no other primitives, for planners",
+    ),
+    option(
+        "--cover",
+        type=float,
+        metavar="SHARE",
+        help="with --spheres: share of each link's volume that they must cover, such as 0.995 "
+        "(default: the largest intersection over union)",
+    ),
     flag("--enclose", "enclose every point of the link, for conservative collision checks"),
     flag("--visual", "replace the visual shapes, too"),
     path_option(
@@ -89,6 +103,7 @@ class Target:
         "fit panda",
         "fit robots/ur5-plane --max-primitives 4 --out robots/ur5-plane-prims",
         "fit link.stl --max-primitives 3",
+        "fit panda --spheres 8 --cover 0.995",
     ),
     extra="fit",
 )
@@ -99,8 +114,19 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
+    if args.spheres is None:
+        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
+    else:
+        primitive_options = {
+            "--max-primitives": args.max_primitives is not None,
+            "--iou": args.iou != DEFAULT_IOU,
+            "--enclose": args.enclose,
+        }
+        opt.reject_idle(primitive_options, "only without --spheres")
     max_primitives = 1 if args.max_primitives is None else args.max_primitives
-    options = FitOptions(max_primitives, args.iou, args.enclose, args.seed)
+    options = FitOptions(
+        max_primitives, args.iou, args.enclose, args.seed, args.spheres, args.cover
+    )
     if args.all:
         _fit_all_parts(args)
         return
@@ -224,6 +250,7 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
         "--no-picture": args.no_picture,
         "--max-primitives": args.max_primitives is not None,
         "--iou": args.iou != DEFAULT_IOU,
+        "--spheres": args.spheres is not None,
         "--configurations": args.configurations != DEFAULT_CONFIGURATIONS,
         "--seed": args.seed,
         "--json": args.json,
@@ -283,5 +310,5 @@ def _quality_cells(quality: Quality) -> tuple[float, ...]:
         quality.gap_p95,
         quality.hausdorff,
     )
-    shares = (quality.iou, quality.coverage, quality.volume_ratio)
+    shares = (quality.iou, quality.coverage, quality.volume_ratio, quality.protrusion_share)
     return (*shares, *(1e3 * distance for distance in distances))

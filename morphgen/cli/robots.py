@@ -28,9 +28,10 @@ PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment"
     ),
     option(
         "--geometry",
-        choices=["mesh", "primitive"],
+        choices=["mesh", "primitive", "sphere"],
         default="mesh",
-        help="collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres",
+        help="collision shapes: meshes of real parts, fitted boxes, cylinders and spheres in their "
+        "place, or 8 spheres for each link",
     ),
     *opt.BUNDLE_OUT,
     *opt.LIBRARY_JSON,
@@ -52,6 +53,10 @@ def compose(args: argparse.Namespace) -> int:
             from morphgen.fitting.replace_collision import as_primitives
 
             robot = as_primitives(robot, library.folders)
+        elif args.geometry == "sphere":
+            from morphgen.fitting.sphere_robot import as_spheres
+
+            robot = as_spheres(robot, library.folders)
     return write_and_report(robot, args)
 
 

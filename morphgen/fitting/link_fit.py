@@ -11,8 +11,12 @@ from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
+from morphgen.fitting.sphere_search import best_spheres
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
-from morphgen.model.geometry import Shape
+from morphgen.model.geometry import Shape, Sphere
+
+MAX_COVER = 0.9999
+"""Largest share that spheres can be required to cover: more cannot be counted on sample points."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +31,27 @@ class FitOptions:
     """Enclose every point of the solid, instead of maximising the intersection over union."""
     seed: int = 0
     """Seed of the sample points and of the clusterings."""
+    spheres: int | None = None
+    """Number of spheres per link, of a fit with spheres alone; None for a fit with primitives."""
+    cover: float | None = None
+    """Share of a link's volume that its spheres must cover; None for the largest IoU."""
 
     def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
-            FitError: If one is out of its range.
+            FitError: If one is out of its range, or has no effect on a fit of this kind.
         """
+        if self.spheres is not None:
+            if not 1 <= self.spheres <= MAX_PRIMITIVES:
+                raise FitError(f"{self.spheres} spheres: expected 1 to {MAX_PRIMITIVES} per link")
+            if self.max_primitives != 1 or self.enclose:
+                raise FitError("a fit of spheres takes neither max_primitives nor enclose")
+        if self.cover is not None:
+            if self.spheres is None:
+                raise FitError(f"cover {self.cover:g}: expected a number of spheres, too")
+            if not 0 < self.cover <= MAX_COVER:
+                raise FitError(f"cover {self.cover:g}: expected more than 0, at most {MAX_COVER}")
         if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
             raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
         if not 0 < self.iou <= 1:
@@ -76,7 +94,7 @@ def fit_shapes(
 
     Args:
         shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
-            there are no more than ``max_primitives``.
+            there are no more than ``max_primitives``; by a fit of spheres, if all are spheres.
         options: Options of the fit.
         solid: The solid of the shapes, if it is known already.
 
@@ -86,7 +104,11 @@ def fit_shapes(
     """
     start = time.perf_counter()
     solid = solid or solid_of(shapes)
-    if are_primitives(shapes) and len(shapes) <= options.max_primitives:
+    if options.spheres is not None:
+        is_kept = all(isinstance(shape.geometry, Sphere) for shape in shapes)
+    else:
+        is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
+    if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None
         return _measure(kept, single, solid, start, method="primitives")
@@ -97,6 +119,9 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     """Fit a solid; see ``fit_shapes``."""
     start = time.perf_counter()
     target = sample_solid(solid, options.seed)
+    if options.spheres is not None:
+        found = best_spheres(target, options.spheres, options.cover, options.seed)
+        return _measure(found.shapes, None, solid, start)
     if options.enclose:
         shapes = enclose_solid(target, options.max_primitives, options.iou, options.seed)
         return _measure(shapes, None, solid, start)

@@ -10,9 +10,11 @@ from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
 from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.fitting.solid import solid_of
+from morphgen.fitting.token_shapes import token_of_primitives
 from morphgen.formats.files import write_file
 from morphgen.formats.fits import (
     SUFFIX,
+    are_primitives,
     find_fit,
     fits_text,
     has_meshes,
@@ -110,7 +112,11 @@ def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, St
 def _with_token(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
     """Return a link's fit with the primitive of its token, which is fitted if it is missing."""
     solid = solid_of(shapes)
-    single = fit.single or fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives[0]
+    single = fit.single
+    if single is None and are_primitives(shapes):
+        single = token_of_primitives(shapes)
+    if single is None:
+        (single,) = fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives
     token_iou = quality(solid, [single]).iou
     return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
 

@@ -29,6 +29,9 @@ SurfacePoints = tuple[Array, Array]
 Patch = tuple[float, Callable[[Array], SurfacePoints]]
 """Area of a patch of a surface, and its area-preserving map from the unit square (n, 2)."""
 
+_ON_SURFACE = 1e-6
+"""Distance up to which a point counts as on the surface of the solid, not outside [m]."""
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -40,6 +43,8 @@ class Quality:
     """Share of the solid's volume that is inside the primitives."""
     volume_ratio: float
     """Volume of the union of the primitives over the volume of the solid."""
+    protrusion_share: float
+    """Share of the primitives' outer surface that is outside of the solid."""
     protrusion_mean: float
     """Mean distance of the primitives' outer surface from the solid, 0 where inside [m]."""
     protrusion_p95: float
@@ -103,6 +108,7 @@ def quality(
         iou=float(intersection / np.count_nonzero(in_primitives | in_solid)),
         coverage=float(intersection / np.count_nonzero(in_solid)),
         volume_ratio=float(np.count_nonzero(in_primitives) / np.count_nonzero(in_solid)),
+        protrusion_share=float((protrusion > _ON_SURFACE).mean()),
         protrusion_mean=float(protrusion.mean()),
         protrusion_p95=float(np.percentile(protrusion, 95)),
         gap_mean=float(gap.mean()),

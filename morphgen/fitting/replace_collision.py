@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from morphgen.checks.self_collision import survey_collisions
-from morphgen.errors import FitError
-from morphgen.fitting.fit_cache import cached_fits, keep_fits
+from morphgen.fitting.fit_cache import cached_fits, fit_and_keep
 from morphgen.formats.fits import (
     FITTER_VERSION,
     find_fit,
     has_meshes,
     read_stored_fits,
     shapes_key,
-    shapes_scale,
 )
 from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
 from morphgen.processes import Progress, no_progress
 
-_LOGGER = logging.getLogger(__name__)
+_CACHE = f"fits-{FITTER_VERSION}"
+"""Folder of the fits in the user's cache."""
 
 
 def as_primitives(
@@ -49,25 +47,11 @@ def as_primitives(
     """
     fits = _known_fits(robot, read_stored_fits(folders))
     if missing := _meshed_links(robot, fits):
-        fits |= _known_fits(robot, cached_fits(shapes_key(link.collisions) for link in missing))
+        fits |= cached_fits(missing, _CACHE)
     if missing := _meshed_links(robot, fits):
-        # These import torch, which takes seconds to load.
-        from morphgen.fitting.part_fits import COLLISION_OPTIONS, fits_of
-        from morphgen.fitting.robot_fit import fit_links
+        from morphgen.fitting.part_fits import COLLISION_OPTIONS  # imports torch, which takes long
 
-        _LOGGER.warning(
-            "fitting primitives to %d links of robot %r, seconds for each; the fits are kept",
-            len(missing),
-            robot.name,
-        )
-        names = [link.name for link in missing]
-        report = fit_links(robot, COLLISION_OPTIONS, only=names, progress=progress)
-        for finding in report.findings:
-            if finding.severity != "info":
-                raise FitError(f"{finding.where}: {finding.why}")
-        new_fits = _at_unit_scale(robot, fits_of(robot, report, {}))
-        keep_fits(new_fits)
-        fits |= _known_fits(robot, new_fits)
+        fits |= fit_and_keep(robot, missing, COLLISION_OPTIONS, _CACHE, {}, progress=progress)
     fitted = with_primitives(robot, {link: fit.collision for link, fit in fits.items()})
     return replace(
         with_fits(fitted, fits),
@@ -78,15 +62,6 @@ def as_primitives(
 def _meshed_links(robot: Robot, fits: Mapping[str, StoredFit]) -> list[Link]:
     """Return the links that collide as meshes and have no fit."""
     return [link for link in robot.links if link.name not in fits and has_meshes(link.collisions)]
-
-
-def _at_unit_scale(robot: Robot, fits: Mapping[str, StoredFit]) -> dict[str, StoredFit]:
-    """Return fits of links by the keys of their shapes, as files of fits hold them."""
-    at_unit_scale = {}
-    for name, fit in fits.items():
-        shapes = robot.link(name).collisions
-        at_unit_scale[shapes_key(shapes)] = fit.scaled(1 / shapes_scale(shapes))
-    return at_unit_scale
 
 
 def with_fits(robot: Robot, fits: Mapping[str, StoredFit]) -> Robot:

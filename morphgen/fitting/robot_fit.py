@@ -63,12 +63,20 @@ class FitReport:
 
     def as_dict(self) -> dict[str, object]:
         """Return plain data for JSON."""
+        options = self.options
+        settings: dict[str, object]
+        if options.spheres is not None:
+            settings = {"spheres": options.spheres, "cover": options.cover}
+        else:
+            settings = {
+                "max_primitives": options.max_primitives,
+                "iou": options.iou,
+                "enclose": options.enclose,
+            }
         return {
             "robot": self.robot,
-            "max_primitives": self.options.max_primitives,
-            "iou": self.options.iou,
-            "enclose": self.options.enclose,
-            "seed": self.options.seed,
+            **settings,
+            "seed": options.seed,
             "links": [
                 {"link": report.link, "same_as": report.same_as, **report.fit.as_dict()}
                 for report in self.links

@@ -157,25 +157,37 @@ def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> Search
 def _climb(target: SampledSolid, start: Candidates, tau: tuple[float, float]) -> SearchResult:
     """Improve all candidates on few points, then the best ones on all points."""
     points, inside, weights = target.points, target.inside, target.weights
-    coarse = ascend(
+    coarse = ascend_coarsely(target, start, weights, tau)
+    best = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")[:NUM_REFINED]
+    fine = ascend_finely(target, coarse.take(best), weights)
+    ious = overlaps(fine, points, inside, weights)
+    row = int(np.argmax(ious))
+    return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))
+
+
+def ascend_coarsely(
+    target: SampledSolid, start: Candidates, weights: Array, tau: tuple[float, float]
+) -> Candidates:
+    """Improve candidates on few sample points; see ``soft_iou.ascend`` for the arguments."""
+    return ascend(
         start,
-        points[:COARSE_POINTS],
-        inside[:COARSE_POINTS],
-        weights=weights[:COARSE_POINTS],
+        target.points[:COARSE_POINTS],
+        target.inside[:COARSE_POINTS],
+        weights=weights[..., :COARSE_POINTS],
         num_steps=100,
         tau=tau,
         rate=(0.01, 0.003),
     )
-    best = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")[:NUM_REFINED]
-    fine = ascend(
-        coarse.take(best),
-        points,
-        inside,
+
+
+def ascend_finely(target: SampledSolid, coarse: Candidates, weights: Array) -> Candidates:
+    """Improve candidates on all sample points; see ``soft_iou.ascend`` for the arguments."""
+    return ascend(
+        coarse,
+        target.points,
+        target.inside,
         weights=weights,
         num_steps=60,
         tau=(0.006, 0.0015),
         rate=(0.004, 0.0004),
     )
-    ious = overlaps(fine, points, inside, weights)
-    row = int(np.argmax(ious))
-    return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))

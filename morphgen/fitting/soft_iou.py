@@ -14,8 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.fitting.canonical import KINDS
 from morphgen.typing import Array
 
+_SPHERE = KINDS.index("sphere")
 _MAX_DISTANCES = 96_000
 """Number of distances that are evaluated together; bounds memory."""
 
@@ -148,15 +150,24 @@ def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
     return np.asarray(_members(candidates, points).numpy())
 
 
-@torch.no_grad()
+def distances(candidates: Candidates, points: Array) -> Array:
+    """Return the signed distances of points (m, 3) to the union of each candidate, shape (n, m)."""
+    return np.asarray(_distances(candidates, points).amin(dim=1).double().numpy())
+
+
 def _members(candidates: Candidates, points: Array) -> torch.Tensor:
+    return (_distances(candidates, points) <= 0).any(dim=1)
+
+
+@torch.no_grad()
+def _distances(candidates: Candidates, points: Array) -> torch.Tensor:
+    """Return signed distances, shape (n, k, m), without gradients."""
     arrays = (candidates.centres, candidates.quaternions, candidates.halves)
-    distance = _distance(
+    return _distance(
         torch.from_numpy(points.astype(np.float32)),
         torch.from_numpy(candidates.kinds),
         *(torch.from_numpy(array.astype(np.float32)) for array in arrays),
     )
-    return (distance <= 0).any(dim=1)
 
 
 def _distance(
@@ -168,6 +179,10 @@ def _distance(
 ) -> torch.Tensor:
     """Return signed distances (n, k, m) of points (m, 3) to primitives (n, k)."""
     n, k = kinds.shape
+    if bool((kinds == _SPHERE).all()):
+        # Spheres need no rotation of the points, which is most of the work.
+        from_centres = torch.cdist(centres.reshape(1, n * k, 3), x[None])
+        return from_centres.reshape(n, k, -1) - halves[:, :, :1]
     # Primitives are sorted by kind, so that each kind is one block of tensor operations.
     flat = kinds.reshape(-1)
     order = torch.argsort(flat, stable=True)

@@ -78,7 +78,7 @@ def token_shapes(
         if fit := find_fit(link.collisions, robot, stored):
             primitives[link.name] = fit.token
         elif dominant := _dominant_primitive(shapes):
-            primitives[link.name] = canonical(replace(dominant, rgba=None))
+            primitives[link.name] = dominant
         else:
             path = user_cache_path("morphgen") / _CACHE_DIR / f"{shapes_key(shapes)}.json"
             if path.is_file():
@@ -95,6 +95,12 @@ def token_shapes(
     return {name: shape for name, shape in primitives.items() if shape}
 
 
+def token_of_primitives(shapes: Sequence[Shape]) -> Shape | None:
+    """Return the token's primitive of a link with primitives; None if they have no volume."""
+    shapes = rounded_shapes(tuple(shapes))
+    return _dominant_primitive(shapes) or fit_composite(shapes)
+
+
 def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
     """Fit one primitive to shapes that are fixed to each other; None if they have no volume."""
     if are_primitives(shapes):
@@ -109,12 +115,15 @@ def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
 
 
 def _dominant_primitive(shapes: Sequence[Shape]) -> Shape | None:
-    """Return the primitive to which the other primitives of a link add next to no volume."""
+    """Return the primitive to which the other primitives of a link add next to no volume.
+
+    It is in its canonical pose.
+    """
     if not are_primitives(shapes):
         return None
     largest = max(shapes, key=lambda shape: union_integrals([shape]).volume)
     share = union_integrals([largest]).volume / union_integrals(shapes).volume
-    return largest if share >= DOMINANT_SHARE else None
+    return canonical(replace(largest, rgba=None)) if share >= DOMINANT_SHARE else None
 
 
 def _read_cached(path: Path, scale: float) -> Shape | None:

@@ -14,6 +14,7 @@ FIGURES = {
     "iou",
     "coverage",
     "volume_ratio",
+    "protrusion_share",
     "protrusion_mean",
     "protrusion_p95",
     "gap_mean",
