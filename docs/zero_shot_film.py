@@ -1,9 +1,9 @@
-"""Film six arms that one policy reaches with: docs/images/zero_shot.gif.
+"""Film six arms that one policy reaches with: docs/images/zero_shot.gif; or other robots.
 
-    python docs/zero_shot_film.py [--seed 3]
+    python docs/zero_shot_film.py [--robots FILE ...] [--task reach] [--seed 3] [--out FILE]
 
-The policy is ``zero-shot``, which was trained on none of these arms. Each has four episodes of
-reach; arms that reach earlier wait for the others.
+The policy is ``zero-shot`` or ``zero-shot-push``, which was trained on none of these arms. Each has
+four episodes; arms that finish earlier wait for the others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ ROBOTS = (
     "arm=xarm7 ee=stick",
     "arm=so101 ee=so101_gripper",
 )
-COLUMNS = 3
+COLUMNS, MANY_COLUMNS = 3, 4
+"""Columns of the film, and of one with more than six robots."""
 SIZE = (240, 180)
 EPISODES = 4
 STRIDE = 2
@@ -38,11 +39,13 @@ REST = 25
 def main() -> int:
     """Run the episodes and write the film."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
+    parser.add_argument("--task", choices=("reach", "push"), default="reach")
     parser.add_argument("--seed", type=int, default=3)
     images = Path(__file__).parent / "images"
     parser.add_argument("--out", type=Path, default=images / "zero_shot.gif")
     args = parser.parse_args()
-    films = [film(robot, args.seed) for robot in ROBOTS]
+    films = [film(robot, args.task, args.seed) for robot in args.robots]
     frames = (
         tiled([own[min(i, len(own) - 1)] for own in films]) for i in range(max(map(len, films)))
     )
@@ -51,9 +54,9 @@ def main() -> int:
     return 0
 
 
-def film(robot: str, seed: int) -> np.ndarray:
+def film(robot: str, task: str, seed: int) -> np.ndarray:
     """Return the frames of a robot's episodes, shape (n, height, width, 3)."""
-    spec = read_controller("zero-shot", "reach")
+    spec = read_controller("zero-shot" if task == "reach" else "zero-shot-push", task)
     env, controller = make_env_and_controller(
         spec, robot, seed, sim="mujoco", render_mode="rgb_array", size=SIZE
     )
@@ -63,8 +66,10 @@ def film(robot: str, seed: int) -> np.ndarray:
 
 
 def tiled(tiles: list[np.ndarray]) -> np.ndarray:
-    """Return pictures in rows of ``COLUMNS``."""
-    rows = [np.concatenate(tiles[i : i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
+    """Return pictures in rows; the last row is filled up in white."""
+    columns = COLUMNS if len(tiles) <= 6 else MANY_COLUMNS
+    tiles = tiles + [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
     return np.concatenate(rows)
 
 
