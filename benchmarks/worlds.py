@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -23,6 +24,9 @@ TABLE_SIZE = (3.0, 3.0, 0.5)
 
 class World(Protocol):
     """One robot in one simulator."""
+
+    load_seconds: float
+    """Time in which the simulator loaded its model [s]."""
 
     def reset(self) -> None:
         """Set the home configuration with zero velocities."""
@@ -55,7 +59,9 @@ class MujocoWorld:
                 size=[edge / 2 for edge in TABLE_SIZE],
                 pos=[0, 0, table_top - TABLE_SIZE[2] / 2],
             )
+        start = time.perf_counter()
         self._model = spec.compile()
+        self.load_seconds = time.perf_counter() - start
         self._data = mujoco.MjData(self._model)
 
     def reset(self) -> None:
@@ -90,12 +96,14 @@ class PybulletWorld:
             self._bullet, self._robot = pybullet, robot
             self._client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
             folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
+            start = time.perf_counter()
             self._body = pybullet.loadURDF(
                 str(folder / URDF),
                 useFixedBase=True,
                 flags=pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_IMPLICIT_CYLINDER,
                 **self._client,
             )
+            self.load_seconds = time.perf_counter() - start
         pybullet.setTimeStep(TIMESTEP, **self._client)
         count = pybullet.getNumJoints(self._body, **self._client)
         infos = [pybullet.getJointInfo(self._body, i, **self._client) for i in range(count)]

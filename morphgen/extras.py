@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from morphgen.errors import MissingDependencyError
 
 EXTRAS = {
+    "coacd": ("convex",),
     "embreex": ("fit",),
     "fast_simplification": ("fit",),
     "gymnasium": ("tasks", "rl"),
     "imageio": ("tasks", "rl"),
     "tensorboard": ("rl",),
     "torch": ("tasks", "rl", "fit"),
+    "urdf_usd_converter": ("usd",),
     "viser": ("viewer",),
     "websockets": ("viewer",),
 }

@@ -1,4 +1,4 @@
-"""Collision shapes of simulated robots: all of their primitives, or one for each link."""
+"""Collision shapes of simulated robots: primitives, one for each link, or convex pieces."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
+from morphgen.extras import explain_missing_extras
+from morphgen.fitting.convex_pieces import as_convex
 from morphgen.fitting.replace_collision import with_primitives
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.rounding import as_written
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES, CollisionGeometry, Scene
 
@@ -25,12 +31,13 @@ def require_geometry(geometry: str) -> None:
         )
 
 
+@explain_missing_extras()
 def with_geometry(
     scenes: Sequence[Scene], geometry: CollisionGeometry, folders: Sequence[Path] = ()
 ) -> list[Scene]:
     """Return scenes whose robots have the collision shapes of a geometry.
 
-    Masses, joints and visuals stay. Pairs of links that overlap with the new shapes wherever the
+    Masses and joints stay. Pairs of links that overlap with the new shapes wherever the
     joints are, or at the home pose, do not collide.
 
     Args:
@@ -39,16 +46,37 @@ def with_geometry(
         folders: Folders of parts, for their stored fits.
 
     Raises:
+        FitError: If a mesh has no convex pieces.
         FormatError: If a stored fit is malformed.
         MeshError: If a mesh cannot be read.
+        MissingDependencyError: If convex pieces are wanted and the extra ``convex`` is missing.
+        TaskError: If they are wanted for a robot whose meshes are not known any more.
     """
     if geometry == "primitive":
         return list(scenes)
     robots: dict[int, Robot] = {}
     for scene in scenes:
         if id(scene.robot) not in robots:
-            shapes = token_shapes(scene.robot, folders)
-            robots[id(scene.robot)] = with_primitives(
-                scene.robot, {name: (shape,) for name, shape in shapes.items()}
-            )
+            change = _light if geometry == "light" else _convex
+            robots[id(scene.robot)] = change(scene.robot, folders)
     return [replace(scene, robot=robots[id(scene.robot)]) for scene in scenes]
+
+
+def _light(robot: Robot, folders: Sequence[Path]) -> Robot:
+    """Return the robot with the primitive of each link's token."""
+    shapes = token_shapes(robot, folders)
+    return with_primitives(robot, {name: (shape,) for name, shape in shapes.items()})
+
+
+def _convex(robot: Robot, folders: Sequence[Path]) -> Robot:
+    """Return the robot with the convex pieces of the meshes that its primitives were fitted to."""
+    if not robot.fits:  # it never had meshes
+        return robot
+    text = robot.provenance.get("derivation")
+    composed = compose(parse_derivation(str(text)), Library(folders), robot.name) if text else None
+    if composed is None or as_written(composed).joints != robot.joints:
+        raise TaskError(
+            f"robot {robot.name!r}: collision geometry 'convex' needs its meshes, which only a "
+            "robot that morphgen composes finds again; expected 'primitive' or 'light'"
+        )
+    return as_written(as_convex(composed, folders))

@@ -183,8 +183,9 @@ def batch_from_specs(
         first: Number of the first environment, where a batch is made in parts.
         layouts: Layouts of obstacles that episodes draw from: those of training or of evaluation.
         device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
-        geometry: Collision shapes of the simulated robots: all (``primitive``), or one for each
-            link (``light``). Observations and goals do not depend on it.
+        geometry: Collision shapes of the simulated robots: all (``primitive``), one for each link
+            (``light``), or convex pieces of the meshes (``convex``). Observations and goals do not
+            depend on it.
         library: Folders of your own parts.
 
     Raises:

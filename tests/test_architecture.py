@@ -233,6 +233,8 @@ def test_core_works_without_optional_extras(words, tmp_path):
     ("words", "extra"),
     [
         (("fit", "ur5"), "fit"),
+        (("compose", "arm=ur5", "--geometry", "convex"), "convex"),
+        (("export", "prims", "--format", "usd"), "usd"),
         (("train", "interpolation/arm3/reach"), "rl"),
         (("finetune", "zero-shot"), "rl"),
         (("play", "reach", "prims"), "tasks"),

@@ -10,8 +10,7 @@ from morphgen.api.library import LibraryFolders, open_library
 from morphgen.checks import check
 from morphgen.errors import CompositionError, nearest
 from morphgen.extras import explain_missing_extras
-from morphgen.fitting.replace_collision import as_primitives
-from morphgen.fitting.sphere_robot import as_spheres
+from morphgen.fitting.collision_geometry import GEOMETRIES, with_geometry
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
@@ -21,9 +20,6 @@ from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
-
-GEOMETRIES = ("mesh", "primitive", "sphere")
-"""Collision shapes that ``compose`` can give a robot."""
 
 
 @explain_missing_extras()
@@ -49,14 +45,15 @@ def compose(
             dashes, such as ``ur5-plane``; or a grammar and pinned choices, such as
             ``chain beads=5``.
         name: Name of the robot; by default it is made from the parts.
-        geometry: Collision shapes: ``mesh`` for those of the parts, ``primitive`` for fitted boxes,
-            cylinders and spheres in place of meshes, or ``sphere`` for 8 spheres for each link.
+        geometry: Collision shapes: ``mesh`` for those of the parts; ``primitive`` for fitted boxes,
+            cylinders and spheres in place of meshes; ``convex`` for convex pieces of meshes; or
+            ``sphere`` for 8 spheres for each link.
         library: Folders of your own parts and grammars.
         **words: More ``key=value`` words. Values without a unit are in SI units.
 
     Raises:
         MissingDependencyError: If primitives or spheres have to be fitted and the extra ``fit`` is
-            missing.
+            missing, or meshes decomposed and the extra ``convex``.
         MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
             value is out of range; the message lists what is valid.
     """
@@ -66,9 +63,7 @@ def compose(
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
     derivation, default_name = parse_words(request_words, parts)
     robot = compose_derivation(derivation, parts, name or default_name)
-    if geometry == "primitive":
-        return as_primitives(robot, parts.folders)
-    return as_spheres(robot, parts.folders) if geometry == "sphere" else robot
+    return with_geometry(robot, geometry, parts.folders)
 
 
 def sample(

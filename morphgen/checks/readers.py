@@ -159,10 +159,18 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
     return Reading(tuple(address), float(model.body_mass.sum()), poses)
 
 
+def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the USD that urdf-usd-converter makes of the URDF with OpenUSD."""
+    from morphgen.checks.usd_reader import read_stage
+
+    return Reading(*read_stage(folder / "robot.urdf", frame, q, n))
+
+
 LOADERS = (
     Loader("yourdfpy", "yourdfpy", read_yourdfpy),
     Loader("pybullet", "pybullet", read_pybullet),
     Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, "robot.urdf")),
     Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, "robot.xml")),
     Loader("pinocchio", "pinocchio", read_pinocchio),
+    Loader("usd", "urdf_usd_converter", read_usd),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -160,6 +161,15 @@ def _sdf(robot: Robot, mesh_uri: MeshUri) -> Mapping[str, str]:
     return {MODEL_SDF: sdf_text(robot, mesh_uri), MODEL_CONFIG: model_config_text(robot)}
 
 
+def _usd(robot: Robot, folder: Path, settings: ExportSettings) -> None:
+    from morphgen.formats.bundle import URDF
+    from morphgen.formats.usd import convert_urdf
+
+    with TemporaryDirectory() as scratch:
+        _with_meshes(_urdf)(robot, Path(scratch), settings)
+        convert_urdf(Path(scratch) / URDF, folder)
+
+
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.robot_srdf import robot_srdf_text
     from morphgen.fitting.sphere_robot import link_spheres
@@ -201,6 +211,9 @@ FORMATS: dict[str, FileFormat | FolderFormat] = {
         _curobo,
         "{}-curobo".format,
         ("samples", "seed", *_SPHERES),
+    ),
+    "usd": FolderFormat(
+        "OpenUSD with physics, by urdf-usd-converter", _usd, "{}-usd".format, _SPHERES
     ),
     "ros2": FolderFormat(
         "a ROS 2 package NAME_description with URDF, meshes, SRDF and launch file",

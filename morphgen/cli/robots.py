@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, option
-from morphgen.cli.progress import status
+from morphgen.cli.progress import bar, status
 from morphgen.errors import CompositionError
 
 if TYPE_CHECKING:
@@ -28,10 +28,11 @@ PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment"
     ),
     option(
         "--geometry",
-        choices=["mesh", "primitive", "sphere"],
+        choices=["mesh", "primitive", "convex", "sphere"],
         default="mesh",
-        help="collision shapes: meshes of real parts, fitted boxes, cylinders and spheres in their "
-        "place, or 8 spheres for each link",
+        help="collision shapes: meshes of real parts; in their place fitted boxes, cylinders and "
+        "spheres, or convex pieces by CoACD, which takes minutes once for each part; or 8 spheres "
+        "for each link",
     ),
     *opt.BUNDLE_OUT,
     *opt.LIBRARY_JSON,
@@ -49,14 +50,11 @@ def compose(args: argparse.Namespace) -> int:
     with status(args, "composing"):
         derivation, name = parse_words(args.words, library)
         robot = compose(derivation, library, name if args.name is None else args.name)
-        if args.geometry == "primitive":
-            from morphgen.fitting.replace_collision import as_primitives
+    if args.geometry != "mesh":
+        from morphgen.fitting.collision_geometry import with_geometry
 
-            robot = as_primitives(robot, library.folders)
-        elif args.geometry == "sphere":
-            from morphgen.fitting.sphere_robot import as_spheres
-
-            robot = as_spheres(robot, library.folders)
+        with bar(args, "replacing collision meshes", "shape") as shown:
+            robot = with_geometry(robot, args.geometry, library.folders, progress=shown)
     return write_and_report(robot, args)
 
 

@@ -168,7 +168,7 @@ def mutate(args: argparse.Namespace) -> None:
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
     """Return the URDF that a derivation gives, as in a bundle or in a light set."""
-    from morphgen.fitting.replace_collision import as_primitives
+    from morphgen.fitting.collision_geometry import with_geometry
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
     from morphgen.grammar.robot_set import light_urdf
@@ -176,14 +176,17 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
     robot = compose(derivation, library, folder.resolve().name)
     if not (folder / CARD).is_file():
         return light_urdf(robot)
-    primitives = _card(folder).get("primitives")
+    card = _card(folder)
+    if "convex" in card:
+        robot = with_geometry(robot, "convex", library.folders)
+    primitives = card.get("primitives")
     if primitives is not None:
         if "links" in primitives:
             raise FormatError(
                 f"{folder} has primitives of morphgen fit, which its derivation does not include: "
                 "replay the robot that was fitted"
             )
-        robot = as_primitives(robot, library.folders)
+        robot = with_geometry(robot, "primitive", library.folders)
     with tempfile.TemporaryDirectory() as scratch:
         bundle = write_bundle(robot, Path(scratch) / robot.name, picture=False)
         return (bundle / URDF).read_text(encoding="utf-8")

@@ -20,7 +20,16 @@ from morphgen.model.robot import Robot
 
 CARD_FORMAT = 1
 
-_PROVENANCE = ("derivation", "source", "choices", "repairs", "parts", "accepted", "primitives")
+_PROVENANCE = (
+    "derivation",
+    "source",
+    "choices",
+    "repairs",
+    "parts",
+    "accepted",
+    "primitives",
+    "convex",
+)
 """Keys of a card that become the robot's ``provenance``."""
 
 
@@ -37,6 +46,7 @@ class _CardRecord(Record, frozen=True):
     parts: list[dict[str, Any]] = field(default_factory=list)
     accepted: dict[str, dict[str, str]] = field(default_factory=dict)
     primitives: dict[str, Any] = field(default_factory=dict)
+    convex: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if any(not {"label", "part"} <= part.keys() for part in self.parts):

@@ -21,9 +21,10 @@ CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
 GRAVITY = 9.81
 """Gravity along -z [m/s^2]. Robots carry their own weight, as controllers of real arms ensure."""
-CollisionGeometry = Literal["primitive", "light"]
+CollisionGeometry = Literal["primitive", "light", "convex"]
 """Collision shapes of simulated robots. ``primitive``: all primitives. ``light``: for each link the
-one that its token describes, which overlaps them most; fewer shapes take less time."""
+one that its token describes, which overlaps them most; fewer shapes take less time. ``convex``:
+convex pieces of the meshes, which are closest to them and take more time."""
 COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 
 

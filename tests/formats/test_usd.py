@@ -1,0 +1,93 @@
+"""Export to USD: what a stage holds, read with OpenUSD itself."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+import morphgen
+from morphgen.cli import main
+from morphgen.errors import FormatError
+from morphgen.formats.usd import convert_urdf
+from morphgen.model.geometry import Mesh
+
+pytest.importorskip("urdf_usd_converter")
+from pxr import Usd, UsdGeom, UsdPhysics
+
+WORDS = ("arm=ur5", "ee=robotiq_2f85")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    assert main(["export", *WORDS, "--format", "usd", "--out", str(out)]) == 0
+    return out / "ur5-robotiq_2f85-usd"
+
+
+@pytest.fixture(scope="module")
+def stage(folder):
+    return Usd.Stage.Open(str(folder / "ur5-robotiq_2f85.usda"))
+
+
+def test_links_have_their_masses_and_centres_of_mass(stage):
+    prims = {prim.GetName(): prim for prim in stage.Traverse()}
+    for link in morphgen.compose(" ".join(WORDS)).links:
+        if not prims[link.name].HasAPI(UsdPhysics.RigidBodyAPI):
+            assert link.inertial is None
+            continue
+        mass = UsdPhysics.MassAPI(prims[link.name])
+        if link.inertial is None:  # zero would mean that the mass follows from the shapes
+            assert 0 < mass.GetMassAttr().Get() <= 1e-12
+            continue
+        assert mass.GetMassAttr().Get() == pytest.approx(link.inertial.mass, rel=1e-6)
+        centre = link.inertial.com
+        assert tuple(mass.GetCenterOfMassAttr().Get()) == pytest.approx(centre, abs=1e-6)
+
+
+def test_joints_have_their_limits_and_couplings(stage):
+    prims = {prim.GetName(): prim for prim in stage.Traverse()}
+    followers = 0
+    for joint in morphgen.compose(" ".join(WORDS)).joints:
+        prim = prims.get(joint.name)
+        if joint.limits is not None:
+            unit = math.degrees(1) if joint.kind == "revolute" else 1
+            limits = [prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper")]
+            assert limits == pytest.approx([unit * limit for limit in joint.limits], rel=1e-6)
+        if joint.mimic is not None:
+            followers += 1
+            (leader,) = prim.GetRelationship("newton:mimicJoint").GetTargets()
+            assert leader.name == joint.mimic.joint
+            assert prim.GetAttribute("newton:mimicCoef1").Get() == joint.mimic.multiplier
+    assert followers == 5
+
+
+def test_the_folder_stands_alone(folder, stage):
+    meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    assert meshes
+    assert all(UsdGeom.Mesh(prim).GetPointsAttr().Get() for prim in meshes)
+    files = [Path(layer.realPath) for layer in stage.GetUsedLayers() if not layer.anonymous]
+    assert all(file.is_relative_to(folder) for file in files)
+    for path in folder.rglob("*.usda"):
+        assert not re.search(r"(/tmp|robot\.urdf)", path.read_text("utf-8"))
+
+
+def test_every_collision_mesh_is_a_hull(stage):
+    meshes = sum(
+        isinstance(shape.geometry, Mesh)
+        for link in morphgen.compose(" ".join(WORDS)).links
+        for shape in link.collisions
+    )
+    approximations = [
+        prim.GetAttribute("physics:approximation").Get()
+        for prim in stage.Traverse()
+        if prim.HasAPI(UsdPhysics.MeshCollisionAPI)
+    ]
+    assert approximations == ["convexHull"] * meshes
+
+
+def test_a_urdf_that_the_converter_refuses_is_one_error(tmp_path):
+    broken = tmp_path / "robot.urdf"
+    broken.write_text("<robot name='r'><link/></robot>")
+    with pytest.raises(FormatError, match=r"urdf-usd-converter: .*name"):
+        convert_urdf(broken, tmp_path / "out")
