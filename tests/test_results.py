@@ -90,6 +90,13 @@ def test_the_page_of_results_has_the_tables_of_its_command():
     assert page["write_tables"](page["tables"](), text) == text
 
 
+def test_the_docs_have_the_table_of_the_stored_conformance(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    assert run_here("python benchmarks/conformance.py --report", monkeypatch) == 0
+    text = (ROOT / "docs" / "measurements.md").read_text("utf-8")
+    assert capsys.readouterr().out.rstrip() in "\n".join(map(str.rstrip, text.splitlines()))
+
+
 @pytest.mark.parametrize("page", ["differences.md", "training.md"])
 def test_the_docs_have_the_constants_of_the_stored_runs(page):
     stored = {}

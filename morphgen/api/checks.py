@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from morphgen import checks
 from morphgen.api.library import LibraryFolders, open_library
 from morphgen.checks import fix
-from morphgen.checks.conformance import ConformanceReport, conformance, robot_conformance
-from morphgen.formats.bundle import CARD, file_findings
+from morphgen.checks.conformance import ConformanceReport, conformance
+from morphgen.checks.hold import HoldRow, hold_files
+from morphgen.checks.home_pose import home_penetrations
+from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.urdf import UnsoundError
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import (
@@ -85,9 +90,11 @@ def bundle_of(source: RobotSource) -> Path | None:
 def conform(
     robot: RobotLike, *, samples: int = 100, seed: int = 0, library: LibraryFolders = ()
 ) -> ConformanceReport:
-    """Load a robot in every installed loader and compare joints, mass and tool pose.
+    """Compare a robot in every installed loader, and measure how it holds its home configuration.
 
-    The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio.
+    The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared in
+    joints, limits, couplings, damping, gains, mass and tool pose. The robot then holds its home
+    for 5 s: its MJCF in MuJoCo, its URDF in PyBullet, and in environments of both.
 
     Examples:
         >>> report = morphgen.conform("ur5-plane", samples=10)
@@ -95,6 +102,8 @@ def conform(
         True
         >>> report.rows[2].loader, report.rows[2].position_error < 1e-5
         ('mujoco (urdf)', True)
+        >>> report.holds[0].simulator, report.holds[0].drift < 0.02, dict(report.penetrations)
+        ('mujoco (mjcf)', True, {})
 
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``. The files
@@ -104,7 +113,7 @@ def conform(
         library: Folders of your own parts.
 
     Returns:
-        The report; ``rows`` has an entry for each loader.
+        The report; ``rows`` has an entry for each loader, ``holds`` one for each simulator.
 
     Raises:
         FormatError: If ``samples`` is below 1, ``seed`` is below 0, or the robot's name cannot be
@@ -112,7 +121,7 @@ def conform(
         MorphgenError: If the robot cannot be composed or read.
     """
     if isinstance(robot, Robot):
-        return robot_conformance(robot, samples, seed)
+        return _conform_robot(robot, samples, seed)
     return conform_source(find_robot(robot), open_library(library), samples=samples, seed=seed)
 
 
@@ -124,7 +133,7 @@ def conform_source(
     samples: int = 100,
     seed: int = 0,
 ) -> ConformanceReport:
-    """Compare the loaders on a bundle, or on a robot whose bundle is written for it.
+    """Compare loaders and simulators on a bundle, or on one written for it; see ``conform``.
 
     Args:
         source: The robot, as ``find_robots`` returns it.
@@ -137,5 +146,34 @@ def conform_source(
         MorphgenError: As ``read_source``.
     """
     if source.path is not None and (source.path / CARD).is_file():
-        return conformance(source.path, samples, seed)
-    return robot_conformance(read_source(source, library, root), samples, seed)
+        return _conform_bundle(source.path, samples, seed)
+    return _conform_robot(read_source(source, library, root), samples, seed)
+
+
+def _conform_robot(robot: Robot, samples: int, seed: int) -> ConformanceReport:
+    with TemporaryDirectory() as folder:
+        bundle = bundle_folder(Path(folder), robot.name)
+        write_bundle(robot, bundle, checks.check(robot), picture=False)
+        return _conform_bundle(bundle, samples, seed)
+
+
+def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
+    report, robot = conformance(bundle, samples, seed), read_bundle(bundle)
+    holds = (*hold_files(robot, bundle), *_hold_in_environments(robot))
+    return replace(
+        report,
+        passed=report.passed and all(row.passed is not False for row in holds),
+        holds=holds,
+        penetrations={
+            ", ".join(pair): depth for pair, depth in sorted(home_penetrations(robot).items())
+        },
+    )
+
+
+def _hold_in_environments(robot: Robot) -> tuple[HoldRow, ...]:
+    """Hold a robot in the simulators of the tasks, which are an extra."""
+    if find_spec("torch") is None:
+        return ()
+    from morphgen.tasks.hold_home import hold_in_environment
+
+    return tuple(hold_in_environment(robot, name) for name in ("mujoco", "pybullet"))

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from morphgen.checks import check
+from morphgen.checks.hold import HoldRow
+from morphgen.checks.joint_readings import compare_joints
 from morphgen.checks.readers import LOADERS, Loader
 from morphgen.errors import FormatError
-from morphgen.formats.bundle import bundle_folder, read_bundle, write_bundle
+from morphgen.formats.bundle import read_bundle
 from morphgen.formats.urdf_text import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot
@@ -47,6 +48,15 @@ class ConformanceRow:
     """Largest distance between the frame and morphgen's over all configurations [m]."""
     rotation_error: float | None = None
     """Largest angle between the frame and morphgen's over all configurations [rad]."""
+    limits: bool | None = None
+    """Whether position, effort and velocity limits agree; None, here and below, if the loader reads
+    no such values."""
+    mimic: bool | None = None
+    """Whether leader, multiplier and offset of mimic joints agree."""
+    damping: bool | None = None
+    """Whether damping and friction agree."""
+    gains: bool | None = None
+    """Whether gains and armature of the position actuators agree."""
     message: str = ""
     """Description of the disagreement, or ``not installed``."""
 
@@ -64,12 +74,21 @@ class ConformanceReport:
     seed: int
     """Seed of the configurations."""
     passed: bool
-    """Whether every installed loader agrees."""
+    """Whether every installed loader agrees and, if measured, the robot holds its home."""
     rows: tuple[ConformanceRow, ...]
+    """The loaders."""
+    holds: tuple[HoldRow, ...] = ()
+    """The simulators in which the robot holds its home configuration."""
+    penetrations: Mapping[str, float] = field(default_factory=dict)
+    """Depth of every pair of links, as ``a, b``, that penetrate at home [m]; ignored pairs are not
+    tested."""
 
 
 def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
     """Load a bundle in every loader and compare joints, total mass and tool pose.
+
+    The values of joints are compared as far as a loader reads them: position, effort and velocity
+    limits, couplings of mimic joints, damping and friction, and the gains of the MJCF's actuators.
 
     The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared with
     ``morphgen.model.kinematics``. Mimic joints are set like any other joint, except in yourdfpy,
@@ -84,18 +103,6 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
         FormatError: If ``bundle_dir`` is not a bundle, ``samples`` is below 1 or ``seed`` below 0.
     """
     return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
-
-
-def robot_conformance(robot: Robot, samples: int = 100, seed: int = 0) -> ConformanceReport:
-    """Write a robot's bundle to a temporary folder and compare its loaders; see ``conformance``.
-
-    Raises:
-        FormatError: If the robot's name cannot be that of a folder, or a bundle cannot hold it.
-    """
-    with TemporaryDirectory() as folder:
-        bundle = bundle_folder(Path(folder), robot.name)
-        write_bundle(robot, bundle, check(robot), picture=False)
-        return conformance(bundle, samples, seed)
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
@@ -145,6 +152,8 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
     slack = MASS_TOLERANCE * robot.mass + BOUND_MASS * (len(robot.links) + len(robot.frames))
     if abs(reading.mass - robot.mass) > slack:
         faults.append(f"weighs {reading.mass:.9g} kg, not {robot.mass:.9g} kg")
+    agreement = compare_joints(robot, reading)
+    faults += agreement.faults
     if position_error > POSITION_TOLERANCE:
         faults.append(f"{frame} is {position_error:.3g} m off")
     if rotation_error > ROTATION_TOLERANCE:
@@ -156,5 +165,9 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
         mass=reading.mass,
         position_error=position_error,
         rotation_error=rotation_error,
+        limits=agreement.limits,
+        mimic=agreement.mimic,
+        damping=agreement.damping,
+        gains=agreement.gains,
         message="; ".join(faults),
     )

@@ -17,7 +17,7 @@ from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Primitive, Sha
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.mesh import load_mesh
-from morphgen.model.robot import Link, Robot
+from morphgen.model.robot import Link, Pair, Robot
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -71,21 +71,8 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
 
 
 def check_self_collision(robot: Robot) -> Iterator[Finding]:
-    """Find pairs of links that penetrate each other at home.
-
-    Adjacent links, ``robot.ignore_pairs`` and unreadable shapes are left out. A robot without valid
-    joint axes and positions is not tested.
-    """
-    if not _has_home_pose(robot):
-        return
-
-    def with_valid_collisions(link: Link) -> Link:
-        valid = tuple(shape for shape in link.collisions if has_hull(shape.geometry))
-        return replace(link, collisions=valid)
-
-    testable = robot.with_links(map(with_valid_collisions, robot.links))
-    checker = SelfCollisionChecker(testable, untested_pairs(testable))
-    for (a, b), depth in sorted(next(checker.penetrations([robot.home])).items()):
+    """Find pairs of links that penetrate each other at home."""
+    for (a, b), depth in sorted(home_penetrations(robot).items()):
         yield Finding(
             "self-collision",
             "warning",
@@ -93,6 +80,25 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
             f"at home they penetrate each other by {1000 * depth:.3g} mm",
             "move home, or ignore the pair if the overlap is by design",
         )
+
+
+def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:
+    """Return the pairs of links that penetrate each other at home, with their depth [m].
+
+    Links that are nearer than ``margin`` [m] count, too, with a negative depth. Adjacent links,
+    ``robot.ignore_pairs`` and unreadable shapes are left out. A robot without valid joint axes and
+    positions is not tested.
+    """
+    if not _has_home_pose(robot):
+        return {}
+
+    def with_valid_collisions(link: Link) -> Link:
+        valid = tuple(shape for shape in link.collisions if has_hull(shape.geometry))
+        return replace(link, collisions=valid)
+
+    testable = robot.with_links(map(with_valid_collisions, robot.links))
+    checker = SelfCollisionChecker(testable, untested_pairs(testable), margin)
+    return next(checker.penetrations([robot.home]))
 
 
 def _has_home_pose(robot: Robot) -> bool:

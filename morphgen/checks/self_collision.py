@@ -43,13 +43,16 @@ shapes on parallel slides as they are. Even the largest offset is below ``PENETR
 class SelfCollisionChecker:
     """A robot's collision shapes, compiled once and tested at many configurations."""
 
-    def __init__(self, robot: Robot, ignore: Iterable[Pair] | None = None) -> None:
+    def __init__(
+        self, robot: Robot, ignore: Iterable[Pair] | None = None, margin: float = 0.0
+    ) -> None:
         """Compile the collision model.
 
         Args:
             robot: The robot.
             ignore: Pairs of links that are not tested; by default ``robot.ignore_pairs``. Links
                 joined by fixed joints are one MuJoCo body and never tested against each other.
+            margin: Links that are nearer than this count, too, with a negative depth [m].
 
         Raises:
             MeshError: If a collision mesh cannot be read.
@@ -59,6 +62,8 @@ class SelfCollisionChecker:
 
         self._robot = robot
         self._model = _compile(robot, robot.ignore_pairs if ignore is None else ignore)
+        self._model.geom_margin[:] = margin
+        self._limit = margin if margin > 0 else -PENETRATION
         self._data = mujoco.MjData(self._model)
         self._geom_links = [
             robot.links[int(self._model.body(i).name)].name
@@ -159,9 +164,9 @@ class SelfCollisionChecker:
             )
         contact = self._data.contact
         for (a, b), distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
-            if distance < -PENETRATION:
+            if distance < self._limit:
                 pair = sorted_pair(self._geom_links[a], self._geom_links[b])
-                depths[pair] = max(depths.get(pair, 0.0), -distance)
+                depths[pair] = max(depths.get(pair, -distance), -distance)
         return depths
 
     def _collide(self, positions: Array) -> None:

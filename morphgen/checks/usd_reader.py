@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from morphgen.checks.joint_readings import JointReading, Reading
 from morphgen.errors import FormatError
 from morphgen.formats.usd import convert_urdf
 from morphgen.model.geometry import Pose
 from morphgen.typing import Array
 
 
-def read_stage(
-    urdf: Path, frame: str, q: Mapping[str, Array], n: int
-) -> tuple[tuple[str, ...], float, Array]:
+def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
     """Convert a URDF to USD, open the stage and move its physics joints.
 
     The joints of ``UsdPhysics`` are followed from the root link to the frame, with the local poses
@@ -31,8 +31,7 @@ def read_stage(
         n: Number of configurations.
 
     Returns:
-        Names of the movable joints; total mass [kg]; poses of the frame in the root link, shape
-        (n, 4, 4).
+        The robot. Of its joints only the position limits are read: ``UsdPhysics`` has no others.
 
     Raises:
         FormatError: If the converter refuses the URDF, or the stage has no prim for the frame.
@@ -57,13 +56,23 @@ def read_stage(
             _poses(prim, joints, q, n) for prim in (links.GetChildren()[0], of_frame[0])
         )
         masses = [UsdPhysics.MassAPI(prim).GetMassAttr().Get() for prim in prims]
-        movable = tuple(
-            _name(joint.GetPrim())
+        movable = {
+            _name(joint.GetPrim()): JointReading(limits=_limits(joint.GetPrim()))
             for joint in joints.values()
             if not joint.GetPrim().IsA(UsdPhysics.FixedJoint)
-        )
+        }
     mass = float(sum(value for value in masses if value is not None))
-    return movable, mass, np.linalg.inv(T_world_root) @ T_world_frame
+    return Reading(movable, mass, np.linalg.inv(T_world_root) @ T_world_frame, mimics=None)
+
+
+def _limits(prim: Any) -> tuple[float, float]:  # noqa: ANN401
+    """Return the position limits of a joint [rad or m]."""
+    scale = 1.0 if prim.GetTypeName() == "PhysicsPrismaticJoint" else math.pi / 180
+    lower, upper = (prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
+    return (
+        -math.inf if lower is None else scale * lower,
+        math.inf if upper is None else scale * upper,
+    )
 
 
 def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401

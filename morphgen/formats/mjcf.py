@@ -23,8 +23,8 @@ from morphgen.model.robot import Joint, Link, Robot
 
 log_mujoco_warnings()
 
-TIMESTEP = 0.005
-"""Physics step of the written model [s]."""
+TIMESTEP = 0.002
+"""Physics step of the written model, MuJoCo's default [s]; environments set their own."""
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 """Geom groups; MuJoCo's viewers show groups 0 to 2."""
 _SITE_GROUP = 4

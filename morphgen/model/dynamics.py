@@ -11,6 +11,8 @@ from morphgen.model.kinematics import forward_kinematics, link_jacobians
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
+GRAVITY = 9.81
+"""Gravity along -z [m/s^2]."""
 BANDWIDTH = 30.0
 """Natural frequency of the position control [rad/s]."""
 MIN_RELATIVE_INERTIA = 0.05
@@ -75,6 +77,29 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
         M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
     matrix, _ = robot.mimic_map
     return np.asarray(matrix.T @ M @ matrix)
+
+
+def gravity_load(robot: Robot, q: ArrayLike) -> Array:
+    """Return the forces that hold the weight of an upright robot, the sum of J^T m g over links.
+
+    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.3.
+
+    Args:
+        robot: The robot, its root fixed in the world.
+        q: Independent joint positions, shape (dof,) [rad or m].
+
+    Returns:
+        Force of every movable joint, shape (n_movable,) [N m or N]; mimic joints have their own.
+    """
+    T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
+    J_root_link = link_jacobians(robot, T_root_link)
+    forces = np.zeros(len(robot.movable_joints))
+    for T, J, link in zip(T_root_link, J_root_link, robot.links, strict=True):
+        if link.inertial is not None:
+            com = T[:3, 3] + T[:3, :3] @ np.array(link.inertial.com)
+            rise = (J[:3] + np.cross(J[3:], com, axis=0))[2]
+            forces += link.inertial.mass * GRAVITY * rise
+    return forces
 
 
 def actuation(robot: Robot) -> tuple[Actuation, ...]:

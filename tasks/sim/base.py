@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
+from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own weight
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
@@ -19,8 +20,6 @@ SUBSTEPS = 4
 """Number of physics steps per control step."""
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
-GRAVITY = 9.81
-"""Gravity along -z [m/s^2]. Robots carry their own weight, as controllers of real arms ensure."""
 CollisionGeometry = Literal["primitive", "light", "convex"]
 """Collision shapes of simulated robots. ``primitive``: all primitives. ``light``: for each link the
 one that its token describes, which overlaps them most; fewer shapes take less time. ``convex``:

@@ -1,5 +1,6 @@
 """Conformance: all loaders agree on our bundles, and disagreements are reported."""
 
+import re
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -14,6 +15,8 @@ from morphgen.model.geometry import Capsule, Pose, Shape
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 
 LOADERS = ["yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio", "usd"]
+OF_ALL_VALUES = LOADERS[:-1]
+"""Loaders that read efforts, damping and friction."""
 
 
 def massless_tree():
@@ -159,3 +162,101 @@ def test_a_folder_that_is_not_a_bundle_is_an_error(tmp_path):
 def test_a_robot_without_movable_joints(tmp_path):
     robot = Robot("block", (rod("block"),), frames=(Frame("tool", "block", Pose((0, 0, 0.3))),))
     assert conformance(bundle(robot, tmp_path), samples=2).passed
+
+
+@pytest.mark.parametrize(
+    ("changes", "column", "message", "readers"),
+    [
+        ({"limits": (-2.0, 1.9)}, "limits", "upper limit 2, not 1.9", LOADERS),
+        ({"effort": 40.0}, "limits", "effort 50, not 40", OF_ALL_VALUES),
+        (
+            {"velocity": 3.0},
+            "limits",
+            "velocity 2, not 3",
+            ["yourdfpy", "pybullet", "pinocchio"],
+        ),
+        ({"damping": 0.5}, "damping", "damping 0, not 0.5", OF_ALL_VALUES),
+        ({"friction": 0.1}, "damping", "friction 0, not 0.1", OF_ALL_VALUES),
+    ],
+)
+def test_each_loader_that_reads_a_value_notices_another_one(
+    changes, column, message, readers, tmp_path
+):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    other = replace(robot, joints=(replace(robot.joints[0], **changes), *robot.joints[1:]))
+    for name, row in {row.loader: row for row in compare(other, folder, samples=2).rows}.items():
+        if row.passed is None:
+            continue
+        assert row.passed is (name not in readers)
+        if name in OF_ALL_VALUES or column == "limits":
+            assert getattr(row, column) is (name not in readers)
+        assert row.message == (f"joint shoulder: {message}" if name in readers else "")
+
+
+def test_values_of_joints_survive_in_every_loader(tmp_path):
+    robot = arm()
+    rough = replace(robot.joints[0], damping=0.3, friction=0.2)
+    report = conformance(bundle(replace(robot, joints=(rough, *robot.joints[1:])), tmp_path), 2)
+    assert report.passed
+    columns = {row.loader: (row.mimic, row.gains) for row in report.rows if row.passed is not None}
+    for name in ("pybullet", "usd"):
+        assert columns.pop(name, (None, None)) == (None, None)
+    assert columns.pop("mujoco (mjcf)") == (True, True)
+    assert set(columns.values()) == {(True, None)}
+
+
+def test_another_mimic_ratio_is_noticed(tmp_path):
+    robot = massless_tree()
+    folder = bundle(robot, tmp_path)
+    joints = tuple(
+        replace(joint, mimic=Mimic("swing", -0.4, 0.2)) if joint.mimic else joint
+        for joint in robot.joints
+    )
+    for name, row in rows_of(replace(robot, joints=joints), folder).items():
+        if name in OF_ALL_VALUES and name != "pybullet":
+            assert row.mimic is False
+            assert "joint follow: -0.5 swing +0.2, not -0.4 swing +0.2" in row.message
+
+
+def test_a_chain_of_mimic_joints_counts_as_its_product(tmp_path):
+    robot = massless_tree()
+    last = Joint(
+        "last", "revolute", "follower", "end", limits=(-9.0, 9.0), effort=1.0, velocity=1.0
+    )
+    chained = replace(last, mimic=Mimic("follow", 2.0, 0.1))
+    robot = replace(robot, links=(*robot.links, rod("end")), joints=(*robot.joints, chained))
+    folder = bundle(robot, tmp_path)
+    rows = {row.loader: row for row in conformance(folder, 2).rows}
+    assert all(rows[name].mimic for name in ("yourdfpy", "mujoco (urdf)", "mujoco (mjcf)"))
+    assert rows["pinocchio"].mimic is None  # it refuses chains
+    direct = replace(last, mimic=Mimic("swing", -1.0, 0.5))
+    same = replace(robot, joints=(*robot.joints[:-1], direct))
+    rows = {row.loader: row for row in compare(same, folder, 2).rows}
+    assert rows["mujoco (mjcf)"].mimic
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kp="', 'kp="1', "stiffness"),
+        ('kv="', 'kv="1', "derivative gain"),
+        ('<joint name="shoulder"', '<joint name="shoulder" armature="0.1"', "armature"),
+    ],
+)
+def test_other_gains_are_noticed(old, new, message, tmp_path):
+    folder = bundle(arm(), tmp_path)
+    text = (folder / "robot.xml").read_text()
+    (folder / "robot.xml").write_text(text.replace(old, new, 1))
+    row = next(row for row in conformance(folder, 2).rows if row.loader == "mujoco (mjcf)")
+    assert (row.passed, row.gains, row.limits) == (False, False, True)
+    assert row.message.startswith(f"joint shoulder: {message} ")
+
+
+def test_a_missing_actuator_is_noticed(tmp_path):
+    folder = bundle(arm(), tmp_path)
+    text = re.sub("<position [^>]*/>", "", (folder / "robot.xml").read_text(), count=1)
+    (folder / "robot.xml").write_text(re.sub(' ctrl="[^"]*"', "", text))
+    row = next(row for row in conformance(folder, 2).rows if row.loader == "mujoco (mjcf)")
+    assert row.gains is False
+    assert "joint shoulder: stiffness nan" in row.message

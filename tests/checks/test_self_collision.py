@@ -51,6 +51,14 @@ def chain(*links, kind="revolute"):
     return Robot("chain", links, joints, home=home)
 
 
+def test_a_margin_counts_gaps_as_negative_depths():
+    robot = slides(0.0, 0.1004)
+    (depths,) = SelfCollisionChecker(robot, margin=1e-3).penetrations([[0.0, 0.0]])
+    assert depths == {("ball0", "ball1"): pytest.approx(-4e-4, abs=1e-9)}
+    (depths,) = SelfCollisionChecker(robot, margin=3e-4).penetrations([[0.0, 0.0]])
+    assert depths == {}
+
+
 def test_depths_are_those_of_spheres():
     robot = slides(0.0, 0.3)
     depths = penetrations(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])

@@ -13,6 +13,7 @@ from morphgen.model.dynamics import (
     MIN_ROTATIONAL_INERTIA,
     MIN_SLIDING_MASS,
     actuation,
+    gravity_load,
     mass_matrix,
 )
 from morphgen.model.geometry import Pose
@@ -73,6 +74,21 @@ def test_mass_matrix_equals_that_of_mujoco(seed):
 
 def test_mass_matrix_of_a_robot_without_joints_is_empty():
     assert mass_matrix(Robot("block", (Link("block", Inertial(1.0)),)), ()).shape == (0, 0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_gravity_load_equals_that_of_mujoco(seed):
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng)
+    q = rng.normal(size=robot.dof)
+    model = to_spec(robot).compile()
+    data = mujoco.MjData(model)
+    joints = [model.joint(robot.joints[k].name) for k in robot.movable_joints]
+    for joint, value in zip(joints, movable_positions(robot, q), strict=True):
+        data.qpos[joint.qposadr[0]] = value
+    mujoco.mj_forward(model, data)  # at rest, the bias force is gravity's alone
+    expected = data.qfrc_bias[[joint.dofadr[0] for joint in joints]]
+    assert gravity_load(robot, q) == pytest.approx(expected, abs=1e-9)
 
 
 def test_gains_are_critically_damped():

@@ -1,0 +1,105 @@
+"""Robots hold their home configuration with the files of their bundle, or it is said why not."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from helpers.robots import arm
+from helpers.simulators import needs_pybullet
+from morphgen.checks import hold as module
+from morphgen.checks.hold import hold_files, overloads
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Inertial, Joint, Link, Robot
+
+
+def held(robot, tmp_path, edit=lambda mjcf: mjcf):
+    folder = write_bundle(robot, tmp_path / "bundle", picture=False)
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(edit(mjcf.read_text()))
+    return {row.simulator: row for row in hold_files(read_bundle(folder), folder)}
+
+
+def lever(effort):
+    """A bar of 2 kg whose centre of mass is 0.5 m beside its horizontal axis: 9.81 N m."""
+    inertial = Inertial(2.0, (0.5, 0.0, 0.0), (0.01, 0.0, 0.0, 0.05, 0.0, 0.05))
+    strength = {"limits": (-3.0, 3.0), "effort": effort, "velocity": 1.0}
+    joint = Joint("pivot", "revolute", "base", "bar", axis=(0, 1, 0), **strength)
+    return Robot("lever", (Link("base"), Link("bar", inertial)), (joint,), home=(0.0,))
+
+
+@needs_pybullet
+def test_an_arm_with_a_mimic_joint_holds_home(tmp_path):
+    rows = held(arm(), tmp_path)
+    assert list(rows) == ["mujoco (mjcf)", "pybullet (urdf)"]
+    assert all(row.passed and row.message == "" for row in rows.values())
+    assert rows["mujoco (mjcf)"].drift < 1e-6
+    assert rows["pybullet (urdf)"].drift < 1e-3
+
+
+@needs_pybullet
+@pytest.mark.parametrize(("effort", "holds"), [(9.0, False), (11.0, True)])
+def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path):
+    rows = held(lever(effort), tmp_path)
+    assert rows["mujoco (mjcf)"].passed  # compensates gravity without the motor
+    row = rows["pybullet (urdf)"]
+    assert (row.passed, row.joint) == (holds, "pivot")
+    if not holds:
+        assert row.drift > 0.5
+        cause = "pivot needs 9.81 N m to carry the weight, its effort is 9"
+        assert row.message.endswith(cause)
+        assert overloads(lever(effort)) == (cause,)
+
+
+def test_drift_is_the_distance_to_which_an_actuator_pulls(tmp_path):
+    def pull(mjcf):
+        (ctrl,) = re.findall(r' ctrl="([^"]*)"', mjcf)
+        first, *others = ctrl.split()
+        return mjcf.replace(ctrl, " ".join([str(float(first) + 0.05), *others]))
+
+    row = held(arm(), tmp_path, pull)["mujoco (mjcf)"]
+    assert (row.passed, row.joint) == (False, "shoulder")
+    assert row.drift == pytest.approx(0.05, rel=0.02)
+    assert row.message == f"shoulder moves {row.drift:.3g} rad"
+
+
+def test_a_model_that_diverges_is_reported(tmp_path):
+    def stiffen(mjcf):
+        actuator = r'kp="[^"]*" kv="[^"]*"( ctrlrange="[^"]*") forcerange="[^"]*"'
+        return re.sub(actuator, r'kp="1e12" kv="0"\1', mjcf)
+
+    row = held(arm(), tmp_path, stiffen)
+    assert row["mujoco (mjcf)"].passed is False
+    assert row["mujoco (mjcf)"].message == "diverged"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"home"', '"start"', "no keyframe 'home'"),
+        ('"elbow"', '"knee"', "lacks joints elbow"),
+        ("<worldbody>", "<nonsense>", "MuJoCo: "),
+    ],
+)
+def test_a_file_that_is_not_the_robots_fails(old, new, message, tmp_path):
+    row = held(arm(), tmp_path, lambda mjcf: mjcf.replace(old, new))["mujoco (mjcf)"]
+    assert (row.passed, row.drift) == (False, None)
+    assert row.message.startswith(message)
+
+
+def test_a_robot_without_joints_holds(tmp_path):
+    block = replace(arm().root, name="block")
+    row = held(Robot("block", (block,)), tmp_path)["mujoco (mjcf)"]
+    assert (row.passed, row.drift) == (True, 0.0)
+
+
+def test_a_missing_simulator_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    rows = held(arm(), tmp_path).values()
+    assert [(row.passed, row.message) for row in rows] == [(None, "not installed")] * 2
+
+
+def test_overloads_are_those_of_the_pose():
+    upright = replace(lever(9.0).joints[0], T_parent_joint=Pose.from_xyz_rpy(rpy=(1.5707963, 0, 0)))
+    assert overloads(replace(lever(9.0), joints=(upright,))) == ()
