@@ -47,6 +47,8 @@ OVERLOAD = "hand and arm are heavier than the effort limit of the source carries
 TOUCH = "links touch at home, and PyBullet enlarges meshes by 1 mm"
 MARGIN = "within PyBullet's collision margin"
 """Part of the message of links that touch; see ``morphgen.tasks.hold_home``."""
+SOLVER = "PyBullet's solver has not converged; the robot holds with more iterations"
+HOLDS = "solver iterations"
 CARRY = "to carry the weight"
 """Part of the message of a motor that is too weak; see ``morphgen.checks.hold.overloads``."""
 COMPOSED = "arm x end-effector"
@@ -107,7 +109,7 @@ class Row:
         misfit = MISFIT if self._is_misfit else ""
         if self.penetrations:
             causes["penetrations"] = misfit
-        overload = OVERLOAD if CARRY in self.moving else ""
+        overload = OVERLOAD if CARRY in self.moving else SOLVER if HOLDS in self.moving else ""
         touch = TOUCH if MARGIN in self.moving else ""
         known = {"mjcf": misfit, "urdf": overload, "mujoco": misfit, "pybullet": misfit or touch}
         for column, cause in known.items():
