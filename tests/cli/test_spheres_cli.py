@@ -118,7 +118,7 @@ def test_compose_gives_all_links_spheres(run, tmp_path):
         (
             ("export", "--format", "glb", "--spheres", "4"),
             "--spheres has no effect on --format glb; expected --format srdf, urdf, mjcf, sdf, "
-            "curobo or ros2",
+            "curobo, usd or ros2",
         ),
     ],
 )

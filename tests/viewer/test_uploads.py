@@ -280,7 +280,8 @@ def test_uploaded_bundle_keeps_tool_and_home(access, tmp_path, as_zip, pairs):
 def test_link_named_tool_is_the_tool_frame(access):
     text = b"""<robot name="r"><link name="a"/><link name="tool"/><joint name="j" type="fixed">
     <parent link="a"/><child link="tool"/></joint></robot>"""
-    assert read_robot_uri(store_upload("a.urdf", text, access), access).frame("tool").link == "tool"
+    robot = read_robot_uri(store_upload("a.urdf", text, access), access)
+    assert robot.frame("tool").link == "tool_link"
 
 
 def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
