@@ -202,7 +202,7 @@ def test_conform_prints_json_and_nothing_else(tmp_path):
     out, err = process.communicate()
     assert (process.returncode, err) == (0, "")
     (report,) = json.loads(out)
-    assert (report["robot"], report["passed"], len(report["rows"])) == ("arm", True, 5)
+    assert (report["robot"], report["passed"], len(report["rows"])) == ("arm", True, 6)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -18,7 +18,7 @@ COMMANDS = {
     "sample": ["sample", "chain", "-n", 40, "--jobs", 2, "--light", "--out", "out"],
     "train": [
         *["train", "planar-cube", "task=reach", "--agent", "me-mlp", "--envs", 4, "--steps", 2048],
-        *["--workers", 2, "--out", "out"],
+        *["--sim", "pybullet", "--workers", 2, "--out", "out"],
     ],
     "goals": ["goals", "split.yaml", "--jobs", 2],
     "split": [
@@ -35,7 +35,7 @@ PATIENCE = 120.0
 @pytest.mark.parametrize("later", [0.0, 0.3])
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=needs_pybullet if n == "eval" else []) for n in COMMANDS],
+    [pytest.param(n, marks=needs_pybullet if "pybullet" in COMMANDS[n] else []) for n in COMMANDS],
 )
 def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
     check(tmp_path, name, later)
