@@ -116,7 +116,7 @@ def _import_several(args: argparse.Namespace) -> int:
 def _import(description: NamedDescription, name: str | None, args: argparse.Namespace) -> int:
     """Import a robot, write its bundle and, if asked for, its manifest; return the exit code."""
     from morphgen.formats.bundle import URDF, bundle_folder
-    from morphgen.grammar.imported_part import require_part, write_part
+    from morphgen.grammar.imported_part import part_manifest, write_part
     from morphgen.grammar.robot_source import import_robot
 
     pairs = [entry.partition("=") for entry in args.arg]
@@ -137,12 +137,13 @@ def _import(description: NamedDescription, name: str | None, args: argparse.Name
             name=name,
             repair=not args.as_is,
         )
-    if args.part:
-        require_part(robot)
-    code = write_and_report(robot, args)
-    if args.part:
+    part = None
+    if args.part:  # refuses before the bundle is replaced
         urdf = bundle_folder(args.out, robot.name) / URDF
-        path = write_part(robot, urdf, args.part, args.parts or _PARTS, licence)
+        part = part_manifest(robot, urdf, args.part, args.parts or _PARTS, licence)
+    code = write_and_report(robot, args)
+    if part is not None:
+        write_part(*part)
         if not args.json:
-            print(path)
+            print(part[0])
     return code

@@ -34,27 +34,10 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Names that derivations and grammars can hold."""
 
 
-def require_part(robot: Robot) -> None:
-    """Require what a part needs of a robot: a name that derivations can hold, and a tool.
-
-    Raises:
-        CompositionError: If it has no frame ``tool``.
-        FormatError: If it has another name.
-    """
-    if not _NAME.fullmatch(robot.name):
-        raise FormatError(
-            f"name {robot.name!r} of a part: expected letters, digits and underscores, no digit "
-            "first; choose one by --name"
-        )
-    if all(frame.name != TOOL for frame in robot.frames):
-        raise CompositionError(
-            f"robot {robot.name!r} has no frame {TOOL!r}, which is the flange or the tool of a "
-            "part; name its link by --tool"
-        )
-
-
-def write_part(robot: Robot, description: Path, kind: str, folder: Path, licence: str) -> Path:
-    """Write the manifest of a part, and return its path.
+def part_manifest(
+    robot: Robot, description: Path, kind: str, folder: Path, licence: str
+) -> tuple[Path, str]:
+    """Return the path of a part's manifest and its text, before anything is written.
 
     The frame ``tool`` of the robot becomes the port ``flange`` of an arm, and the tool of an
     end-effector or a body. The part has the robot's home.
@@ -67,11 +50,20 @@ def write_part(robot: Robot, description: Path, kind: str, folder: Path, licence
         licence: Licence of the robot.
 
     Raises:
-        CompositionError: As ``require_part``, or if the robot cannot be a part.
-        FormatError: As ``require_part``, or if the manifest exists with other content, or cannot
-            be written.
+        CompositionError: If the robot has no frame ``tool``.
+        FormatError: If derivations cannot hold its name, ``folder`` is a file, or the manifest
+            exists with other content.
     """
-    require_part(robot)
+    if not _NAME.fullmatch(robot.name):
+        raise FormatError(
+            f"name {robot.name!r} of a part: expected letters, digits and underscores, no digit "
+            "first; choose one by --name"
+        )
+    if all(frame.name != TOOL for frame in robot.frames):
+        raise CompositionError(
+            f"robot {robot.name!r} has no frame {TOOL!r}, which is the flange or the tool of a "
+            "part; name its link by --tool"
+        )
     tool = robot.frame(TOOL)
     pose = tool.T_link_frame
     frame = {"link": tool.link, "xyz": list(pose.position), "rpy": list(pose.rpy)}
@@ -89,13 +81,28 @@ def write_part(robot: Robot, description: Path, kind: str, folder: Path, licence
     }
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     path = folder / f"{robot.name}.yaml"
-    if path.exists() and path.read_text("utf-8") != text:
+    if folder.exists() and not folder.is_dir():
+        raise FormatError(f"{folder} is not a folder; choose another --parts")
+    if path.exists() and path.read_bytes() != text.encode():
         raise FormatError(f"{path} exists; move it away, or choose another --name or --parts")
-    folder.mkdir(parents=True, exist_ok=True)
+    return path, text
+
+
+def write_part(path: Path, text: str) -> None:
+    """Write the manifest of a part whose bundle is written.
+
+    Args:
+        path: Path of ``part_manifest``.
+        text: Text of ``part_manifest``.
+
+    Raises:
+        FormatError: If the manifest cannot be written.
+        MorphgenError: If the robot cannot be a part.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, text)
     try:
         load_part(read_manifest(path))
     except MorphgenError:
         path.unlink()
         raise
-    return path

@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import morphgen
+from helpers.commands import tree
 from helpers.mjcf import TWO_JOINTS, write
 from morphgen.formats.named_descriptions import find_description
 
@@ -34,9 +35,13 @@ def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
     assert alone.frame("tool").T_link_frame.position == (0.0, 0.0, 0.2)
     stick = robot.joints[robot.parents.index(robot.link_index["arm_right"]) - 1]
     assert stick.T_parent_joint.rpy == pytest.approx((0, 1.5707963, 0), abs=1e-6)
-    (tmp_path / "parts" / "my_arm.yaml").write_text("# mine")
-    assert run(*words, "--no-picture", "--out", "imported")[0] == 2
-    assert (tmp_path / "parts" / "my_arm.yaml").read_text() == "# mine"
+    (tmp_path / "parts" / "my_arm.yaml").write_bytes(b"# mine \xff")
+    write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.18"), "my_arm.xml")
+    before = tree(tmp_path)
+    for folder in ("parts", "my_arm.xml"):
+        again = (*words, "--parts", folder, "--no-picture", "--out", "imported")
+        assert run(*again)[0] == 2
+    assert tree(tmp_path) == before
 
 
 def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
