@@ -52,7 +52,7 @@ def robot_srdf_text(
         MeshError: If a collision mesh cannot be read.
         RobotError: As ``collision_matrix``.
     """
-    _require_tool(robot)
+    require_tool(robot)
     matrix = collision_matrix(robot, samples=samples, seed=seed)
     srdf = replace(robot_srdf(robot, matrix), link_spheres=spheres)
     return srdf_text(srdf, matrix_evidence(matrix))
@@ -73,7 +73,7 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
     Raises:
         FormatError: If the robot has no frame ``tool``.
     """
-    _require_tool(robot)
+    require_tool(robot)
     groups: list[Group] = []
     end_effectors = []
     for limb in _limbs(robot):
@@ -93,11 +93,16 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
     )
 
 
-def _require_tool(robot: Robot) -> None:
+def require_tool(robot: Robot) -> None:
+    """Require that a robot has the frame ``tool``, which an SRDF and planners need.
+
+    Raises:
+        FormatError: If it has no such frame.
+    """
     if all(frame.name != TOOL for frame in robot.frames):
         raise FormatError(
-            f"robot {robot.name!r} has no frame {TOOL!r}, where the chain of its arm ends; import "
-            "it with a tool (morphgen import FILE --tool LINK)"
+            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
+            "tool (morphgen import FILE --tool LINK)"
         )
 
 

@@ -99,9 +99,10 @@ def _with_spheres(robot: Robot, settings: ExportSettings) -> Robot:
 
 
 def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
-    from morphgen.checks.robot_srdf import robot_srdf_text
+    from morphgen.checks.robot_srdf import require_tool, robot_srdf_text
     from morphgen.fitting.sphere_robot import link_spheres
 
+    require_tool(robot)
     # The pairs are those of the robot's own shapes, which planners may test, too.
     spheres = link_spheres(_with_spheres(robot, settings))
     text = robot_srdf_text(robot, samples=settings.samples, seed=settings.seed, spheres=spheres)
@@ -110,11 +111,12 @@ def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
 
 def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.collision_matrix import collision_matrix
-    from morphgen.checks.robot_srdf import matrix_evidence
+    from morphgen.checks.robot_srdf import matrix_evidence, require_tool
     from morphgen.fitting.sphere_robot import SPHERES, link_spheres
     from morphgen.formats.bundle import URDF
     from morphgen.formats.curobo import CONFIG, curobo_text
 
+    require_tool(robot)
     if settings.spheres is None:
         settings = replace(settings, spheres=SPHERES)
     robot = _with_spheres(robot, settings)
@@ -171,10 +173,11 @@ def _usd(robot: Robot, folder: Path, settings: ExportSettings) -> None:
 
 
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-    from morphgen.checks.robot_srdf import robot_srdf_text
+    from morphgen.checks.robot_srdf import require_tool, robot_srdf_text
     from morphgen.fitting.sphere_robot import link_spheres
     from morphgen.formats.ros_package import write_ros_package
 
+    require_tool(robot)
     robot = _with_spheres(robot, settings)
     srdf = robot_srdf_text(
         robot, samples=settings.samples, seed=settings.seed, spheres=link_spheres(robot)

@@ -10,6 +10,7 @@ from helpers.robots import arm
 from morphgen.checks.collision_matrix import MATRIX_SAMPLES
 from morphgen.checks.robot_srdf import robot_srdf_text
 from morphgen.cli.export_formats import SAMPLES
+from morphgen.fitting import sphere_robot
 from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.export_folder import MANIFEST
 from morphgen.formats.srdf_reader import read_srdf
@@ -141,10 +142,12 @@ def test_default_number_of_samples_is_that_of_the_matrix():
     assert SAMPLES == MATRIX_SAMPLES
 
 
-@pytest.mark.parametrize("name", ["srdf", "ros2"])
-def test_failed_export_leaves_nothing(run, tmp_path, name):
+@pytest.mark.parametrize("name", ["srdf", "ros2", "curobo"])
+def test_export_without_a_tool_is_refused_before_the_fit(run, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(sphere_robot, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
     bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)
-    code, _, err = run("export", bundle, "--format", name, "--out", tmp_path)
+    words = ("--format", name, "--spheres", "2", "--out", tmp_path)
+    code, _, err = run("export", bundle, *words)
     assert code == 2
     assert "robot 'arm' has no frame 'tool'" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
