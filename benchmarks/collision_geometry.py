@@ -136,7 +136,9 @@ class Row:
 
 def main() -> int:
     """Measure the forms that have no row yet, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--steps", type=int, default=4000, help="steps of a block")
     parser.add_argument("--blocks", type=int, default=7)

@@ -31,7 +31,9 @@ PAPER_ARMS = ("ur5", "panda", "kinova_gen3", "jaco2", "xarm7", "lwr", "yumi_righ
 def main() -> int:
     """Run all combinations."""
     library = default_library()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--arms", type=_names, default=list(PAPER_ARMS))
     parser.add_argument("--ees", type=_names, default=library.names("ee"))
     parser.add_argument("--samples", type=int, default=100)

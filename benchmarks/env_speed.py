@@ -97,7 +97,9 @@ class Row:
 
 def main() -> int:
     """Measure all rows and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--envs", type=int, default=128)
     parser.add_argument("--seconds", type=float, default=4.0, help="of every row in every round")
     parser.add_argument("--rounds", type=int, default=3)

@@ -122,7 +122,9 @@ class Ceiling:
 
 def main() -> int:
     """Search all links and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="parts of arm/link, separated by commas")
     parser.add_argument("--starts", type=int, default=300, help="of each kind")
     parser.add_argument("--jobs", type=int, default=1)

@@ -90,7 +90,9 @@ class Task:
 
 def main() -> int:
     """Measure all links and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="arms, separated by commas")
     parser.add_argument("--solid", default="link", help=f"of {', '.join(SOLIDS)}; by commas")
     parser.add_argument("--jobs", type=int, default=1)

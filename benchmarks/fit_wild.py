@@ -40,7 +40,9 @@ Row = tuple[str, str, float, float, int, float, float, float]
 
 def main() -> int:
     """Fit all links and print the summary."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="parts of file names, separated by commas")
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()

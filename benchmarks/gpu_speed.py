@@ -57,7 +57,9 @@ Row = dict[str, str | int | float]
 
 def main() -> int:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("physics", "training", "robots", "copies"))
     parser.add_argument("--splits", nargs="+", default=SPLITS)
     parser.add_argument("--split", default=SPLITS[0])

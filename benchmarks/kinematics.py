@@ -43,7 +43,9 @@ Rows = dict[tuple[str, str], Call]
 
 def main() -> int:
     """Measure all rows and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--robot", default="arm=ur5 ee=plane")
     parser.add_argument("--n", type=int, default=1024)
     parser.add_argument("--rounds", type=int, default=15)

@@ -77,7 +77,9 @@ ROBOTS, OBSTACLES = 10, 3
 
 def main() -> int:
     """Measure all rows and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     cores = os.cpu_count() or 1
     parser.add_argument("--robot", default="ur5-plane")
     parser.add_argument("--envs", type=int, default=64)

@@ -81,7 +81,9 @@ class Measuring:
 
 def main() -> int:
     """Measure all robots and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--only", default="", help="robots whose name matches this expression")
     parser.add_argument("--envs", type=int, default=8)

@@ -175,7 +175,9 @@ def table(name: str, args: argparse.Namespace) -> str:
 
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Return the options of the command line, or of other words."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--robots", type=int, nargs="+", default=[10, 30, 100, 300, 1000])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])

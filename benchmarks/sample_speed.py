@@ -58,7 +58,9 @@ class Run:
 
 def main() -> int:
     """Measure the runs and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--grammar", default="arm3")
     parser.add_argument("--n", type=int, default=2000)
     args = parser.parse_args()

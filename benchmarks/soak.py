@@ -35,7 +35,9 @@ GROWTH = 1.05
 
 def main() -> int:
     """Step and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("split", nargs="?", default="extrapolation/arms/reach")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--envs", type=int, default=40)

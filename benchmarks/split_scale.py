@@ -39,7 +39,9 @@ MIB = 2**20
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train", default="10,100,1000", help="robots to train on, ascending")
     parser.add_argument("--test", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)

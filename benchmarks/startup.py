@@ -32,7 +32,9 @@ COMMANDS = {
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     times = [{name: _time(words) for name, words in COMMANDS.items()} for _ in range(args.repeats)]

@@ -28,7 +28,9 @@ from morphgen.fitting.token_shapes import token_shapes
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--grammar", default="arm5")
     parser.add_argument("--n", type=int, default=12, help="number of robots")
     args = parser.parse_args()

@@ -45,7 +45,9 @@ Row = tuple[float, int, int, int, int, int]
 
 def main() -> int:
     """Use the viewer and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--robots", type=int, default=100)
     args = parser.parse_args()

@@ -105,7 +105,9 @@ Row = tuple[str, str]
 
 def main() -> int:
     """Measure all pages and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--many", type=int, default=500)
     parser.add_argument("--moves", type=int, default=200)

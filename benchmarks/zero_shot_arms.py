@@ -81,7 +81,9 @@ class Measuring:
 
 def main() -> None:
     """Measure all robots and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", default="reach")
     parser.add_argument("--goal", choices=GOAL_KINDS, default=GOAL_KINDS[0])
     parser.add_argument("--policy", help="a checkpoint, or a policy that comes with morphgen")

@@ -20,7 +20,9 @@ WIDTH = 1280
 
 def main() -> None:
     """Read the film and write the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("film", type=Path)
     parser.add_argument("picture", type=Path)
     parser.add_argument("--frames", type=int, default=6)

@@ -53,7 +53,9 @@ COLOURS: tuple[Rgba, ...] = (
 
 def main() -> int:
     """Draw the pictures and print their paths."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "fit")
     parser.add_argument("--spheres", type=int, help="spheres per link, in place of primitives")

@@ -69,7 +69,9 @@ def draw(kind: str, name: str) -> None:
 
 def main() -> None:
     """Draw the pictures that are named or missing, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="*", metavar="PART")
     names = parser.parse_args().parts
     parts = {str(row["name"]): kind for kind in KINDS for row in shown_parts(kind)}

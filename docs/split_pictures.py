@@ -29,7 +29,9 @@ from morphgen.grammar.library import default_library
 
 def main() -> int:
     """Compute the similarities and draw them."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--measure", default="tree", choices=sorted(MEASURES))
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "images" / "splits", help="folder"

@@ -26,7 +26,9 @@ SIZE = (320, 240)
 
 def main() -> int:
     """Draw the pictures of all tasks."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=2)
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "images" / "tasks", help="folder"

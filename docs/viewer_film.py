@@ -36,7 +36,9 @@ OUT = Path(__file__).parent / "images" / "viewer" / "workflow.gif"
 
 def main() -> int:
     """Write the film."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=OUT, help=".gif or .mp4")
     out = parser.parse_args().out.resolve()
     with served(24) as address, started_browser() as browser:

@@ -63,7 +63,9 @@ IMAGES = Path(__file__).parent / "images" / "viewer"
 
 def main() -> int:
     """Take the pictures of the named pages, or all."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("pages", nargs="*", metavar="PAGE", help=", ".join(PAGES))
     parser.add_argument("--out", type=Path, default=Path("build/viewer"), help="folder")
     args = parser.parse_args()

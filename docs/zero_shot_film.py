@@ -38,7 +38,9 @@ REST = 25
 
 def main() -> int:
     """Run the episodes and write the film."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
     parser.add_argument("--task", choices=("reach", "push"), default="reach")
     parser.add_argument("--seed", type=int, default=3)

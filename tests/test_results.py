@@ -125,6 +125,7 @@ def test_the_docs_have_the_constants_of_the_stored_runs(page):
 DIFFICULTY = re.findall(
     r"(?m)^morphgen split difficulty .*$", (ROOT / "results/README.md").read_text("utf-8")
 )
+DIFFICULTY_FILES = sorted((ROOT / "results/difficulty").iterdir())
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,7 @@ def test_difficulty_of_robots_is_what_its_command_writes(command, tmp_path, monk
 def test_difficulty_has_every_robot_of_the_shipped_splits():
     rows = [
         (row["split"], row["side"], row["robot"])
-        for path in (ROOT / "results/difficulty").iterdir()
+        for path in DIFFICULTY_FILES
         for row in csv.DictReader(path.read_text("utf-8").splitlines())
     ]
     shipped = [
@@ -149,3 +150,5 @@ def test_difficulty_has_every_robot_of_the_shipped_splits():
         for side, member in sided_members(read_split(name))
     ]
     assert sorted(rows) == sorted(shipped)
+    written = {shlex.split(command)[-1] for command in DIFFICULTY}
+    assert written == {f"results/difficulty/{path.name}" for path in DIFFICULTY_FILES}

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from morphgen.checks.collision_matrix import MATRIX_SAMPLES, CollisionMatrix, collision_matrix
 from morphgen.checks.self_collision import ALWAYS_SHARE
-from morphgen.errors import FormatError
 from morphgen.formats.srdf import (
     Chain,
     EndEffector,
@@ -16,8 +15,10 @@ from morphgen.formats.srdf import (
     LinkPair,
     LinkSpheres,
     Srdf,
+    require_tool,
     srdf_text,
 )
+from morphgen.model.geometry import Mesh
 from morphgen.model.robot import TOOL, Frame, Robot
 
 HOME = "home"
@@ -55,7 +56,7 @@ def robot_srdf_text(
     require_tool(robot)
     matrix = collision_matrix(robot, samples=samples, seed=seed)
     srdf = replace(robot_srdf(robot, matrix), link_spheres=spheres)
-    return srdf_text(srdf, matrix_evidence(matrix))
+    return srdf_text(srdf, matrix_evidence(robot, matrix))
 
 
 def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
@@ -93,28 +94,18 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
     )
 
 
-def require_tool(robot: Robot) -> None:
-    """Require that a robot has the frame ``tool``, which an SRDF and planners need.
-
-    Raises:
-        FormatError: If it has no such frame.
-    """
-    if all(frame.name != TOOL for frame in robot.frames):
-        raise FormatError(
-            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
-            "tool (morphgen import FILE --tool LINK)"
-        )
-
-
-def matrix_evidence(matrix: CollisionMatrix) -> str:
+def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
     """Return sentences about how pairs that need no test were found, and how many."""
     counts = ", ".join(f"{count} {reason}" for reason, count in matrix.counts.items())
+    shapes = (shape.geometry for link in robot.links for shape in link.collisions)
+    has_mesh = any(isinstance(shape, Mesh) for shape in shapes)
     return (
         f"{matrix.num_pairs} pairs of links with collision shapes, "
         f"{matrix.samples} configurations sampled with seed {matrix.seed}. Disabled: {counts}. "
         f"Always: in collision in at least {ALWAYS_SHARE:.0%} of the configurations. "
-        "Never: in collision in none of them. User: ignored by the robot for another reason. "
-        "Meshes count as their convex hulls."
+        "Never: in collision in none of them. User: ignored by the robot for another reason."
+        + " Meshes count as their convex hulls."
+        * has_mesh
     )
 
 

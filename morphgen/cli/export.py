@@ -88,7 +88,8 @@ def export(args: argparse.Namespace) -> None:
     settings = _settings(args)
     sources, library = opt.sources_of(args), opt.library_of(args)
     if args.out is not None and not args.out.is_dir():
-        raise FormatError(f"--out {args.out}: no such folder; create it first")
+        problem = "is no folder" if args.out.exists() else "no such folder; create it first"
+        raise FormatError(f"--out {args.out}: {problem}")
     paths: list[Path] = []
     for source in track(sources, args, "exporting", "robot", len(sources)):
         robot = read_source(source, library, args.root)

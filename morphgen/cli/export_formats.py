@@ -99,8 +99,9 @@ def _with_spheres(robot: Robot, settings: ExportSettings) -> Robot:
 
 
 def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
-    from morphgen.checks.robot_srdf import require_tool, robot_srdf_text
+    from morphgen.checks.robot_srdf import robot_srdf_text
     from morphgen.fitting.sphere_robot import link_spheres
+    from morphgen.formats.srdf import require_tool
 
     require_tool(robot)
     # The pairs are those of the robot's own shapes, which planners may test, too.
@@ -111,10 +112,11 @@ def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
 
 def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.collision_matrix import collision_matrix
-    from morphgen.checks.robot_srdf import matrix_evidence, require_tool
+    from morphgen.checks.robot_srdf import matrix_evidence
     from morphgen.fitting.sphere_robot import SPHERES, link_spheres
     from morphgen.formats.bundle import URDF
     from morphgen.formats.curobo import CONFIG, curobo_text
+    from morphgen.formats.srdf import require_tool
 
     require_tool(robot)
     if settings.spheres is None:
@@ -122,7 +124,7 @@ def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     robot = _with_spheres(robot, settings)
     matrix = collision_matrix(robot, samples=settings.samples, seed=settings.seed)
     spheres = link_spheres(robot)
-    text = curobo_text(robot, spheres, matrix.reasons, URDF, matrix_evidence(matrix))
+    text = curobo_text(robot, spheres, matrix.reasons, URDF, matrix_evidence(robot, matrix))
     _with_meshes(_urdf)(robot, folder, replace(settings, spheres=None))
     (folder / CONFIG).write_text(text, encoding="utf-8")
 
@@ -173,9 +175,10 @@ def _usd(robot: Robot, folder: Path, settings: ExportSettings) -> None:
 
 
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-    from morphgen.checks.robot_srdf import require_tool, robot_srdf_text
+    from morphgen.checks.robot_srdf import robot_srdf_text
     from morphgen.fitting.sphere_robot import link_spheres
     from morphgen.formats.ros_package import write_ros_package
+    from morphgen.formats.srdf import require_tool
 
     require_tool(robot)
     robot = _with_spheres(robot, settings)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import yaml
 
 from morphgen.errors import FormatError
-from morphgen.formats.srdf import LinkSpheres
+from morphgen.formats.srdf import LinkSpheres, require_tool
 from morphgen.model.robot import TOOL, Pair, Robot
 
 CONFIG = "robot.yml"
@@ -40,21 +40,17 @@ def curobo_text(
     Raises:
         FormatError: If the robot has no frame ``tool``, or no spheres.
     """
-    frames = [frame.name for frame in robot.frames]
+    require_tool(robot)
     # "tool" of a robot with several limbs is the tool of the last one.
-    tools = [name for name in frames if name.endswith(f"_{TOOL}")] or [TOOL]
-    if TOOL not in frames:
-        raise FormatError(
-            f"robot {robot.name!r} has no frame {TOOL!r}, whose pose cuRobo plans; import it with "
-            "a tool (morphgen import FILE --tool LINK)"
-        )
+    names = (frame.name for frame in robot.frames)
+    tools = [name for name in names if name.endswith(f"_{TOOL}")] or [TOOL]
     if not spheres:
         raise FormatError(f"robot {robot.name!r} has no link with spheres")
-    names = [link.link for link in spheres]
+    links = [link.link for link in spheres]
     joints = [robot.joints[k].name for k in robot.independent_joints]
     ignore = defaultdict(list)
     for a, b in sorted(ignored):
-        if a in names and b in names:
+        if a in links and b in links:
             ignore[a].append(b)
     kinematics = {
         "format_version": FORMAT_VERSION,
@@ -62,7 +58,7 @@ def curobo_text(
         "asset_root_path": "",
         "base_link": robot.root.name,
         "tool_frames": tools,
-        "collision_link_names": names,
+        "collision_link_names": links,
         "collision_spheres": {
             link.link: [
                 {"center": list(sphere.center), "radius": sphere.radius} for sphere in link.spheres
@@ -71,7 +67,7 @@ def curobo_text(
         },
         "collision_sphere_buffer": 0.0,
         "self_collision_ignore": dict(ignore),
-        "self_collision_buffer": dict.fromkeys(names, 0.0),
+        "self_collision_buffer": dict.fromkeys(links, 0.0),
         "mesh_link_names": [link.name for link in robot.links if link.visuals],
         "cspace": {
             "joint_names": joints,

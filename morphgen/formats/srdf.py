@@ -13,7 +13,7 @@ from lxml import etree
 
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.urdf_schema import shortened
-from morphgen.model.robot import Pair, Robot, sorted_pair
+from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 
 
@@ -153,6 +153,19 @@ FLAT_ELEMENTS: dict[str, tuple[str, type[FlatElement]]] = {
 element's attributes; those with a default may be missing."""
 GROUP, STATE, SPHERES = "group", "group_state", "link_sphere_approximation"
 """Elements with children."""
+
+
+def require_tool(robot: Robot) -> None:
+    """Require that a robot has the frame ``tool``, which an SRDF and planners need.
+
+    Raises:
+        FormatError: If it has no such frame.
+    """
+    if all(frame.name != TOOL for frame in robot.frames):
+        raise FormatError(
+            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
+            "tool (morphgen import FILE --tool LINK)"
+        )
 
 
 def srdf_text(srdf: Srdf, evidence: str = "") -> str:

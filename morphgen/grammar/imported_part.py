@@ -66,7 +66,9 @@ def part_manifest(
         )
     tool = robot.frame(TOOL)
     pose = tool.T_link_frame
-    frame = {"link": tool.link, "xyz": list(pose.position), "rpy": list(pose.rpy)}
+    # Adding zero turns -0.0 into 0.0.
+    xyz, rpy = ([value + 0.0 for value in values] for values in (pose.position, pose.rpy))
+    frame = {"link": tool.link, "xyz": xyz, "rpy": rpy}
     joints = [robot.joints[k].name for k in robot.independent_joints]
     content = {
         "name": robot.name,

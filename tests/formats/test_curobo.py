@@ -93,7 +93,7 @@ def test_every_tool_of_several_limbs_is_a_tool_frame():
 
 
 def test_robots_without_tool_or_spheres_are_refused():
-    with pytest.raises(FormatError, match="no frame 'tool', whose pose cuRobo plans"):
+    with pytest.raises(FormatError, match="no frame 'tool', where its arm ends"):
         read(with_balls(replace(arm(), frames=())))
     with pytest.raises(FormatError, match="no link with spheres"):
         read(arm())
