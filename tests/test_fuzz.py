@@ -53,6 +53,7 @@ MODEL = """<mujoco model="m">
       <geom type="box" size="0.1 0.2 0.3" material="grey"/><site name="tool" pos="0 0 1"/>
       <body name="tip" pos="0 0 0.3" euler="0 1.57 0" childclass="c">
         <joint name="turn" axis="0 0 1" range="-1 1" ref="0.1" pos="0 0.1 0"/><geom/>
+        <geom type="mesh" mesh="cut" mass="1"/><geom type="ellipsoid" size="0.1 0.2 0.3"/>
         <body name="nail"><joint name="slide" type="slide" range="0 0.1"/><geom mass="1"/></body>
       </body>
     </body>

@@ -29,7 +29,7 @@ def show(session: Session) -> None:
     header = INTRODUCTION + section_links(library_sections(session.files))
     panel = open_panels(gallery, "", header)
     upload = session.client.gui.add_upload_button(
-        "Open a URDF or a zipped bundle", icon=viser.Icon.UPLOAD
+        "Open a URDF, an MJCF or a zip", icon=viser.Icon.UPLOAD
     )
 
     async def uploaded(event: viser.GuiEvent[viser.GuiUploadButtonHandle]) -> None:

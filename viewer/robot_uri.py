@@ -26,12 +26,16 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
+from platformdirs import user_cache_path
+
 from morphgen.benchmark.split import SIDES, Member, Side, Split, compose_member
 from morphgen.benchmark.split_file import find_split, read_split_file, split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.bundle import CARD, MJCF, URDF, split_colours
-from morphgen.formats.resolve import file_stamp
+from morphgen.formats.description import is_mjcf
+from morphgen.formats.mjcf_document import read_document
+from morphgen.formats.resolve import PackageFinder, file_stamp
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
@@ -98,7 +102,7 @@ class FileAccess:
     def redact(self, error: object) -> str:
         """Return the text of an error without this machine's folders, for a page."""
         text = str(error).replace(f"{self.uploads}/", UPLOAD).replace(str(self.uploads), UPLOAD)
-        text = _TEMPORARY.sub("", text)
+        text = _TEMPORARY.sub("", text).replace(f"{user_cache_path('morphgen')}/", "")
         for root in self.roots:
             text = re.sub(rf"{re.escape(str(root))}/(?=\w)", "", text)
             text = re.sub(rf"{re.escape(str(root))}(?![\w.-])", ".", text)
@@ -168,12 +172,44 @@ def read_robot_uri(uri: str, files: FileAccess) -> Robot:
             derivation = parse_derivation(uri.removeprefix(DERIVATION))
             return compose(derivation, files.library, default_name(derivation, files.library))
         path = files.path(uri)
-        # A xacro is a program: those of an upload are never expanded.
-        if uri.startswith(UPLOAD) and path.is_file() and path.suffix != ".urdf":
-            raise UriError(f"{shorten(uri)}: only a URDF or a bundle is read from an upload")
+        if uri.startswith(UPLOAD) and path.is_file():
+            _require_readable_upload(uri, path, files)
         return read_source(RobotSource(uri, path), files.library)
     except RecursionError:
         raise UriError(f"{shorten(uri)}: is nested too deeply") from None
+
+
+def _require_readable_upload(uri: str, path: Path, files: FileAccess) -> None:
+    """Require that a file of an upload is one that pages read.
+
+    A xacro is a program: those of an upload are never expanded. An address may name any MJCF of an
+    upload, also one that another includes, so their files are checked whenever they are read.
+
+    Raises:
+        MorphgenError: If it is not, or names files elsewhere.
+    """
+    if path.suffix.lower() not in (".urdf", ".xml"):
+        raise UriError(f"{shorten(uri)}: only a URDF, an MJCF or a bundle is read from an upload")
+    if is_mjcf(path):
+        own = path.resolve().relative_to(files.uploads).parts[0]
+        require_own_files(path, files.uploads / own)
+
+
+def require_own_files(mjcf: Path, folder: Path) -> None:
+    """Require that an MJCF names only files of a folder, symbolic links resolved.
+
+    The paths are found by the function that later reads them: it joins ``meshdir`` and the like,
+    decodes escapes (``%2f``) and finds packages elsewhere on this machine.
+
+    Raises:
+        UnsoundError: If a mesh is not found.
+        FormatError: If the MJCF cannot be read.
+        UriError: If it names a file elsewhere.
+    """
+    document = read_document(mjcf, PackageFinder())
+    for file in (*document.includes, *document.meshes.values()):
+        if not file.resolve().is_relative_to(folder):
+            raise UriError(f"{mjcf.name}: names {file.name!r}, which is not in the upload")
 
 
 def resolve_derivation(uri: str, files: FileAccess) -> Derivation | None:

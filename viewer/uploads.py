@@ -1,4 +1,4 @@
-"""Robots that users upload: a URDF, or a zip of a bundle, kept while the viewer runs.
+"""Robots that users upload: a URDF, an MJCF, or a zip with one, kept while the viewer runs.
 
 Threat: whoever can open the page can upload a file made to do harm. Therefore
 
@@ -7,7 +7,7 @@ Threat: whoever can open the page can upload a file made to do harm. Therefore
 - only descriptions, meshes and cards are stored, in a new folder with a random name;
 - every path that they contain must stay inside that folder, so that an upload cannot make the
   viewer read, draw or send another file;
-- a xacro is a program, so an upload's xacro is never expanded.
+- a xacro is a program, so an upload's xacro is never expanded; an MJCF has no plugins.
 
 If any check fails, nothing of the upload is kept.
 """
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import io
 import json
+import posixpath
 import re
 import secrets
 import shutil
@@ -26,7 +27,9 @@ from lxml import etree
 
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import CARD, PICTURE, URDF
+from morphgen.formats.mjcf_document import listed
 from morphgen.formats.resolve import PackageFinder, resolve_uri
+from morphgen.formats.urdf import UnsoundError
 from morphgen.formats.xml import parse_xml
 from morphgen.formats.zip_files import (
     UNREADABLE,
@@ -37,7 +40,13 @@ from morphgen.formats.zip_files import (
 )
 from morphgen.model.geometry import MESH_SUFFIXES
 from morphgen.viewer.messages import MAX_UPLOAD
-from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shorten
+from morphgen.viewer.robot_uri import (
+    UPLOAD,
+    FileAccess,
+    UriError,
+    require_own_files,
+    shorten,
+)
 
 MAX_UPLOADS = 50
 """Uploads that a viewer keeps."""
@@ -45,6 +54,10 @@ LIMITS = ZipLimits(max_bytes=100 * 2**20, max_files=2000, max_name=100, max_dept
 """Bounds on a zip."""
 PACKAGE = "package.xml"
 """Marks a ROS package, which ``package://`` needs."""
+_FORMATS = {"robot": "URDF", "mujoco": "MJCF", "mujocoinclude": "included MJCF"}
+"""Formats of descriptions by their root element."""
+_SUFFIXES = (".urdf", ".xml")
+"""Suffixes of descriptions."""
 _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
 _MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
 """Suffixes of files that meshes refer to."""
@@ -71,7 +84,7 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
         The URI of the robot.
 
     Raises:
-        UploadError: If the file is too large, not a URDF or a zip of one, or unsafe.
+        UploadError: If the file is too large, not a URDF, an MJCF or a zip of one, or unsafe.
     """
     if len(content) > MAX_UPLOAD:
         raise UploadError(
@@ -84,19 +97,27 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
             f"invalid file name: {shorten(name)!r}; use letters, digits and '.', at most 100"
         )
     suffix = PurePosixPath(file).suffix.lower()
-    if suffix not in (".urdf", ".zip"):
-        raise UploadError(f"{file}: expected a .urdf, or a .zip of a folder with one")
+    if suffix not in (*_SUFFIXES, ".zip"):
+        raise UploadError(
+            f"{file}: expected a .urdf, an MJCF as .xml, or a .zip of a folder with one"
+        )
     unpacked = _unzip(file, content) if suffix == ".zip" else {file: content}
-    stored = {path: data for path, data in unpacked.items() if _is_kept(path, data)}
-    main_urdf = _main_urdf(file, unpacked, stored)
+    formats = {path: _format(path, data) for path, data in unpacked.items()}
+    if suffix != ".zip" and formats[file] is None:
+        root = _parse(file, content)
+        raise UploadError(
+            f"{file}: its root is <{shorten(str(root.tag))}>; expected <robot> of a URDF, or "
+            "<mujoco> of an MJCF"
+        )
+    stored = {path: data for path, data in unpacked.items() if formats[path] or _is_kept(path)}
+    main = _main_description(file, formats, unpacked)
     for path, data in stored.items():
-        _require_inner_paths(path, data)
-    folder = _write_upload(stored, files.uploads)
+        _require_inner_paths(path, data, formats[path])
+    folder = _write_upload(stored, formats, main, files)
     is_bundle = (
-        PurePosixPath(main_urdf).name == URDF
-        and str(PurePosixPath(main_urdf).parent / CARD) in stored
+        PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in stored
     )
-    target = str(PurePosixPath(main_urdf).parent) if is_bundle else main_urdf
+    target = str(PurePosixPath(main).parent) if is_bundle else main
     return f"{UPLOAD}{folder}/{target}".removesuffix("/.")
 
 
@@ -114,41 +135,75 @@ def _unzip(name: str, content: bytes) -> dict[str, bytes]:
         ) from error
 
 
-def _is_kept(path: str, data: bytes) -> bool:
-    """Return whether a file is a description, a mesh or part of one, a card or a package file."""
+def _format(path: str, data: bytes) -> str | None:
+    """Return the format of a description, a value of ``_FORMATS``; None for any other file."""
     file = PurePosixPath(path)
-    if any(part.startswith((".", "__MACOSX")) for part in file.parts):
-        return False
-    if file.suffix == ".xml":
-        return file.name == PACKAGE or _is_mjcf(data)
-    return (
-        file.name in (CARD, PICTURE)
+    if file.suffix.lower() not in _SUFFIXES or _is_hidden(file):
+        return None
+    try:
+        return _FORMATS.get(str(parse_xml(data, "").tag))
+    except FormatError:
+        return None
+
+
+def _is_kept(path: str) -> bool:
+    """Return whether a file is a mesh or part of one, a card, a package file or a ``.urdf``."""
+    file = PurePosixPath(path)
+    return not _is_hidden(file) and (
+        file.name in (CARD, PICTURE, PACKAGE)
         or file.suffix in (".urdf", *_MESH_PARTS)
         or file.suffix.lower() in MESH_SUFFIXES
     )
 
 
-def _is_mjcf(data: bytes) -> bool:
-    try:
-        return bool(parse_xml(data, "").tag == "mujoco")
-    except FormatError:
-        return False
+def _is_hidden(file: PurePosixPath) -> bool:
+    return any(part.startswith((".", "__MACOSX")) for part in file.parts)
 
 
-def _main_urdf(name: str, unpacked: dict[str, bytes], stored: dict[str, bytes]) -> str:
-    """Return the URDF with the shortest path, which in a bundle is the bundle's own."""
-    urdfs = [path for path in stored if path.endswith(".urdf")]
+def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[str, bytes]) -> str:
+    """Return the description to show.
+
+    That is the URDF with the shortest path, which in a bundle is the bundle's own. Without one, it
+    is the MJCF with the archive's name, or the only one that no other MJCF includes.
+    """
+    urdfs = [
+        path
+        for path, form in formats.items()
+        if form == "URDF" or (form is None and path.endswith(".urdf") and _is_kept(path))
+    ]
     if urdfs:
         return min(urdfs, key=lambda path: (path.count("/"), path))
+    mjcfs = {path: unpacked[path] for path, form in formats.items() if form == "MJCF"}
+    if mjcfs:
+        return _main_mjcf(name, mjcfs)
     hint = ""
     if any(path.endswith(".xacro") for path in unpacked):
         hint = (
             "; no xacro of an upload is expanded: import it on this machine, with morphgen import"
         )
-    raise UploadError(f"{name}: holds no .urdf{hint}")
+    raise UploadError(f"{name}: holds no .urdf and no MJCF{hint}")
 
 
-def _require_inner_paths(path: str, data: bytes) -> None:
+def _main_mjcf(name: str, mjcfs: dict[str, bytes]) -> str:
+    stem = PurePosixPath(name).stem
+    named = [path for path in mjcfs if PurePosixPath(path).stem == stem]
+    # A name is relative to the main file, which lies beside the including file or above it.
+    included = {
+        posixpath.normpath(folder / element.get("file", ""))
+        for path, data in mjcfs.items()
+        for element in _parse(path, data).iter("include")
+        for folder in PurePosixPath(path).parents
+    }
+    mains = named or [path for path in mjcfs if path not in included] or [*mjcfs]
+    if len(mains) > 1:
+        raise UploadError(
+            f"{name}: holds several MJCFs: {listed(map(shorten, sorted(mains)))}; send only one "
+            "with the files that it needs, or name the zip after it"
+        )
+    return mains[0]
+
+
+def _require_inner_paths(path: str, data: bytes, form: str | None) -> None:
     """Require that a description or card names files of its own upload only."""
     file = PurePosixPath(path)
     if file.name == CARD:
@@ -159,9 +214,9 @@ def _require_inner_paths(path: str, data: bytes) -> None:
         hashes = card.get("hashes") if isinstance(card, dict) else None
         for name in hashes if isinstance(hashes, dict) else ():
             _require_inner_uri(path, name)
-    elif file.suffix in (".urdf", ".xml") and file.name != PACKAGE:
+    elif form or file.suffix == ".urdf":
         root = _parse(path, data)
-        if file.suffix == ".urdf":
+        if form in ("URDF", None):
             _require_plain_urdf(path, root)
         for element in root.iter(etree.Element):
             for key in _PATH_ATTRIBUTES:
@@ -202,25 +257,45 @@ def _require_inner_uri(path: str, uri: str) -> None:
         raise UploadError(f"{path}: {shorten(uri)!r} leads out of its folder; nothing was kept")
 
 
-def _write_upload(files: dict[str, bytes], uploads: Path) -> str:
+def _write_upload(
+    stored: dict[str, bytes], formats: dict[str, str | None], main: str, files: FileAccess
+) -> str:
     """Write an upload into a new folder, or nothing; return the folder's name."""
-    if sum(1 for _ in uploads.iterdir()) >= MAX_UPLOADS:
+    if sum(1 for _ in files.uploads.iterdir()) >= MAX_UPLOADS:
         raise UploadError(f"{MAX_UPLOADS} uploads are kept already; start the viewer again")
-    folder = uploads / secrets.token_hex(16)  # cannot be guessed by other users of the viewer
+    folder = files.uploads / secrets.token_hex(16)  # cannot be guessed by other users of the viewer
     try:
-        for path, data in files.items():
+        for path, data in stored.items():
             target = folder / path
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(data)
-        for path, data in files.items():
-            if path.endswith(".urdf"):
+        for path, data in stored.items():
+            if formats[path] == "URDF":
                 _require_inner_meshes(folder, path, data)
+        if formats[main] == "MJCF":
+            _require_inner_files(folder, main, files)
     except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, OSError):
             raise UploadError(f"the upload cannot be kept: {error.strerror}") from error
         raise
     return folder.name
+
+
+def _require_inner_files(folder: Path, path: str, files: FileAccess) -> None:
+    """Require that every mesh and include of an MJCF exists in its upload."""
+    try:
+        require_own_files(folder / path, folder)
+    except UnsoundError as error:
+        names = [finding.where.removeprefix(f"{folder / path}: ") for finding in error.findings]
+        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+        raise UploadError(
+            f"{path}: {shorten(', '.join(names[:5]), 300)}{more}: not in the upload: send a zip of "
+            "the folder with its meshes; nothing was kept"
+        ) from error
+    except (FormatError, UriError) as error:
+        text = files.redact(str(error).replace(f"{folder}/", ""))
+        raise UploadError(f"{text}; nothing was kept") from error
 
 
 def _require_inner_meshes(folder: Path, path: str, data: bytes) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option, repeated
 from morphgen.cli.progress import status, track
-from morphgen.cli.robots import write_and_report
+from morphgen.cli.robots import WrittenBundle, write_checked
 from morphgen.errors import FormatError, MorphgenError, one_line
 
 if TYPE_CHECKING:
@@ -57,14 +60,14 @@ _PARTS = Path("parts")
     details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
     "no safe repair removes (see morphgen check); the bundle is written all the same. Robots of "
     "several files are named after their files; those that are refused are named with the reason, "
-    "and the exit code is 2.",
+    "and the exit code is 2. With --json, several files give one array with an object per file.",
     examples=(
         "import my_arm.urdf --tool flange",
         "import my_arm.xacro --arg length=0.4",
         "import scene.xml --root-link base",
         "import my_arm.urdf --tool flange --srdf my_arm.srdf",
         "import menagerie:universal_robots_ur5e --part arm --licence BSD-3-Clause",
-        "import bodies/*.xml --part body --licence MIT --out imported",
+        "import bodies/*.xml --tool torso --part arm --licence MIT --out imported",
     ),
 )
 def import_robots(args: argparse.Namespace) -> int:
@@ -75,61 +78,100 @@ def import_robots(args: argparse.Namespace) -> int:
     if args.part is None:
         given = {"--parts": args.parts is not None, "--licence": args.licence is not None}
         opt.reject_idle(given, "only with --part")
-    if args.name is not None:
-        if len(args.files) > 1:
+    if len(args.files) > 1:
+        if args.name is not None:
             raise FormatError(f"--name {args.name}: {len(args.files)} robots cannot have one name")
+        if args.srdf is not None:
+            raise FormatError(
+                f"--srdf {args.srdf}: is of one robot, and {len(args.files)} are named; import its "
+                "robot alone"
+            )
+    elif args.name is not None:
         bundle_folder(args.out, args.name)  # refuses an invalid name before the work
     if args.root is not None and not args.root.is_dir():
         raise FormatError(
             f"--root {args.root}: no such folder; the link where the robot begins is named by "
             "--root-link"
         )
-    if len(args.files) == 1:
-        return _import(find_description(args.files[0]), args.name, args)
-    return _import_several(args)
+    xacro_args = _xacro_args(args.arg)
+    if len(args.files) > 1:
+        return _import_several(args, xacro_args)
+    robot = _import(find_description(args.files[0]), args.name, xacro_args, args)
+    opt.print_result(args, robot.data, lambda: robot.text)
+    return robot.code
 
 
-def _import_several(args: argparse.Namespace) -> int:
+def _xacro_args(words: Sequence[str]) -> dict[str, str]:
+    """Return the values of ``--arg NAME=VALUE`` by name."""
+    pairs = [word.partition("=") for word in words]
+    for key, equals, value in pairs:
+        if not key or not equals:
+            raise FormatError(f"--arg {key}{equals}{value}: expected NAME=VALUE")
+    return {key: value for key, _, value in pairs}
+
+
+def _import_several(args: argparse.Namespace, xacro_args: Mapping[str, str]) -> int:
     """Import every file that can be, and print what became of each; return the exit code."""
     from morphgen.formats.named_descriptions import find_description
 
-    found = [find_description(file) for file in args.files]
-    names = [re.sub(r"\W", "_", each.path.stem, flags=re.ASCII) for each in found]
-    for name, count in Counter(names).items():
+    found: dict[str, NamedDescription | MorphgenError] = {}
+    for file in dict.fromkeys(args.files):
+        try:
+            found[file] = find_description(file)
+        except MorphgenError as error:
+            found[file] = error
+    names = {
+        file: re.sub(r"\W", "_", description.path.stem, flags=re.ASCII)
+        for file, description in found.items()
+        if not isinstance(description, MorphgenError)
+    }
+    for name, count in Counter(names.values()).items():
         if count > 1:
-            files = [file for file, own in zip(args.files, names, strict=True) if own == name]
+            files = [file for file, own in names.items() if own == name]
             raise FormatError(
-                f"{', '.join(files)}: these would all be named {name!r}; import one at a time"
+                f"{', '.join(files)}: these would all be named {name!r}; import one at a time, "
+                "with --name"
             )
     code = 0
-    for description, name in track(
-        list(zip(found, names, strict=True)), args, "importing", "robot", len(found)
-    ):
+    objects: list[dict[str, object]] = []
+    for file, description in track(list(found.items()), args, "importing", "robot", len(found)):
         try:
-            code = max(code, _import(description, name, args))
+            if isinstance(description, MorphgenError):
+                raise description
+            robot = _import(description, names[file], xacro_args, args)
         except MorphgenError as error:
-            print(f"morphgen: {one_line(str(error))}", file=sys.stderr)
+            reason = one_line(str(error))
+            print(f"morphgen: {reason}", file=sys.stderr)
+            objects.append({"file": file, "error": reason})
             code = 2
+            continue
+        objects.append({"file": file, **robot.data})
+        code = max(code, robot.code)
+        if not args.json:
+            print(robot.text)
+    if args.json:
+        print(json.dumps(objects, default=str))
     return code
 
 
-def _import(description: NamedDescription, name: str | None, args: argparse.Namespace) -> int:
-    """Import a robot, write its bundle and, if asked for, its manifest; return the exit code."""
+def _import(
+    description: NamedDescription,
+    name: str | None,
+    xacro_args: Mapping[str, str],
+    args: argparse.Namespace,
+) -> WrittenBundle:
+    """Import a robot, and write its bundle and, if asked for, its manifest."""
     from morphgen.formats.bundle import URDF, bundle_folder
     from morphgen.grammar.imported_part import part_manifest, write_part
     from morphgen.grammar.robot_source import import_robot
 
-    pairs = [entry.partition("=") for entry in args.arg]
-    for key, equals, value in pairs:
-        if not key or not equals:
-            raise FormatError(f"--arg {key}{equals}{value}: expected NAME=VALUE")
     licence = args.licence or description.licence
     if args.part and not licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")
     with status(args, f"importing {description.path}"):
         robot = import_robot(
             description.path,
-            {**description.args, **{key: value for key, _, value in pairs}},
+            {**description.args, **xacro_args},
             root=args.root,
             root_link=args.root_link,
             tool=args.tool,
@@ -141,9 +183,9 @@ def _import(description: NamedDescription, name: str | None, args: argparse.Name
     if args.part:  # refuses before the bundle is replaced
         urdf = bundle_folder(args.out, robot.name) / URDF
         part = part_manifest(robot, urdf, args.part, args.parts or _PARTS, licence)
-    code = write_and_report(robot, args)
-    if part is not None:
-        write_part(*part)
-        if not args.json:
-            print(part[0])
-    return code
+    written = write_checked(robot, args)
+    if part is None:
+        return written
+    write_part(*part)
+    path = str(part[0])
+    return replace(written, data={**written.data, "part": path}, text=f"{written.text}\n{path}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
@@ -64,6 +65,25 @@ def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     Returns:
         1 if the checks find an error in the robot, as ``morphgen check`` does, else 0.
     """
+    written = write_checked(robot, args)
+    opt.print_result(args, written.data, lambda: written.text)
+    return written.code
+
+
+@dataclass(frozen=True)
+class WrittenBundle:
+    """What a command says about a bundle that it wrote."""
+
+    data: dict[str, object]
+    """For ``--json``."""
+    text: str
+    """The summary."""
+    code: int
+    """1 if the checks find an error in the robot, as ``morphgen check`` does, else 0."""
+
+
+def write_checked(robot: Robot, args: argparse.Namespace) -> WrittenBundle:
+    """Check a robot, write ``args.out / robot.name``, and return what to print."""
     from morphgen.checks import check
     from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
     from morphgen.formats.data_files import read_json
@@ -73,24 +93,24 @@ def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
         findings = check(robot)
         write_bundle(robot, folder, findings, picture=not args.no_picture)
 
-    def text() -> str:
-        lines = [
-            f"{folder}: {len(robot.links)} links, {robot.dof} DoF, {robot.mass:.3g} kg, "
-            f"{len(robot.ignore_pairs)} pairs ignored for self-collision"
-        ]
-        repairs = robot.provenance.get("repairs", ())
-        lines += [f"  repaired {repair}" for repair in repairs]  # type: ignore[attr-defined]
-        lines += [
-            f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}"
-            for finding in findings
-            if finding.severity != "info"
-        ]
-        files = sorted(folder.iterdir())
-        lines += [f"  {path.name}{'/' if path.is_dir() else ''}" for path in files]
-        return "\n".join(lines)
-
-    opt.print_result(args, {"folder": str(folder), "card": read_json(folder / CARD)}, text)
-    return int(any(finding.severity == "error" for finding in findings))
+    lines = [
+        f"{folder}: {len(robot.links)} links, {robot.dof} DoF, {robot.mass:.3g} kg, "
+        f"{len(robot.ignore_pairs)} pairs ignored for self-collision"
+    ]
+    repairs = robot.provenance.get("repairs", ())
+    lines += [f"  repaired {repair}" for repair in repairs]  # type: ignore[attr-defined]
+    lines += [
+        f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}"
+        for finding in findings
+        if finding.severity != "info"
+    ]
+    files = sorted(folder.iterdir())
+    lines += [f"  {path.name}{'/' if path.is_dir() else ''}" for path in files]
+    return WrittenBundle(
+        {"folder": str(folder), "card": read_json(folder / CARD)},
+        "\n".join(lines),
+        int(any(finding.severity == "error" for finding in findings)),
+    )
 
 
 @command(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from morphgen.formats.mjcf_document import MjcfDocument, listed
+from morphgen.formats.mjcf_document import GEOM_TYPES, MjcfDocument, listed
 from morphgen.formats.mujoco_warnings import MujocoWarnings
 from morphgen.formats.structure import MAX_LINKS, MAX_SHAPES
 from morphgen.formats.urdf_schema import MAX_NUMBER, MAX_TEXT
@@ -97,9 +97,7 @@ def _require_bounded(spec: mujoco.MjSpec, document: MjcfDocument) -> None:
     # The octree of a signed distance field grows without bound.
     fields = [g.name for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_SDF]
     if fields:
-        raise document.error(
-            f"geom {listed(fields)}: type sdf; expected box, sphere, cylinder, capsule or mesh"
-        )
+        raise document.error(f"geom {listed(fields)}: type sdf; expected {GEOM_TYPES}")
     for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
         if asset.file:
             raise document.error(

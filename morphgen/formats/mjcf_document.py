@@ -25,6 +25,8 @@ MAX_DEPTH = 40
 """Deepest nesting of includes."""
 MAX_COPIES = 10_000
 """Largest number of elements that the ``<replicate>`` elements of an MJCF make."""
+GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
+"""Types of geoms that a robot can have, for errors."""
 
 _REFUSED = {
     "plugin": "plugins are code",
@@ -53,7 +55,10 @@ class MjcfDocument:
     text: str
     """The document with includes inserted, without the sections that a robot does not need."""
     meshes: Mapping[str, Path]
-    """File of every mesh asset by name; assets with vertices in the document have none."""
+    """File of every mesh asset by name; assets with vertices in the document have none until
+    ``inline_meshes`` adds it."""
+    includes: tuple[Path, ...] = ()
+    """Files whose content is inserted."""
     findings: tuple[Finding, ...] = ()
     """Repairs without which the document could not be parsed."""
 
@@ -74,7 +79,8 @@ def read_document(path: Path, finder: PackageFinder) -> MjcfDocument:
         FormatError: If a file is missing, too large, not XML or elsewhere, or the document has an
             element that cannot be read.
     """
-    root, findings = _Includes(path, finder).read(path, 0)
+    includes = _Includes(path, finder)
+    root, findings = includes.read(path, 0)
     _require_supported(root, path)
     for section in [*root.iterchildren(*_IGNORED)]:
         root.remove(section)
@@ -100,6 +106,7 @@ def read_document(path: Path, finder: PackageFinder) -> MjcfDocument:
         root.get("model") or path.stem,
         etree.tostring(root, encoding="unicode"),
         meshes,
+        includes.files,
         tuple(replace(f, where=f"{path.name}{f.where.removeprefix(where)}") for f in findings),
     )
 
@@ -112,6 +119,11 @@ class _Includes:
         self._finder = finder
         self._seen: set[Path] = set()
         self._bytes_left = MAX_MJCF_BYTES
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files read so far, links resolved, besides the main one."""
+        return tuple(sorted(self._seen - {self._main.resolve()}))
 
     def read(self, path: Path, depth: int) -> tuple[etree._Element, tuple[Finding, ...]]:
         """Return the root of a file with its includes inserted, and what was repaired."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -14,7 +15,13 @@ from morphgen.formats.mjcf_compile import compile_document
 from morphgen.formats.mjcf_couplings import Couplings, read_couplings
 from morphgen.formats.mjcf_document import MjcfDocument, read_document
 from morphgen.formats.mjcf_frames import read_frames
-from morphgen.formats.mjcf_shapes import BodyShapes, body_shapes, pose_of
+from morphgen.formats.mjcf_meshes import inline_meshes
+from morphgen.formats.mjcf_shapes import (
+    BodyShapes,
+    body_shapes,
+    ellipsoid_findings,
+    pose_of,
+)
 from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.urdf import require_description_file
 from morphgen.formats.urdf_text import BOUND_MASS
@@ -40,6 +47,8 @@ def read_mjcf(
     a body. A link's frame is its body's; if the body's last hinge has a ``pos``, the frame is there
     instead, as URDF requires. A joint's position is MuJoCo's, also with a ``ref``.
 
+    Meshes without a file and ellipsoids get one in the user's cache; see ``mjcf_meshes``.
+
     ``robot_bodies`` says which bodies are the robot, ``body_shapes`` which geoms are visual and
     collision shapes, ``read_couplings`` what becomes a mimic joint, ``read_efforts`` how joints get
     effort limits, and ``read_frames`` what becomes the frame ``tool``. Masses up to that of
@@ -63,15 +72,18 @@ def read_mjcf(
     require_description_file(path)
     document = read_document(path, finder or default_finder())
     spec, model, warnings = compile_document(document)
+    document = replace(document, meshes={**document.meshes, **inline_meshes(spec, document)})
     chosen = robot_bodies(model, document, root_body)
     couplings = read_couplings(model, chosen.joints, chosen.bodies, document)
     tree = _Tree(model, chosen, couplings)
     links, ignored = [], []
+    ellipsoids: list[str] = []
     for body in chosen.bodies:
         for joint in tree.steps[body][:-1]:
             links.append(Link(joint.child))
         shapes = body_shapes(spec, model, body, document).moved(tree.T_link_body[body])
         links.append(_link(model, body, tree, shapes))
+        ellipsoids += shapes.ellipsoids
     for signature in model.exclude_signature.tolist():
         a, b = signature >> 16, signature & 0xFFFF
         if a in tree.link and b in tree.link:
@@ -91,6 +103,7 @@ def read_mjcf(
             *chosen.findings,
             *couplings.findings,
             *findings,
+            *ellipsoid_findings(ellipsoids, document),
         ),
     )
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from morphgen.formats.mjcf_bodies import FLOOR_GEOMS, WORLD, body_label
-from morphgen.formats.mjcf_document import MjcfDocument, listed
+from morphgen.formats.mjcf_document import GEOM_TYPES, MjcfDocument, listed
+from morphgen.formats.mjcf_meshes import ellipsoid_mesh
 from morphgen.model import rotation
+from morphgen.model.findings import Finding
 from morphgen.model.geometry import (
     Box,
     Capsule,
@@ -36,17 +39,18 @@ class BodyShapes:
 
     visuals: tuple[Shape, ...]
     collisions: tuple[Shape, ...]
+    ellipsoids: tuple[str, ...] = ()
+    """Labels of the geoms that are ellipsoids, which meshes approximate."""
 
     def moved(self, T_link_body: Pose) -> BodyShapes:
         """Return the shapes in the frame of a link."""
         if T_link_body.is_identity:
             return self
-        return BodyShapes(
-            *(
-                tuple(replace(s, T_link_shape=T_link_body @ s.T_link_shape) for s in shapes)
-                for shapes in (self.visuals, self.collisions)
-            )
+        visuals, collisions = (
+            tuple(replace(s, T_link_shape=T_link_body @ s.T_link_shape) for s in shapes)
+            for shapes in (self.visuals, self.collisions)
         )
+        return replace(self, visuals=visuals, collisions=collisions)
 
 
 def body_shapes(
@@ -59,11 +63,13 @@ def body_shapes(
     2 are drawn, too, if the body has no visual shapes of its own. Planes and height fields of the
     world are its floor and left out, as are geoms that neither touch nor are drawn.
 
+    An ellipsoid becomes a convex mesh of its volume, or a sphere if its radii are equal.
+
     MuJoCo moves meshes to their centre of mass and principal axes; the shapes are again in the
     coordinates of the mesh files.
 
     Raises:
-        FormatError: If a geom has no counterpart, such as an ellipsoid.
+        FormatError: If a geom has no counterpart, such as a plane of a body.
     """
     first = model.body_geomadr[body]
     geoms = range(first, first + model.body_geomnum[body])
@@ -72,6 +78,7 @@ def body_shapes(
     collisions: list[Shape] = []
     drawn: list[Shape] = []
     refused: dict[str, list[str]] = {}
+    ellipsoids: list[str] = []
     for geom in geoms:
         touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom]) or geom in paired
         rgba = _rgba(model, geom)
@@ -81,8 +88,10 @@ def body_shapes(
         if is_floor or not (touches or is_drawn):
             continue
         geometry, T_body_shape = _geometry(spec, model, geom, document)
+        name = model.geom(geom).name or f"(of {body_label(model, body)})"
+        if kind == _GEOM.mjGEOM_ELLIPSOID and isinstance(geometry, Mesh):
+            ellipsoids.append(name)
         if geometry is None:
-            name = model.geom(geom).name or f"(of {body_label(model, body)})"
             refused.setdefault(kind.name.removeprefix("mjGEOM_").lower(), []).append(name)
             continue
         shape = Shape(geometry, T_body_shape)
@@ -91,10 +100,24 @@ def body_shapes(
         if is_drawn:
             (drawn if touches else visuals).append(replace(shape, rgba=rgba))
     for form, names in refused.items():
-        raise document.error(
-            f"geom {listed(names)}: type {form}; expected box, sphere, cylinder, capsule or mesh"
-        )
-    return BodyShapes(tuple(visuals or drawn), tuple(collisions))
+        raise document.error(f"geom {listed(names)}: type {form}; expected {GEOM_TYPES}")
+    return BodyShapes(tuple(visuals or drawn), tuple(collisions), tuple(ellipsoids))
+
+
+def ellipsoid_findings(geoms: Sequence[str], document: MjcfDocument) -> tuple[Finding, ...]:
+    """Return a finding about ellipsoids that became meshes; none without ellipsoids."""
+    if not geoms:
+        return ()
+    return (
+        Finding(
+            "ellipsoid-mesh",
+            "info",
+            f"{document.path.name}: geom {listed(geoms)}",
+            "a robot has no ellipsoids",
+            "use a capsule, if the shape has to be exact",
+            "became a convex mesh of the volume of the ellipsoid",
+        ),
+    )
 
 
 def _geometry(
@@ -112,6 +135,8 @@ def _geometry(
             return Cylinder(a, 2 * b), T_body_geom
         case _GEOM.mjGEOM_CAPSULE:
             return Capsule(a, 2 * b), T_body_geom
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return Sphere(a) if a == b == c else ellipsoid_mesh((a, b, c)), T_body_geom
         case _GEOM.mjGEOM_MESH:
             k = model.geom_dataid[geom]
             name = model.mesh(k).name
@@ -128,10 +153,6 @@ def _mesh(asset: mujoco.MjsMesh, document: MjcfDocument) -> tuple[Mesh, Pose]:
     MuJoCo maps a vertex v of the file to S R^T (v - p), with the position p and rotation R of
     ``refpos`` and ``refquat`` and the scale S.
     """
-    if asset.name not in document.meshes:
-        raise document.error(
-            f"mesh {asset.name!r} has its vertices in the MJCF; write them to a file and name it"
-        )
     x, y, z = (float(value) for value in asset.scale)
     T_ref_file = pose_of(asset.refpos, asset.refquat).inverse()
     if T_ref_file.quaternion != rotation.IDENTITY and not x == y == z:

@@ -57,7 +57,7 @@ def part_manifest(
     if not _NAME.fullmatch(robot.name):
         raise FormatError(
             f"name {robot.name!r} of a part: expected letters, digits and underscores, no digit "
-            "first; choose one by --name"
+            "first; import its file alone, and choose a name by --name"
         )
     if all(frame.name != TOOL for frame in robot.frames):
         raise CompositionError(
@@ -86,7 +86,7 @@ def part_manifest(
     if folder.exists() and not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; choose another --parts")
     if path.exists() and path.read_bytes() != text.encode():
-        raise FormatError(f"{path} exists; move it away, or choose another --name or --parts")
+        raise FormatError(f"{path} exists; move it away, or choose another folder by --parts")
     return path, text
 
 

@@ -36,6 +36,7 @@ from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MeshError
 from morphgen.model.geometry import MESH_SUFFIXES, Rgba
+from morphgen.model.msh_files import read_msh
 from morphgen.typing import Array
 
 MAX_FILE_SIZE = 128 * 2**20
@@ -104,6 +105,8 @@ def read_mesh_file(path: Path) -> list[tuple[Rgba | None, tuple[Array, NDArray[n
 
 
 def _scene(path: Path) -> trimesh.Scene:
+    if path.suffix.lower() == ".msh":
+        return trimesh.Scene(trimesh.Trimesh(*read_msh(path.read_bytes()), process=False))
     scene = trimesh.load_scene(path, process=False, resolver=FolderResolver(path.parent))
     if path.suffix.lower() == ".dae" and not scene.geometry:
         # pycollada drops a geometry whose material is broken, such as by an undeclared texture.

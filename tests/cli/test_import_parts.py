@@ -66,6 +66,32 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
     assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
 
 
+def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(run, tmp_path):
+    write(tmp_path, ARM, "a.xml")
+    write(tmp_path, BALL, "b.xml")
+    write(tmp_path, ARM, "1st.xml")
+    files = ("a.xml", "menagerie:no_such_robot", "b.xml", "c.xml", "1st.xml")
+    words = ("--part", "arm", "--licence", "MIT", "--no-picture", "--json")
+    code, out, err = run("import", *files, *words)
+    objects = json.loads(out)
+    assert code == 2
+    assert tuple(each["file"] for each in objects) == files
+    assert [path.name for path in (tmp_path / "parts").iterdir()] == ["a.yaml"]
+    assert (objects[0]["folder"], objects[0]["part"]) == ("robots/a", "parts/a.yaml")
+    assert objects[0]["card"]["name"] == "a"
+    reasons = [each["error"] for each in objects[1:]]
+    assert err.splitlines() == [f"morphgen: {reason}" for reason in reasons]
+    for reason, part in zip(
+        reasons,
+        ("menagerie:no_such_robot: ", "type ball", "c.xml", "import its file alone"),
+        strict=True,
+    ):
+        assert part in reason
+    code, out, _ = run("import", "a.xml", *words)
+    one = json.loads(out)
+    assert (code, one["folder"], one["part"]) == (0, "robots/test", "parts/test.yaml")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -74,7 +100,7 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
         (
             ("a.xml", "--part", "arm", "--licence", "MIT", "--name", "1st"),
             "name '1st' of a part: expected letters, digits and underscores, no digit first; "
-            "choose one by --name",
+            "import its file alone, and choose a name by --name",
         ),
         (
             ("a.xml", "--part", "ee", "--licence", "MIT"),
@@ -84,7 +110,15 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
         (("a.xml", "b.xml", "--name", "x"), "--name x: 2 robots cannot have one name"),
         (
             ("a.xml", "b/a.xml"),
-            "a.xml, b/a.xml: these would all be named 'a'; import one at a time",
+            "a.xml, b/a.xml: these would all be named 'a'; import one at a time, with --name",
+        ),
+        (
+            ("a.xml", "b.xml", "--srdf", "a.srdf"),
+            "--srdf a.srdf: is of one robot, and 2 are named; import its robot alone",
+        ),
+        (
+            ("a.xml", "b.xml", "--arg", "length"),
+            "--arg length: expected NAME=VALUE",
         ),
     ],
 )

@@ -55,18 +55,19 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
             "equality 'e': another one couples joint 'a', too; expected one",
         ),
         (
-            '<worldbody><body name="a"><geom name="egg" type="ellipsoid" size="1 2 3"/></body>'
-            "</worldbody>",
-            "geom 'egg': type ellipsoid; expected box, sphere, cylinder, capsule or mesh",
+            '<worldbody><body name="a"><geom name="table" type="plane" size="1 2 3"/><geom '
+            'size="1"/></body></worldbody>',
+            "geom 'table': type plane; expected box, sphere, cylinder, capsule, ellipsoid or mesh",
         ),
         (
             '<extension><plugin plugin="mujoco.pid"/></extension><worldbody/>',
             "<extension> is refused: plugins are code",
         ),
         (
-            '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
-            '<body name="a"><geom type="mesh" mesh="m"/></body></worldbody>',
-            "mesh 'm' has its vertices in the MJCF; write them to a file and name it",
+            '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1e10"/></asset><worldbody>'
+            '<body name="a"><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
+            '<geom type="mesh" mesh="m"/></body></worldbody>',
+            "mesh 'm': a vertex is beyond 1e+09 m",
         ),
         (
             '<worldbody><replicate count="200000"><body><geom size="1"/></body></replicate>'
@@ -76,7 +77,7 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
         (
             '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
             '<body name="a"><geom name="g" type="sdf" mesh="m"/></body></worldbody>',
-            "geom 'g': type sdf; expected box, sphere, cylinder, capsule or mesh",
+            "geom 'g': type sdf; expected box, sphere, cylinder, capsule, ellipsoid or mesh",
         ),
         (
             f"{TWO_JOINTS}<keyframe>{'<key/>' * 1001}</keyframe>",

@@ -7,6 +7,7 @@ Commands share a process because starting one takes longer than most commands ru
 import contextlib
 import io
 import json
+import os
 import resource
 import select
 import subprocess
@@ -45,6 +46,7 @@ class Runner:
                 stdout=subprocess.PIPE,
                 cwd=self.folder,
                 text=True,
+                env={**os.environ, "XDG_CACHE_HOME": str(self.folder / "cache")},
             )
         assert self.process.stdin
         assert self.process.stdout

@@ -103,7 +103,7 @@ class PlainClient:
 
     def upload(self, name, content, *, size=None, parts=None):
         """Upload a file on the first page, in parts as a browser does."""
-        button = self.control("UploadButton", "Open a URDF or a zipped bundle")
+        button = self.control("UploadButton", "Open a URDF, an MJCF or a zip")
         self.control(
             "Text", "Search"
         )  # comes after the button, when the server accepts its uploads

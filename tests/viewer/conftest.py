@@ -14,6 +14,7 @@ from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_gramm
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.viewer.app import serve
+from morphgen.viewer.robot_uri import FileAccess
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -65,6 +66,14 @@ def folder(tmp_path_factory):
     text = (broken / "robot.urdf").read_text()
     (broken / "robot.urdf").write_text(text.replace('<child link="lower"', '<child link="lost"'))
     return root
+
+
+@pytest.fixture
+def access(tmp_path):
+    """The files of a viewer without uploads."""
+    uploads = tmp_path / "uploads"
+    uploads.mkdir()
+    return FileAccess(default_library().folders, (tmp_path.resolve(),), uploads.resolve())
 
 
 @pytest.fixture(scope="session")

@@ -57,7 +57,7 @@ def test_valid_messages_are_accepted():
         ("Dropdown", "Sort by", "/etc/passwd", "not one of the choices"),
         ("Dropdown", "Sort by", ["name"], "not one of the choices"),
         ("ButtonGroup", "Page", "beyond", "not one of the choices"),
-        ("UploadButton", "Open a URDF or a zipped bundle", "x", "takes no value"),
+        ("UploadButton", "Open a URDF, an MJCF or a zip", "x", "takes no value"),
     ],
 )
 def test_invalid_control_values_are_rejected(shared_viewer, capfd, kind, label, value, why):

@@ -272,12 +272,12 @@ def test_an_upload_is_shown(see, tmp_path):
     page = see("?library=")
     button = page.get_by_role("button", name="Open a URDF")
     button.wait_for()
-    (tmp_path / "some.urdf").write_text(
-        '<robot name="sent"><link name="a"><visual><geometry><box size="1 1 1"/></geometry>'
-        "</visual></link></robot>"
+    (tmp_path / "some.xml").write_text(
+        '<mujoco model="sent"><worldbody><body name="a"><geom type="box" size="1 1 1"/></body>'
+        "</worldbody></mujoco>"
     )
     with page.expect_file_chooser() as chooser:
         button.click()
-    chooser.value.set_files(tmp_path / "some.urdf")
+    chooser.value.set_files(tmp_path / "some.xml")
     page.wait_for_url(re.compile(r"robot=upload:"))
     page.get_by_text("sent").first.wait_for()

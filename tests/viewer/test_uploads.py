@@ -12,36 +12,20 @@ import pytest
 import trimesh
 
 from helpers.robots import arm
+from helpers.uploads import URDF, archive
 from helpers.viser_client import PlainClient
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
-from morphgen.grammar.library import default_library
 from morphgen.viewer import uploads
 from morphgen.viewer.robot_files import bundle_files, zip_files
-from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
+from morphgen.viewer.robot_uri import UriError, read_robot_uri
 from morphgen.viewer.uploads import UploadError, store_upload
 
-URDF = b'<robot name="r"><link name="a"/></robot>'
 MESHED = (
     b'<robot name="r"><link name="a"><visual><geometry><mesh filename="%s"/>'
     b"</geometry></visual></link></robot>"
 )
-
-
-@pytest.fixture
-def access(tmp_path):
-    folder = tmp_path / "uploads"
-    folder.mkdir()
-    return FileAccess(default_library().folders, (tmp_path.resolve(),), folder.resolve())
-
-
-def archive(files, how=zipfile.ZIP_STORED):
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", how) as made:
-        for name, data in files.items():
-            made.writestr(name, data)
-    return content.getvalue()
 
 
 def test_urdf_upload_is_kept_and_read(access):
@@ -63,8 +47,10 @@ def test_zipped_bundle_survives_a_round_trip(access, tmp_path):
     ("name", "content", "why"),
     [
         ("a.urdf", b"no xml", "a.urdf:1:1"),
-        ("a.urdf", b"<mujoco/>", "its root is <mujoco>"),
-        ("a.xacro", URDF, "expected a .urdf, or a .zip"),
+        ("a.urdf", b"<sdf/>", "its root is <sdf>; expected <robot> of a URDF, or <mujoco>"),
+        ("a.xml", b"<mujocoinclude/>", "holds no .urdf and no MJCF"),
+        ("a.xml", b"<mujoco", "a.xml:1:"),
+        ("a.xacro", URDF, "expected a .urdf, an MJCF as .xml, or a .zip"),
         ("a.zip", b"PK nothing", "not a readable zip"),
         ("..", URDF, "invalid file name"),
         ("a.zip", archive({"b.txt": b""}), "holds no .urdf"),
@@ -240,7 +226,7 @@ def test_xacro_uploads_are_not_read(access):
     folder = access.uploads / "1"
     folder.mkdir()
     (folder / "a.xacro").write_bytes(XACRO)
-    with pytest.raises(UriError, match="only a URDF or a bundle is read from an upload"):
+    with pytest.raises(UriError, match="only a URDF, an MJCF or a bundle is read from an upload"):
         read_robot_uri("upload:1/a.xacro", access)
 
 
@@ -306,9 +292,11 @@ def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
         ("a.zip", linked("x", "/etc/passwd"), "is a link"),
         ("a.urdf", b"", "a.urdf:1:1"),
         ("a.urdf", MESHED % b"x.stl", "is not in the upload"),
+        ("a.xml", b'<mujoco><asset><mesh file="x.stl"/></asset></mujoco>',
+         "mesh 'x': not in the upload"),
         ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
     ],
-)
+)  # fmt: skip
 def test_hostile_upload_is_rejected_with_a_message(shared_viewer, capfd, name, content, why):
     on = shared_viewer
     before = set(on.files.uploads.iterdir())

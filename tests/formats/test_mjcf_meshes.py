@@ -1,0 +1,191 @@
+"""Shapes of an MJCF without a mesh file have the shape and the mass that MuJoCo gives them."""
+
+import struct
+from importlib.resources import files
+
+import mujoco
+import numpy as np
+import pytest
+
+from helpers.mjcf import read, write
+from morphgen.errors import MeshError
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.model import msh_files
+from morphgen.model.geometry import Mesh, Sphere
+from morphgen.model.mesh import convex_hull, load_mesh
+
+TETRAHEDRON = "0 0 0  1 0 0  0 1 0  0 0 1"
+FACES = "0 2 1  0 1 3  0 3 2  1 2 3"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def directions():
+    vectors = np.random.default_rng(0).normal(size=(200, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def shape_support(shape):
+    """Return the support function of a mesh shape, in the frame of its link."""
+    T = shape.T_link_shape.matrix
+    points = np.asarray(load_mesh(shape.geometry).vertices) @ T[:3, :3].T + T[:3, 3]
+    return (points @ directions().T).max(axis=0)
+
+
+def mujoco_support(model, geom):
+    """Return the support function of a mesh geom, in the frame of the world's only body."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mesh = model.mesh(model.geom_dataid[geom])
+    points = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+    points = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    return (points @ directions().T).max(axis=0)
+
+
+def assert_as_in_mujoco(robot, path):
+    """Compare mass, inertia and the support function of all meshes of a robot of one link."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    inertial = robot.root.inertial
+    assert inertial.mass == pytest.approx(model.body_mass[1])
+    np.testing.assert_allclose(inertial.com, model.body_ipos[1], atol=1e-9)
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, model.body_iquat[1])
+    R = R.reshape(3, 3)
+    expected = R @ np.diag(model.body_inertia[1]) @ R.T
+    np.testing.assert_allclose(inertial.matrix, expected, atol=1e-6 * model.body_inertia[1].max())
+    meshes = [s for s in robot.root.collisions if isinstance(s.geometry, Mesh)]
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    geoms = np.flatnonzero(is_mesh & (model.geom_contype > 0))
+    assert len(meshes) == len(geoms) > 0
+    for shape, geom in zip(meshes, geoms, strict=True):
+        np.testing.assert_allclose(shape_support(shape), mujoco_support(model, geom), atol=1e-6)
+
+
+def test_vertices_in_the_document_become_files_of_the_bundle(tmp_path):
+    points = " ".join(f"{x:.4f}" for x in np.random.default_rng(1).normal(size=60))
+    path = write(
+        tmp_path,
+        f"""<asset>
+          <mesh name="cloud/1" vertex="{points}" scale="1 2 -1" refpos="0.1 0.2 0.3"/>
+          <mesh name="faces" vertex="{TETRAHEDRON}" face="{FACES}" refquat="1 1 0 0"/>
+        </asset><worldbody><body name="base">
+          <geom type="mesh" mesh="cloud/1" pos="0.1 0.2 0.3" euler="10 20 30"/>
+          <geom type="mesh" mesh="faces" pos="0 0 1"/>
+        </body></worldbody>""",
+    )
+    robot = read_mjcf(path)
+    assert_as_in_mujoco(robot, path)
+    cloud, faces = (shape.geometry for shape in robot.root.collisions)
+    assert load_mesh(cloud).is_watertight
+    assert load_mesh(cloud).volume > 0
+    assert load_mesh(faces).volume == pytest.approx(1 / 6)
+    bundle = write_bundle(robot, tmp_path / "test", picture=False)
+    names = {file.name.rpartition("-")[0] for file in (bundle / "meshes").iterdir()}
+    assert names == {"cloud_1", "faces"}
+    assert_as_in_mujoco(read_bundle(bundle), bundle / "robot.xml")
+
+
+def test_the_same_vertices_have_the_same_file(tmp_path, cache):
+    content = f"""<asset><mesh name="m" vertex="{TETRAHEDRON}"/></asset><worldbody>
+    <body name="a"><geom type="mesh" mesh="m"/></body></worldbody>"""
+    first, second = (read(tmp_path / folder, content) for folder in "ab")
+    assert first.root == second.root
+    assert len([*cache.rglob("*.stl")]) == 1
+
+
+def test_a_legacy_binary_mesh_is_read_as_by_mujoco(tmp_path):
+    msh = files("mujoco") / "testdata" / "abdomen_1_body.msh"
+    (tmp_path / "abdomen.msh").write_bytes(msh.read_bytes())
+    path = write(
+        tmp_path,
+        """<asset><mesh file="abdomen.msh" scale="0.5 1 2"/></asset><worldbody><body name="a">
+        <geom type="mesh" mesh="abdomen" pos="0.1 0.2 0.3" euler="10 20 30"/></body></worldbody>""",
+    )
+    robot = read_mjcf(path)
+    assert_as_in_mujoco(robot, path)
+    assert len(load_mesh(robot.root.collisions[0].geometry).faces) == 1458
+
+
+def msh(vertices=4, normals=0, coordinates=0, triangles=4, *, points=None, faces=None):
+    """Return a tetrahedron whose header has the given counts."""
+    points = [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1] if points is None else points
+    faces = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3] if faces is None else faces
+    header = struct.pack("<4i", vertices, normals, coordinates, triangles)
+    return header + struct.pack(f"<{len(points)}f{len(faces)}i", *points, *faces)
+
+
+def test_a_legacy_binary_mesh_without_triangles_is_its_hull(tmp_path, monkeypatch):
+    (tmp_path / "m.msh").write_bytes(msh(triangles=0, faces=[]))
+    assert load_mesh(Mesh(tmp_path / "m.msh")).volume == pytest.approx(1 / 6)
+    monkeypatch.setattr(msh_files, "MAX_HULL_VERTICES", 3)
+    (tmp_path / "n.msh").write_bytes(msh(triangles=0, faces=[]))
+    with pytest.raises(MeshError, match="4 vertices without triangles; at most 3 are read"):
+        load_mesh(Mesh(tmp_path / "n.msh"))
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "0 bytes; expected a header of 16"),
+        (msh(vertices=3), "its header counts 3 vertices"),
+        (msh(normals=3), "its header counts 4 vertices, 3 normals"),
+        (msh(coordinates=-4), "-4 texture coordinates"),
+        (msh(triangles=-1), "-1 triangles"),
+        (msh(vertices=2**31 - 1, triangles=2**31 - 1), "112 bytes; its header counts 2147483647 "),
+        (msh() + b"\0", "113 bytes; .* which take 112"),
+        (msh(faces=[0, 2, 1, 0, 1, 4, 0, 3, 2, 1, 2, 3]), "vertex 4; expected 0 to 3"),
+        (msh(faces=[0, 2, 1, 0, 1, -1, 0, 3, 2, 1, 2, 3]), "vertex -1; expected 0 to 3"),
+        (msh(points=[float("nan")] * 12), "a vertex is not finite"),
+        (
+            msh(triangles=0, faces=[], points=[0, 0, 0, 1, 0, 0, 0, 1, 0, 1, 1, 0]),
+            "no triangles, and its vertices are flat",
+        ),
+        (b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n", "its header counts 1936018724 vertices"),
+    ],
+)
+def test_an_invalid_legacy_binary_mesh_is_refused(content, why, tmp_path):
+    (tmp_path / "m.msh").write_bytes(content)
+    with pytest.raises(MeshError, match=why) as error:
+        load_mesh(Mesh(tmp_path / "m.msh"))
+    assert str(tmp_path / "m.msh") in str(error.value)
+
+
+def test_an_ellipsoid_is_a_convex_mesh_of_its_volume_and_keeps_its_mass(tmp_path):
+    path = write(
+        tmp_path,
+        """<worldbody><body name="a"><geom name="egg" type="ellipsoid" size="0.1 0.2 0.3"
+        pos="0.1 0.2 0.3" euler="10 20 30" density="500"/>
+        <geom type="ellipsoid" size="0.1 0.1 0.1"/></body></worldbody>""",
+    )
+    robot = read_mjcf(path)
+    egg, ball = robot.root.collisions
+    assert robot.root.visuals[0].geometry == egg.geometry
+    assert ball.geometry == Sphere(0.1)
+    radii = np.array((0.1, 0.2, 0.3))
+    volume = 4 / 3 * np.pi * radii.prod()
+    assert load_mesh(egg.geometry).volume == pytest.approx(volume, rel=1e-6)
+    assert convex_hull(egg.geometry).volume == pytest.approx(volume, rel=1e-6)
+    T = egg.T_link_shape.matrix
+    exact = np.linalg.norm(directions() @ T[:3, :3] * radii, axis=1) + directions() @ T[:3, 3]
+    assert np.abs(shape_support(egg) - exact).max() < 0.012 * radii.max()
+    # The inertia about the body's origin is that of the solids, not of the mesh.
+    masses = np.array((500 * volume, 1000 * 4 / 3 * np.pi * 0.1**3))
+    squares = np.stack([radii**2, np.full(3, 0.01)])
+    inertia = np.zeros((3, 3))
+    for mass, square, R, p in zip(
+        masses, squares, (T[:3, :3], np.eye(3)), (T[:3, 3], np.zeros(3)), strict=True
+    ):
+        inertia += R @ np.diag(mass / 5 * (square.sum() - square)) @ R.T
+        inertia += mass * (p @ p * np.eye(3) - np.outer(p, p))
+    inertial = robot.root.inertial
+    com = np.array(inertial.com)
+    at_origin = inertial.matrix + inertial.mass * (com @ com * np.eye(3) - np.outer(com, com))
+    assert inertial.mass == pytest.approx(masses.sum())
+    np.testing.assert_allclose(at_origin, inertia, rtol=1e-6, atol=1e-9)
+    (finding,) = robot.source_findings
+    assert (finding.code, finding.where) == ("ellipsoid-mesh", "robot.xml: geom 'egg'")
