@@ -1,4 +1,4 @@
-"""``morphgen fit``: meshes to boxes, cylinders and spheres, or to spheres alone."""
+"""``morphgen fit``: meshes to boxes, cylinders, spheres and capsules, or to spheres alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot_fit import FitReport
     from morphgen.model.robot import Robot
 
-DEFAULT_IOU, DEFAULT_CONFIGURATIONS = 0.9, 1000
+DEFAULT_IOU, DEFAULT_SEARCH, DEFAULT_CONFIGURATIONS = 0.9, "clusters", 1000
 COLUMNS = {
     "link": "",
     "primitives": "",
@@ -69,6 +69,13 @@ class Target:
         type=float,
         default=DEFAULT_IOU,
         help="use the fewest primitives that reach this intersection over union",
+    ),
+    option(
+        "--search",
+        default=DEFAULT_SEARCH,
+        metavar="SEARCH",
+        help="with --max-primitives: clusters, or residual, which takes two to three times as "
+        "long, gets closer and uses capsules, too (default: clusters)",
     ),
     option(
         "--spheres",
@@ -121,11 +128,18 @@ def fit(args: argparse.Namespace) -> None:
             "--max-primitives": args.max_primitives is not None,
             "--iou": args.iou != DEFAULT_IOU,
             "--enclose": args.enclose,
+            "--search": args.search != DEFAULT_SEARCH,
         }
         opt.reject_idle(primitive_options, "only without --spheres")
     max_primitives = 1 if args.max_primitives is None else args.max_primitives
     options = FitOptions(
-        max_primitives, args.iou, args.enclose, args.seed, args.spheres, args.cover
+        max_primitives,
+        args.iou,
+        args.enclose,
+        args.seed,
+        args.spheres,
+        args.cover,
+        args.search,
     )
     if args.all:
         _fit_all_parts(args)
@@ -250,6 +264,7 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
         "--no-picture": args.no_picture,
         "--max-primitives": args.max_primitives is not None,
         "--iou": args.iou != DEFAULT_IOU,
+        "--search": args.search != DEFAULT_SEARCH,
         "--spheres": args.spheres is not None,
         "--configurations": args.configurations != DEFAULT_CONFIGURATIONS,
         "--seed": args.seed,

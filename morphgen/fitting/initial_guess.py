@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
-from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.soft_iou import Candidates, covered, overlaps
+from morphgen.fitting.soft_iou import SEARCH_KINDS, Candidates, covered, overlaps
 from morphgen.typing import Array
 
 TRIM = 0.03
@@ -19,7 +18,11 @@ _NUM_CLUSTERS = (1, 2, 3)
 """Numbers of clusters of the uncovered points, each of which may get a further primitive."""
 _MIN_HALF_EXTENT = 1e-3
 """Smallest half extent of a guess, relative to the solid's size."""
-_BOX, _CYLINDER, _SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))
+_CAP_LENGTH = 2 / 3
+"""Length of a cylinder of the volume of a capsule's cap, relative to the radius."""
+_BOX, _CYLINDER, _SPHERE, _CAPSULE = (
+    SEARCH_KINDS.index(kind) for kind in ("box", "cylinder", "sphere", "capsule")
+)
 _AXES_TO_Z = (
     np.eye(3),
     np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -28,7 +31,9 @@ _AXES_TO_Z = (
 """Rotations whose z axis is the z, x and y axis."""
 
 
-def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
+def around(
+    points: Array, axes: list[Array], *, sphere: bool = False, capsules: bool = False
+) -> Candidates:
     """Return guesses of one primitive each around a point cloud.
 
     Args:
@@ -36,10 +41,17 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
         axes: Rotations, shape (3, 3) each, whose axes boxes and cylinders follow, besides the
             principal axes of the points.
         sphere: Add a sphere.
+        capsules: Add a capsule for each cylinder.
     """
     _, principal_axes = np.linalg.eigh(np.cov(points.T))
     principal_axes *= (1.0, 1.0, np.linalg.det(principal_axes))  # right-handed
     guesses = [guess for R in (*axes, principal_axes) for guess in _along(points, R)]
+    if capsules:
+        guesses += [
+            (_CAPSULE, centre, R, np.array([r, r, max(h - _CAP_LENGTH * r, _MIN_HALF_EXTENT)]))
+            for kind, centre, R, (r, _, h) in guesses
+            if kind == _CYLINDER
+        ]
     if sphere:
         centre = points.mean(axis=0)
         # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
@@ -56,7 +68,13 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
 
 
 def by_pieces(
-    points: Array, inside: NDArray[np.bool_], weights: Array, k: int, seeds: list[int]
+    points: Array,
+    inside: NDArray[np.bool_],
+    weights: Array,
+    k: int,
+    seeds: list[int],
+    *,
+    capsules: bool = False,
 ) -> Candidates | None:
     """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
 
@@ -67,6 +85,7 @@ def by_pieces(
         k: Number of primitives.
         seeds: Seeds of one clustering each. A clustering gives three guesses: the best kind for
             each cluster, only boxes, and only cylinders.
+        capsules: Capsules are among the kinds, and a fourth guess has only capsules.
 
     Returns:
         The guesses; None if a cluster has too few points in every clustering.
@@ -78,7 +97,9 @@ def by_pieces(
         if np.bincount(label, minlength=k).min() < MIN_POINTS:
             continue
         pieces = [
-            _best_of_each_kind(cloud[label == j], weights[inside][label == j], *outside)
+            _best_of_each_kind(
+                cloud[label == j], weights[inside][label == j], *outside, capsules=capsules
+            )
             for j in range(k)
         ]
         rows.append(Candidates.join(pieces))
@@ -86,7 +107,13 @@ def by_pieces(
 
 
 def by_growth(
-    fewer: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
+    fewer: Candidates,
+    points: Array,
+    inside: NDArray[np.bool_],
+    weights: Array,
+    seed: int,
+    *,
+    capsules: bool = False,
 ) -> Candidates | None:
     """Return guesses with one more primitive, around a part of the solid that is not covered.
 
@@ -96,6 +123,7 @@ def by_growth(
         inside: Points that are inside the solid, shape (n,).
         weights: Weights of the points, shape (n,).
         seed: Seed of the clusterings of the uncovered points.
+        capsules: Add guesses with a capsule.
 
     Returns:
         The guesses; None if too few points are uncovered.
@@ -110,30 +138,50 @@ def by_growth(
         for j in range(n):
             if np.count_nonzero(label == j) >= MIN_POINTS:
                 piece = cloud[label == j], weights[missed][label == j]
-                more = _best_of_each_kind(*piece, *outside)
-                rows.append(Candidates.join([fewer.take(np.zeros(3, np.intp)), more]))
+                more = _best_of_each_kind(*piece, *outside, capsules=capsules)
+                rows.append(Candidates.join([fewer.take(np.zeros(len(more.kinds), int)), more]))
     return Candidates.stack(rows) if rows else None
 
 
+def by_replacement(
+    candidates: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
+) -> Candidates | None:
+    """Return guesses in which one primitive is replaced by one where the rest leaves a gap.
+
+    Each primitive of each candidate is replaced in turn, also by capsules. Arguments and result
+    are those of ``by_growth``.
+    """
+    n, k = candidates.kinds.shape
+    rows = [
+        by_growth(rest.without(i), points, inside, weights, seed, capsules=True)
+        for rest in (candidates.take(np.array([row])) for row in range(n))
+        for i in range(k)
+    ]
+    guesses = [guess for guess in rows if guess is not None]
+    return Candidates.stack(guesses) if guesses else None
+
+
 def _best_of_each_kind(
-    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array
+    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array, *, capsules: bool
 ) -> Candidates:
-    """Return three guesses around a cluster: the best, the best box, the best cylinder.
+    """Return guesses around a cluster: the best, the best box, the best cylinder, a capsule.
 
     Args:
         piece: Points of the cluster, shape (n, 3).
         piece_weights: Weights of these points, shape (n,).
         outside: Points outside the solid, shape (m, 3).
         outside_weights: Weights of these points, shape (m,).
+        capsules: Guess capsules, too.
     """
-    guesses = around(piece, [np.eye(3)])
+    guesses = around(piece, [np.eye(3)], capsules=capsules)
     points = np.concatenate([piece, outside])
     weights = np.concatenate([piece_weights, outside_weights])
     ious = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
     kinds = guesses.kinds[:, 0]
     best = [
         int(np.argmax(np.where(allowed, ious, -1.0)))
-        for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
+        for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER, kinds == _CAPSULE)
+        if allowed.any()
     ]
     return guesses.take(np.array(best))
 

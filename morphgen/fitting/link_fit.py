@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Literal, get_args
 
 from morphgen.errors import FitError
 from morphgen.fitting.enclose_pieces import enclose_solid
@@ -15,6 +16,9 @@ from morphgen.fitting.sphere_search import best_spheres
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model.geometry import Shape, Sphere
 
+Search = Literal["clusters", "residual"]
+"""How several primitives are searched for; ``residual`` is slower, better, and uses capsules."""
+SEARCHES: tuple[Search, ...] = get_args(Search)
 MAX_COVER = 0.9999
 """Largest share that spheres can be required to cover: more cannot be counted on sample points."""
 
@@ -35,6 +39,8 @@ class FitOptions:
     """Number of spheres per link, of a fit with spheres alone; None for a fit with primitives."""
     cover: float | None = None
     """Share of a link's volume that its spheres must cover; None for the largest IoU."""
+    search: Search = "clusters"
+    """How several primitives of largest intersection over union are searched for."""
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -42,6 +48,22 @@ class FitOptions:
         Raises:
             FitError: If one is out of its range, or has no effect on a fit of this kind.
         """
+        self._check_spheres()
+        if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
+            raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
+        if not 0 < self.iou <= 1:
+            raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
+        if self.seed < 0:
+            raise FitError(f"seed {self.seed}: expected 0 or more")
+        if self.search not in SEARCHES:
+            raise FitError(f"search {self.search!r}: expected {' or '.join(SEARCHES)}")
+        if self.search == "residual" and (self.max_primitives == 1 or self.enclose):
+            raise FitError(
+                "search 'residual': expected max_primitives of 2 or more, neither enclose nor "
+                "spheres; 'clusters' is the search for one primitive"
+            )
+
+    def _check_spheres(self) -> None:
         if self.spheres is not None:
             if not 1 <= self.spheres <= MAX_PRIMITIVES:
                 raise FitError(f"{self.spheres} spheres: expected 1 to {MAX_PRIMITIVES} per link")
@@ -52,12 +74,6 @@ class FitOptions:
                 raise FitError(f"cover {self.cover:g}: expected a number of spheres, too")
             if not 0 < self.cover <= MAX_COVER:
                 raise FitError(f"cover {self.cover:g}: expected more than 0, at most {MAX_COVER}")
-        if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
-            raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
-        if not 0 < self.iou <= 1:
-            raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
-        if self.seed < 0:
-            raise FitError(f"seed {self.seed}: expected 0 or more")
 
 
 @dataclass(frozen=True)
@@ -65,7 +81,7 @@ class LinkFit:
     """Primitives that replace the shapes of a link, with their measured quality."""
 
     primitives: tuple[Shape, ...]
-    """Boxes, cylinders and spheres in the link frame."""
+    """Boxes, cylinders, spheres and capsules in the link frame."""
     single: Shape | None
     """The single primitive of largest overlap; None if it was not searched for."""
     solid: str
@@ -130,7 +146,7 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     for _ in range(1, options.max_primitives):
         if best.iou >= options.iou:
             break
-        more = best_several(target, latest, options.seed)
+        more = best_several(target, latest, options.seed, residual=options.search == "residual")
         if more is None:
             break
         latest = more

@@ -72,6 +72,7 @@ class FitReport:
                 "max_primitives": options.max_primitives,
                 "iou": options.iou,
                 "enclose": options.enclose,
+                "search": options.search,
             }
         return {
             "robot": self.robot,

@@ -15,11 +15,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
-from morphgen.fitting.canonical import KINDS, canonical
-from morphgen.fitting.initial_guess import MIN_POINTS, around, by_growth, by_pieces
-from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
+from morphgen.fitting.canonical import canonical
+from morphgen.fitting.initial_guess import (
+    MIN_POINTS,
+    around,
+    by_growth,
+    by_pieces,
+    by_replacement,
+)
+from morphgen.fitting.soft_iou import SEARCH_KINDS, Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
-from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import normalize
 from morphgen.processes import one_torch_thread
 from morphgen.typing import Array
@@ -34,6 +40,12 @@ NUM_CLUSTERINGS = 4
 """Number of clusterings from which the search for several primitives starts."""
 NUM_REFINED = 2
 """Number of candidates that are refined on all sample points."""
+REPLACEMENT_POINTS = 2**12
+"""Number of sample points on which replacements of primitives are screened and improved."""
+NUM_REPLACEMENTS = 16
+"""Number of replacements that are improved in a round; 24 take longer and bring nothing."""
+MAX_ROUNDS = 6
+"""Largest number of rounds of replacements."""
 DIGITS = 6
 """Decimals of dimensions and positions in metres; quaternions have three more."""
 
@@ -77,14 +89,16 @@ class SampledSolid:
             strict=True,
         ):
             x, y, z = np.maximum(halves, 10.0**-DIGITS).tolist()
-            geometry: Box | Cylinder | Sphere
-            match KINDS[kind]:
+            geometry: Box | Cylinder | Sphere | Capsule
+            match SEARCH_KINDS[kind]:
                 case "box":
                     geometry = Box((2 * x, 2 * y, 2 * z))
                 case "cylinder":
                     geometry = Cylinder(x, 2 * z)
                 case "sphere":
                     geometry = Sphere(x)
+                case "capsule":
+                    geometry = Capsule(x, 2 * z)
             a, b, c = np.round(centre, DIGITS).tolist()
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
             pose = Pose((a, b, c), normalize((w, i, j, k)))
@@ -136,30 +150,79 @@ def best_single(target: SampledSolid) -> SearchResult:
     with one_torch_thread():
         cloud = target.points[target.inside]
         start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
-        return _climb(target, start, (0.03, 0.008))
+        return _refine(target, ascend_coarsely(target, start, target.weights, (0.03, 0.008)))
 
 
-def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
+def best_several(
+    target: SampledSolid, fewer: SearchResult, seed: int, *, residual: bool = False
+) -> SearchResult | None:
     """Return the primitives of largest IoU, one more than in an earlier result.
 
-    None if the solid has too few sample points for them.
+    Args:
+        target: The solid.
+        fewer: The earlier result.
+        seed: Seed of the clusterings.
+        residual: Use capsules, too, and replace primitives one at a time by others where the rest
+            leaves the solid uncovered.
+
+    Returns:
+        The primitives; None if the solid has too few sample points for them.
     """
     seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(NUM_CLUSTERINGS)]
     subset = slice(4 * COARSE_POINTS)
     cloud = target.points[subset], target.inside[subset], target.weights[subset]
     k = len(fewer.shapes) + 1
     with one_torch_thread():
-        starts = by_pieces(*cloud, k, seeds), by_growth(fewer.candidate, *cloud, seeds[0])
-        start = [guesses for guesses in starts if guesses is not None]
-        return _climb(target, Candidates.stack(start), (0.02, 0.006)) if start else None
+        starts = (
+            by_pieces(*cloud, k, seeds, capsules=residual),
+            by_growth(fewer.candidate, *cloud, seeds[0], capsules=residual),
+        )
+        guesses = [start for start in starts if start is not None]
+        if not guesses:
+            return None
+        start = Candidates.stack(guesses)
+        coarse = ascend_coarsely(target, start, target.weights, (0.02, 0.006))
+        return _refine(target, _with_replacements(target, coarse, seed) if residual else coarse)
 
 
-def _climb(target: SampledSolid, start: Candidates, tau: tuple[float, float]) -> SearchResult:
-    """Improve all candidates on few points, then the best ones on all points."""
+def _with_replacements(target: SampledSolid, candidates: Candidates, seed: int) -> Candidates:
+    """Replace primitives of the best candidates, one at a time, as long as it helps."""
+    subset = slice(REPLACEMENT_POINTS)
+    cloud = target.points[subset], target.inside[subset], target.weights[subset]
+    best, iou = _best(target, candidates)
+    for round_seed in np.random.SeedSequence(seed).generate_state(MAX_ROUNDS):
+        guesses = by_replacement(best, *cloud, int(round_seed))
+        if guesses is None:
+            break
+        # Equal guesses have equal overlaps, of which ``unique`` keeps one.
+        _, order = np.unique(-overlaps(guesses, *cloud), return_index=True)
+        replaced = ascend(
+            guesses.take(order[:NUM_REPLACEMENTS]),
+            *cloud[:2],
+            weights=cloud[2],
+            num_steps=60,
+            tau=(0.015, 0.004),
+            rate=(0.01, 0.002),
+        )
+        previous = iou
+        best, iou = _best(target, Candidates.stack([best, replaced]))
+        if iou == previous:
+            break
+    return best
+
+
+def _best(target: SampledSolid, candidates: Candidates) -> tuple[Candidates, float]:
+    """Return the candidates of largest IoU, and that of the best one."""
+    ious = overlaps(candidates, target.points, target.inside, target.weights)
+    order = np.argsort(-ious, kind="stable")[:NUM_REFINED]
+    return candidates.take(order), float(ious[order[0]])
+
+
+def _refine(target: SampledSolid, coarse: Candidates) -> SearchResult:
+    """Improve the best candidates on all points, and return the best one."""
     points, inside, weights = target.points, target.inside, target.weights
-    coarse = ascend_coarsely(target, start, weights, tau)
-    best = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")[:NUM_REFINED]
-    fine = ascend_finely(target, coarse.take(best), weights)
+    best, _ = _best(target, coarse)
+    fine = ascend_finely(target, best, weights)
     ious = overlaps(fine, points, inside, weights)
     row = int(np.argmax(ious))
     return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))

@@ -53,7 +53,7 @@ _Iou = Annotated[float, Meta(ge=0, le=1)]
 
 
 class ShapeRecord(Record, frozen=True):
-    """A box, cylinder or sphere as a file holds it; exactly one of the three sizes is given."""
+    """A primitive as a file holds it; exactly one of the four sizes is given."""
 
     xyz: tuple[FiniteNumber, FiniteNumber, FiniteNumber]
     """Position in the link frame [m]."""
@@ -65,10 +65,13 @@ class ShapeRecord(Record, frozen=True):
     """Radius and length [m]."""
     sphere: tuple[PositiveNumber] | None = None
     """Radius [m]."""
+    capsule: tuple[PositiveNumber, PositiveNumber] | None = None
+    """Radius, and length without the caps [m]."""
 
     def __post_init__(self) -> None:
-        if sum(size is not None for size in (self.box, self.cylinder, self.sphere)) != 1:
-            raise ValueError("expected one of box, cylinder and sphere")
+        sizes = (self.box, self.cylinder, self.sphere, self.capsule)
+        if sum(size is not None for size in sizes) != 1:
+            raise ValueError("expected one of box, cylinder, sphere and capsule")
         if not math.isclose(math.hypot(*self.quaternion), 1, rel_tol=1e-6):
             raise ValueError(f"quaternion {list(self.quaternion)} is not of unit length")
 
@@ -80,9 +83,11 @@ class ShapeRecord(Record, frozen=True):
             geometry = Box(self.box)
         elif self.cylinder:
             geometry = Cylinder(*self.cylinder)
-        else:
-            assert self.sphere
+        elif self.sphere:
             geometry = Sphere(*self.sphere)
+        else:
+            assert self.capsule
+            geometry = Capsule(*self.capsule)
         return Shape(geometry, Pose(self.xyz, self.quaternion))
 
 
@@ -230,7 +235,7 @@ def fits_text(fits: Mapping[str, StoredFit]) -> str:
 
 
 def shape_to_data(shape: Shape) -> dict[str, object]:
-    """Return the data of a ``ShapeRecord`` for a box, cylinder or sphere."""
+    """Return the data of a ``ShapeRecord`` for a primitive."""
     size: dict[str, object]
     match shape.geometry:
         case Box(edges):
@@ -239,8 +244,10 @@ def shape_to_data(shape: Shape) -> dict[str, object]:
             size = {"cylinder": [radius, length]}
         case Sphere(radius):
             size = {"sphere": [radius]}
-        case other:
-            raise ValueError(f"{type(other).__name__} is not a box, cylinder or sphere")
+        case Capsule(radius, length):
+            size = {"capsule": [radius, length]}
+        case Mesh(path):
+            raise ValueError(f"mesh {path} is not a primitive")
     pose = shape.T_link_shape
     return size | {"xyz": list(pose.position), "quaternion": list(pose.quaternion)}
 

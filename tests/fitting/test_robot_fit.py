@@ -21,15 +21,21 @@ from morphgen.fitting.part_fits import (
     store_part,
 )
 from morphgen.fitting.quality import quality, signed_distance
-from morphgen.fitting.replace_collision import as_primitives, stored_primitives, with_primitives
+from morphgen.fitting.replace_collision import (
+    as_primitives,
+    stored_primitives,
+    with_fits,
+    with_primitives,
+)
 from morphgen.fitting.robot_fit import fit_links
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.fits import SUFFIX, read_stored_fits, shapes_key, shapes_to_fit
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import IDENTITY, Box, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import IDENTITY, Box, Capsule, Mesh, Pose, Shape, Sphere, StoredFit
 from morphgen.model.robot import Joint, Link, Robot
 
 LIBRARY = default_library()
@@ -74,8 +80,9 @@ def test_mirrored_links_share_a_fit(tmp_path, wedge):
 def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path, wedge):
     ball = trimesh.creation.icosphere(3, 0.1)
     robot = arm([mesh_shape(tmp_path, wedge, "a.stl")], [mesh_shape(tmp_path, ball, "b.stl")])
-    one, two = (fit_links(robot, FitOptions(), jobs=jobs).links for jobs in (1, 2))
-    assert [row.fit.primitives for row in one] == [row.fit.primitives for row in two]
+    for options in (FitOptions(), FitOptions(max_primitives=2, iou=1.0, search="residual")):
+        one, two = (fit_links(robot, options, jobs=jobs).links for jobs in (1, 2))
+        assert [row.fit.primitives for row in one] == [row.fit.primitives for row in two]
 
 
 def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
@@ -143,6 +150,9 @@ def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
         ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
         ({"iou": 1.5}, "IoU 1.5"),
         ({"seed": -1}, "seed -1"),
+        ({"search": "greedy"}, "search 'greedy': expected clusters or residual"),
+        ({"search": "residual"}, "search 'residual': expected max_primitives of 2 or more"),
+        ({"search": "residual", "max_primitives": 2, "enclose": True}, "neither enclose"),
     ],
 )
 def test_options_out_of_range_are_errors(options, message):
@@ -167,6 +177,16 @@ def test_replacing_collisions_preserves_masses_and_joints():
     assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
     assert list(SelfCollisionChecker(primitive_robot).penetrations([primitive_robot.home])) == [{}]
     assert morphgen.check(primitive_robot) == morphgen.check(meshes)
+
+
+def test_fitted_capsules_survive_a_bundle(tmp_path, wedge):
+    pose = Pose.from_xyz_rpy((0.1, 0.1, 0.05), (0.3, -0.5, 2.0))
+    fitted, token = Shape(Capsule(0.03, 0.123457), pose), Shape(Box((0.3, 0.2, 0.1)))
+    robot = with_primitives(arm([mesh_shape(tmp_path, wedge)]), {"l0": [fitted]})
+    robot = with_fits(robot, {"l0": StoredFit("l0", token, (fitted,), 0.5, 0.6)})
+    read = read_bundle(write_bundle(robot, tmp_path / "made", picture=False))
+    assert as_written(read).link("l0").collisions == robot.link("l0").collisions
+    assert token_shapes(read) == {"l0": token}
 
 
 def test_visuals_are_replaced_on_request(tmp_path, wedge):
