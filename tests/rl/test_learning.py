@@ -1,19 +1,13 @@
 """PPO learns to reach with an arm of three joints, from nothing."""
 
-from contextlib import closing
+import json
 from dataclasses import replace
 
 import pytest
 
 import morphgen
+from morphgen.cli import main
 from morphgen.model.robot import TOOL
-from morphgen.rl.baselines.simple import Random
-from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.inference import Policy, PolicyController
-from morphgen.rl.learner_state import state_of
-from morphgen.rl.ppo import Learner
-from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.make import make_batch
 
 
 def arm_of_three_joints():
@@ -31,33 +25,16 @@ def arm_of_three_joints():
     return replace(made, joints=joints, home=home)
 
 
-def successes(controller, robot):
-    """Share of a hundred episodes that end within 3 cm of the goal."""
-    kind = "continuous"
-    with closing(
-        make_batch("reach", [robot], 100, sim="mujoco", kind=kind, seed=99, max_links=10)
-    ) as batch:
-        return sum(each.success for each in run_episodes(batch, controller, 1)) / 100
-
-
 @pytest.mark.slow
-def test_an_arm_of_three_joints_learns_to_reach():
-    robot = arm_of_three_joints()
-    assert successes(Random(0), robot) < 0.1
-    policy = PolicyConfig("se", discrete=False)
-    config = PPOConfig(
-        total_timesteps=4_000_000,
-        num_steps=32,
-        minibatches=8,
-        gamma=0.95,
-        learning_rate=5e-4,
-        desired_kl=0.01,
-    )
-    with closing(
-        make_batch("reach", [robot], 512, sim="mujoco", kind="continuous", max_links=10)
-    ) as batch:
-        learner = Learner(batch, policy, config, seed=0)
-        while not learner.done:
-            learner.iterate()
-        learned = state_of(learner)
-    assert successes(PolicyController(Policy(learned, "deterministic", 0)), robot) >= 0.8
+@pytest.mark.parametrize("agent", ["se", "me-graph"])
+def test_an_arm_of_three_joints_learns_to_reach(agent, tmp_path, capsys):
+    arm, run = str(tmp_path / "arm"), str(tmp_path / "run")
+    morphgen.write(arm_of_three_joints(), arm)
+    options = ("--agent", agent, "--preset", "fast", "--steps", "400000", "--out", run)
+    assert main(["train", arm, "task=reach", *options, "--no-tensorboard"]) == 0
+    capsys.readouterr()
+    chosen = ("--mode", "deterministic", "--episodes", "100", "--json")
+    assert main(["eval", run, *chosen]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["deterministic"]
+    assert row["random_success"] < 0.1
+    assert row["success"] >= 0.8
