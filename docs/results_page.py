@@ -32,6 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
 IMAGES = ROOT / "docs/images/results"
 STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
+TASKS = ("reach", "reach-obstacles", "push")
 SPLITS = (
     "interpolation/arm3",
     "interpolation/panda",
@@ -115,34 +116,35 @@ def by_mean(modes: Modes) -> Mapping[Side, Result]:
 def split_table(task: str) -> str:
     """Return the table of a task: every split with all agents and baselines."""
     lines = []
+    with_scores = task != "push"  # the score of push is its success
     for split in SPLITS:
         found: dict[tuple[str, int, str], Modes] = {}
         for study in STUDIES:
             note = ", four epochs" if "4epochs" in study else ""
             for (agent, steps), modes in results_of(study, f"{split}/{task}").items():
-                if agent in AGENTS or (agent in BASELINES and study == f"{task}-30m"):
+                if agent in (*AGENTS, *BASELINES):
                     found[agent, steps, note] = modes
         order = [*AGENTS, *BASELINES]
         for agent, steps, note in sorted(found, key=lambda key: (order.index(key[0]), key[1:])):
             modes = found[agent, steps, note]
-            lines.append([split, *_line(agent, steps, note, modes, task)])
+            lines.append([split, *_line(agent, steps, note, modes, with_scores)])
             split = ""
-    score = ["MT", "success", "ZS", "success"] if task == "reach" else ["MT", "ZS"]
+    score = ["MT", "success", "ZS", "success"] if with_scores else ["MT", "ZS"]
     headers = ["split", "agent", "transitions", "seeds", *score, "fine-tuned"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
-def _line(agent: str, steps: int, note: str, modes: Modes, task: str) -> list[str]:
+def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) -> list[str]:
     sides = by_mean(modes)
     cells = [AGENTS.get(agent, f"`{agent}`") + note]
     cells.append(f"{round(steps / 1e6)} million" if steps else "")
     cells.append(str(sides["train"].seeds) if steps else "")
     for side in SIDES:
         if side not in sides:
-            cells += [""] * (2 if task == "reach" else 1)
+            cells += [""] * (2 if with_scores else 1)
             continue
         success = sides[side].success.as_percent()
-        cells += [f"{sides[side].score:.1f}", success] if task == "reach" else [success]
+        cells += [f"{sides[side].score:.1f}", success] if with_scores else [success]
     tuned = [modes[key]["test"] for key in modes if key.startswith("fine-tuned 30,000")]
     cells.append(f"{tuned[0].success.value:.0%}" if tuned else "")
     return cells
@@ -253,7 +255,7 @@ def save(figure: Figure, name: str) -> Path:
 def tables() -> dict[str, str]:
     """Return the tables of the page by their names."""
     return {
-        **{task: split_table(task) for task in ("reach", "push")},
+        **{task: split_table(task) for task in TASKS},
         "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
         "similarity": TRANSFER["table"](similarity_rows()),
