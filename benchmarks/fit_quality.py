@@ -1,7 +1,7 @@
 """Quality of primitive fits, compared with trimesh's tightest bound and scikit-robot.
 
-    python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read] [--jobs 2]
-                                     [--json rows.json]
+    python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read]
+        [--fits one,four,residual,enclose] [--jobs 2] [--json rows.json]
 
 Measures every link of every real arm. All methods use the same solid and the measure of
 `morphgen.fitting.quality`. Prints one table per definition of the solid:
@@ -22,6 +22,7 @@ A row is an arm; values are means over its links (links with the same meshes are
 - CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
   and with up to four by both searches.
 
+``--fits`` names ours that are measured; the residual search takes most of the time.
 scikit-robot comes with `pip install morphgen[bench]`; without it its columns are missing.
 """
 
@@ -60,10 +61,14 @@ from morphgen.typing import Array
 T = TypeVar("T")
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
 """The arms for which issues of this project set targets."""
-ONE = FitOptions()
 UP_TO_FOUR = FitOptions(max_primitives=4, iou=1.0)
-RESIDUAL = replace(UP_TO_FOUR, search="residual")
-ENCLOSE = FitOptions(enclose=True)
+FITS = {
+    "one": FitOptions(),
+    "four": UP_TO_FOUR,
+    "residual": replace(UP_TO_FOUR, search="residual"),
+    "enclose": FitOptions(enclose=True),
+}
+"""Fits that are measured, by their name in the columns."""
 COLUMNS: dict[str, Callable[[Sequence[dict[str, float]], str], float]] = {
     "iou trimesh": lambda rows, key: _mean(rows, key),
     "iou skrobot": lambda rows, key: _mean(rows, key),
@@ -99,19 +104,24 @@ def main() -> int:
     )
     parser.add_argument("--only", default="", help="arms, separated by commas")
     parser.add_argument("--solid", default="link", help=f"of {', '.join(SOLIDS)}; by commas")
+    parser.add_argument("--fits", default=",".join(FITS), help="by commas (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write a row a link here")
     args = parser.parse_args()
     solids = args.solid.split(",")
     if unknown := set(solids) - set(SOLIDS):
         parser.error(f"no solid {', '.join(sorted(unknown))}; valid: {', '.join(SOLIDS)}")
+    fits = args.fits.split(",")
+    if unknown := set(fits) - set(FITS):
+        parser.error(f"no fit {', '.join(sorted(unknown))}; valid: {', '.join(FITS)}")
     peer = find_spec("skrobot") is not None
     tasks = link_tasks({name for name in args.only.split(",") if name})
     unique = {shapes_key(task.shapes): task for task in tasks}
     lines = []
     for name in solids:
         with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-            measured = pool.map(partial(_measure, solid_name=name, peer=peer), unique.values())
+            measure = partial(_measure, solid_name=name, fits=fits, peer=peer)
+            measured = pool.map(measure, unique.values())
             row_of = dict(zip(unique, tqdm(measured, total=len(unique), unit="link"), strict=True))
         found: dict[str, list[dict[str, float]]] = defaultdict(list)
         for task in tasks:
@@ -119,7 +129,7 @@ def main() -> int:
             found[task.arm].append(row)
             lines.append({"solid": name, "arm": task.arm, "link": task.link, **row})
         print(f"\nsolid: {name}")
-        _print(found, peer)
+        _print(found)
     if args.json:
         args.json.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
     if not peer:
@@ -127,8 +137,9 @@ def main() -> int:
     return 0
 
 
-def _print(found: Mapping[str, Sequence[dict[str, float]]], peer: bool) -> None:
-    columns = [name for name in COLUMNS if peer or "skrobot" not in name]
+def _print(found: Mapping[str, Sequence[dict[str, float]]]) -> None:
+    measured = {name for of in found.values() for row in of for name in row}
+    columns = [name for name in COLUMNS if name in measured]
     rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
     table = [*rows, *_means("mean of all arms", rows)]
     table += _means(f"mean of {', '.join(FOUR)}", [row for row in rows if row[0] in FOUR])
@@ -182,7 +193,7 @@ SOLIDS: dict[str, Callable[[Sequence[Shape]], Solid]] = {
 }
 
 
-def _measure(task: Task, *, solid_name: str, peer: bool) -> dict[str, float]:
+def _measure(task: Task, *, solid_name: str, fits: Sequence[str], peer: bool) -> dict[str, float]:
     solid = SOLIDS[solid_name](task.shapes)
     row = {"iou trimesh": quality(solid, [_tightest(solid)]).iou}
     if peer:
@@ -194,21 +205,16 @@ def _measure(task: Task, *, solid_name: str, peer: bool) -> dict[str, float]:
             "coverage skrobot": worth.coverage,
             "s skrobot": seconds,
         }
-    (one, s_one), (four, s_four), (residual, s_residual), (enclosing, _) = (
-        _timed(partial(fit_solid, solid, options))
-        for options in (ONE, UP_TO_FOUR, RESIDUAL, ENCLOSE)
-    )
-    return row | {
-        "iou one": one.quality.iou,
-        "iou four": four.quality.iou,
-        "iou residual": residual.quality.iou,
-        "n four": float(len(four.primitives)),
-        "volume enclose": enclosing.quality.volume_ratio,
-        "coverage enclose": enclosing.quality.coverage,
-        "s one": s_one,
-        "s four": s_four,
-        "s residual": s_residual,
-    }
+    for name in fits:
+        fit, seconds = _timed(partial(fit_solid, solid, FITS[name]))
+        row |= {
+            f"iou {name}": fit.quality.iou,
+            f"volume {name}": fit.quality.volume_ratio,
+            f"coverage {name}": fit.quality.coverage,
+            f"n {name}": float(len(fit.primitives)),
+            f"s {name}": seconds,
+        }
+    return row
 
 
 def _tightest(solid: Solid) -> Shape:
