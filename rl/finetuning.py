@@ -9,8 +9,18 @@ from typing import Any
 from morphgen.rl.robot_source import RobotSource
 from morphgen.rl.runs import RunConfig
 
-NUM_ENVS = 16
+NUM_ENVS = 64
 """Default number of environments."""
+CONSTANTS: Mapping[str, Any] = {
+    "num_steps": 32,
+    "minibatches": 4,
+    "learning_rate": 3e-4,
+    "desired_kl": 0.01,
+    "curriculum": False,
+}
+"""Default hyperparameters that differ from those of the training. A new optimiser has no moments of
+the gradient, so that its first steps are large: without a bound of the policy's change they undo
+what the training taught (docs/results.md, "Fine-tuning")."""
 
 
 def finetuning_config(
@@ -18,8 +28,7 @@ def finetuning_config(
 ) -> RunConfig:
     """Return the config of a run that begins with the networks of another run.
 
-    Agent and hyperparameters are those of the other run, but the curriculum is off and the number
-    of environments is ``NUM_ENVS``.
+    Agent and hyperparameters are those of the other run, besides ``CONSTANTS`` and ``NUM_ENVS``.
 
     Args:
         initial: Config of the other run.
@@ -30,7 +39,7 @@ def finetuning_config(
     return replace(
         initial,
         source=source,
-        ppo=replace(initial.ppo, **{"curriculum": False, **changes}),
+        ppo=replace(initial.ppo, **{**CONSTANTS, **changes}),
         num_envs=NUM_ENVS,
         initial_checkpoint=checkpoint,
         slice_updates=0,

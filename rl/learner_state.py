@@ -12,6 +12,7 @@ from torch import nn
 from morphgen.errors import TaskError
 from morphgen.rl.checkpoint_file import in_main_memory
 from morphgen.rl.config import PPOConfig, policy_from
+from morphgen.rl.learning_rate import FINETUNING_ACTOR_LR_SCALE
 from morphgen.rl.observation_layout import last_link, layout_from, layout_of, require_layout
 from morphgen.rl.ppo import Learner
 from morphgen.tasks.batch import TaskBatch
@@ -93,12 +94,16 @@ def _resume_batch(learner: Learner, state: Mapping[str, Any]) -> None:
 def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
     """Load the networks of a learner's state and nothing else of it, to fine-tune them.
 
+    With a ``desired_kl``, the actor's learning rate begins at ``FINETUNING_ACTOR_LR_SCALE``.
+
     Raises:
         TaskError: If they are other networks, or for other observations.
     """
     _require_networks(learner, state)
     for name, network in _networks(learner).items():
         network.load_state_dict(state[name])
+    if learner.config.desired_kl:
+        learner.actor_lr_scale = FINETUNING_ACTOR_LR_SCALE
 
 
 def use_batch(learner: Learner, batch: TaskBatch) -> None:

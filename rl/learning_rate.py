@@ -8,6 +8,8 @@ KL_FACTOR = 1.2
 """Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
 MIN_ACTOR_LR_SCALE = 0.01
 """Smallest factor on the actor's learning rate, so that it rises again soon (rsl_rl: 1e-5/1e-3)."""
+FINETUNING_ACTOR_LR_SCALE = 0.1
+"""Factor with which fine-tuning begins if it has a ``desired_kl``."""
 
 
 def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:

@@ -46,9 +46,6 @@ from morphgen.tasks.registry import SIMULATORS, TASKS, evaluation_simulator
 SCORES = "scores.json"
 FINETUNED = "finetuned"
 """Folder of fine-tuned policies in the folder of a run."""
-FINETUNING = {"num_steps": 64, "minibatches": 4, "bf16": False, "compile": False}
-"""Hyperparameters of fine-tuning: few environments need longer rollouts and fewer minibatches than
-the thousands of a training on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +266,7 @@ def _finetuning(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
         config,
         other_side(cell.source, "test"),
         f"../../{CHECKPOINT}",
-        {"total_timesteps": steps, **FINETUNING},
+        {"total_timesteps": steps, "bf16": False, "compile": False},
     )
     return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
 

@@ -48,11 +48,12 @@ if TYPE_CHECKING:
         "push: move the target line from near to far again (default: it stays far)",
         default=False,
     ),
-    *learning_options(30_000, 16),
+    *learning_options(100_000, 64),
     opt.LIBRARY,
     details="The run begins with the networks of the checkpoint, and with a new optimiser and "
-    "schedule. Agent and hyperparameters are the checkpoint's unless given.",
-    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 30000",),
+    "schedule. The agent and most hyperparameters are the checkpoint's. The learning rate follows "
+    "the change of the policy, so that little of what it can do is lost.",
+    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 300000",),
     extra="rl",
 )
 def finetune(args: argparse.Namespace) -> None:

@@ -135,18 +135,20 @@ def test_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml
         "test"
     }
 
-    code, out, _ = run("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard")
+    few = ("--steps", "32", "--envs", "4", "--set", "num_steps=8", "--no-tensorboard")
+    code, out, _ = run("finetune", "a", *few)
     assert (code, out) == (0, f"a/finetuned/test-seed0/{CHECKPOINT}\n")
     tuned = read_config(Path("a/finetuned/test-seed0"))
     assert (tuned.source.side, tuned.ppo.total_timesteps, tuned.ppo.num_steps) == ("test", 32, 8)
     assert tuned.initial_checkpoint.endswith(f"a/{CHECKPOINT}")
     assert read_config(Path("a")).ppo.curriculum
-    assert not tuned.ppo.curriculum
-    words = ("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard", "--out", "b")
-    assert run(*words, "--curriculum", "--bf16")[0] == 0
+    assert (tuned.ppo.curriculum, tuned.ppo.desired_kl) == (False, 0.01)
+    first = json.loads(Path("a/finetuned/test-seed0/metrics.jsonl").read_text().splitlines()[0])
+    assert first["learning_rate"] == pytest.approx(tuned.ppo.learning_rate * 0.1)
+    assert run("finetune", "a", *few, "--out", "b", "--curriculum", "--bf16")[0] == 0
     other = read_config(Path("b")).ppo
     assert (other.curriculum, other.bf16, other.compile) == (True, True, False)
-    code, _, err = run("finetune", "a", "--steps", "32", "--envs", "4")
+    code, _, err = run("finetune", "a", *few)
     assert code == 2
     assert "pass --resume" in err
 
