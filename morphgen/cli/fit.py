@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, whole_number
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot_fit import FitReport
     from morphgen.model.robot import Robot
 
-DEFAULT_IOU, DEFAULT_SEARCH, DEFAULT_CONFIGURATIONS = 0.9, "clusters", 1000
+DEFAULT_IOU, DEFAULT_CONFIGURATIONS = 0.9, 1000
+DEFAULT_SEARCH: Final = "clusters"
 COLUMNS = {
     "link": "",
     "primitives": "",
@@ -67,15 +68,14 @@ class Target:
     option(
         "--iou",
         type=float,
-        default=DEFAULT_IOU,
-        help="use the fewest primitives that reach this intersection over union",
+        help="with --max-primitives: use the fewest primitives that reach this intersection over "
+        f"union (default: {DEFAULT_IOU})",
     ),
     option(
         "--search",
-        default=DEFAULT_SEARCH,
         metavar="SEARCH",
         help="with --max-primitives: clusters, or residual, which takes two to three times as "
-        "long, gets closer and uses capsules, too (default: clusters)",
+        f"long, gets closer and uses capsules, too (default: {DEFAULT_SEARCH})",
     ),
     option(
         "--spheres",
@@ -99,8 +99,7 @@ class Target:
     number(
         "--configurations",
         "with --out: number of random configurations in which collisions are compared with "
-        "those of the meshes",
-        default=DEFAULT_CONFIGURATIONS,
+        f"those of the meshes (default: {DEFAULT_CONFIGURATIONS})",
     ),
     opt.JOBS,
     opt.SEED,
@@ -121,34 +120,34 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
+    several = {"--iou": args.iou is not None, "--search": args.search is not None}
     if args.spheres is None:
         opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
     else:
-        primitive_options = {
-            "--max-primitives": args.max_primitives is not None,
-            "--iou": args.iou != DEFAULT_IOU,
-            "--enclose": args.enclose,
-            "--search": args.search != DEFAULT_SEARCH,
-        }
-        opt.reject_idle(primitive_options, "only without --spheres")
-    max_primitives = 1 if args.max_primitives is None else args.max_primitives
+        primitives = {"--max-primitives": args.max_primitives is not None, **several}
+        opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
+    if args.max_primitives is None and not args.all:
+        opt.reject_idle(several, "only with --max-primitives")
     options = FitOptions(
-        max_primitives,
-        args.iou,
+        1 if args.max_primitives is None else args.max_primitives,
+        DEFAULT_IOU if args.iou is None else args.iou,
         args.enclose,
         args.seed,
         args.spheres,
         args.cover,
-        args.search,
+        DEFAULT_SEARCH if args.search is None else args.search,
     )
     if args.all:
         _fit_all_parts(args)
         return
     opt.reject_idle({"--missing": args.missing}, "only with --all")
     if not args.out:
-        opt.reject_idle(
-            {"--visual": args.visual, "--no-picture": args.no_picture}, "only with --out"
-        )
+        with_out = {
+            "--visual": args.visual,
+            "--no-picture": args.no_picture,
+            "--configurations": args.configurations is not None,
+        }
+        opt.reject_idle(with_out, "only with --out")
     if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
         _fit_mesh(args, options)
         return
@@ -239,13 +238,14 @@ def _fit_robot(
         print(_report_text(report))
     if folder is None:
         return report.as_dict()
-    with status(args, f"comparing collisions in {args.configurations} configurations"):
-        of_primitives, of_hulls = fit.agreement(args.configurations, args.seed)
+    configurations = args.configurations or DEFAULT_CONFIGURATIONS
+    with status(args, f"comparing collisions in {configurations} configurations"):
+        of_primitives, of_hulls = fit.agreement(configurations, args.seed)
     fitted = replace(fit.robot, name=folder.name)
     findings = check(fitted, tool_required=not target.is_part)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:
-        print(_agreement_text(of_primitives, of_hulls, args.configurations))
+        print(_agreement_text(of_primitives, of_hulls, configurations))
         print(folder)
     return report.as_dict() | {
         "agreement": of_primitives.as_dict(),
@@ -263,10 +263,10 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
         "--visual": args.visual,
         "--no-picture": args.no_picture,
         "--max-primitives": args.max_primitives is not None,
-        "--iou": args.iou != DEFAULT_IOU,
-        "--search": args.search != DEFAULT_SEARCH,
+        "--iou": args.iou is not None,
+        "--search": args.search is not None,
         "--spheres": args.spheres is not None,
-        "--configurations": args.configurations != DEFAULT_CONFIGURATIONS,
+        "--configurations": args.configurations is not None,
         "--seed": args.seed,
         "--json": args.json,
     }

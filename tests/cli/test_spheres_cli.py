@@ -110,7 +110,7 @@ def test_compose_gives_all_links_spheres(run, tmp_path):
     [
         (("fit", "--cover", "0.9"), "--cover: only with --spheres"),
         (("fit", "--spheres", "4", "--enclose"), "--enclose: only without --spheres"),
-        (("fit", "--spheres", "4", "--iou", "0.8"), "--iou: only without --spheres"),
+        (("fit", "--spheres", "4", "--iou", "0.9"), "--iou: only without --spheres"),
         (("fit", "--spheres", "40"), "40 spheres: expected 1 to 32 per link"),
         (("fit", "--spheres", "4", "--cover", "1"), "cover 1: expected more than 0, at most"),
         (("export", "--format", "curobo", "--cover", "0.9"), "--cover: only with --spheres"),
