@@ -142,7 +142,7 @@ def _import_several(args: argparse.Namespace, xacro_args: Mapping[str, str]) -> 
         except MorphgenError as error:
             reason = one_line(str(error))
             print(f"morphgen: {reason}", file=sys.stderr)
-            objects.append({"file": file, "error": reason})
+            objects.append({"file": file, "error": type(error).__name__, "message": reason})
             code = 2
             continue
         objects.append({"file": file, **robot.data})

@@ -79,7 +79,8 @@ def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(ru
     assert [path.name for path in (tmp_path / "parts").iterdir()] == ["a.yaml"]
     assert (objects[0]["folder"], objects[0]["part"]) == ("robots/a", "parts/a.yaml")
     assert objects[0]["card"]["name"] == "a"
-    reasons = [each["error"] for each in objects[1:]]
+    reasons = [each["message"] for each in objects[1:]]
+    assert {each["error"] for each in objects[1:]} == {"FormatError"}
     assert err.splitlines() == [f"morphgen: {reason}" for reason in reasons]
     for reason, part in zip(
         reasons,
