@@ -16,6 +16,8 @@ from morphgen.typing import Array
 
 MAX_HULL_VERTICES = 500_000
 """Number of vertices of the largest file without triangles that is read: its hull takes seconds."""
+_FLAT = 1e-6
+"""Thickness of a flat point cloud, relative to its size: the precision of 32-bit floats."""
 _HEADER = 16
 """Size of the four counts [bytes]."""
 _ROW_SIZES = (12, 12, 8, 12)
@@ -34,10 +36,9 @@ def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
 
     Raises:
         ValueError: If the counts are invalid or disagree with the file's size, a triangle has a
-            vertex that does not exist, a vertex is not finite, or there are too many without
-            triangles.
-        ValueError or scipy.spatial.QhullError: If there are no triangles, and the vertices are
-            flat.
+            vertex that does not exist, a vertex is not finite, or there are no triangles and the
+            vertices are flat or too many.
+        scipy.spatial.QhullError: If there are no triangles, and the hull cannot be computed.
     """
     if len(data) < _HEADER:
         raise ValueError(f"{len(data)} bytes; expected a header of {_HEADER}")
@@ -63,7 +64,7 @@ def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
             raise ValueError(
                 f"{vertices} vertices without triangles; at most {MAX_HULL_VERTICES} are read"
             )
-        if not np.ptp(points, axis=0).all():
+        if np.linalg.matrix_rank(points - points.mean(axis=0), rtol=_FLAT) < 3:
             raise ValueError("has no triangles, and its vertices are flat")
         hull = trimesh.convex.convex_hull(points)
         return np.asarray(hull.vertices, np.float64), np.asarray(hull.faces, np.int64)
