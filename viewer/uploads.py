@@ -176,6 +176,9 @@ def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[
     mjcfs = {path: unpacked[path] for path, form in formats.items() if form == "MJCF"}
     if mjcfs:
         return _main_mjcf(name, mjcfs)
+    for path, data in unpacked.items():
+        if path.endswith(".xml") and not _is_hidden(PurePosixPath(path)):
+            _parse(path, data)  # says why a malformed MJCF is none
     hint = ""
     if any(path.endswith(".xacro") for path in unpacked):
         hint = (

@@ -54,6 +54,7 @@ def test_zipped_bundle_survives_a_round_trip(access, tmp_path):
         ("a.zip", b"PK nothing", "not a readable zip"),
         ("..", URDF, "invalid file name"),
         ("a.zip", archive({"b.txt": b""}), "holds no .urdf"),
+        ("a.zip", archive({"b.xml": b"<mujoco", ".c.xml": b"<"}), "b.xml:1:"),
         ("a.zip", archive({"../b.urdf": URDF}), "leads out of its folder"),
         ("a.zip", archive({"/b.urdf": URDF}), "leads out of its folder"),
         ("a.zip", archive({"c\\..\\..\\b.urdf": URDF}), "leads out of its folder"),
