@@ -177,7 +177,8 @@ def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[
     if mjcfs:
         return _main_mjcf(name, mjcfs)
     for path, data in unpacked.items():
-        if path.endswith(".xml") and not _is_hidden(PurePosixPath(path)):
+        file = PurePosixPath(path)
+        if file.suffix.lower() in _SUFFIXES and not _is_hidden(file):
             _parse(path, data)  # says why a malformed MJCF is none
     hint = ""
     if any(path.endswith(".xacro") for path in unpacked):
