@@ -99,13 +99,13 @@ def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
     counts = ", ".join(f"{count} {reason}" for reason, count in matrix.counts.items())
     shapes = (shape.geometry for link in robot.links for shape in link.collisions)
     has_mesh = any(isinstance(shape, Mesh) for shape in shapes)
+    about_meshes = " Meshes count as their convex hulls." if has_mesh else ""
     return (
         f"{matrix.num_pairs} pairs of links with collision shapes, "
         f"{matrix.samples} configurations sampled with seed {matrix.seed}. Disabled: {counts}. "
         f"Always: in collision in at least {ALWAYS_SHARE:.0%} of the configurations. "
         "Never: in collision in none of them. User: ignored by the robot for another reason."
-        + " Meshes count as their convex hulls."
-        * has_mesh
+        f"{about_meshes}"
     )
 
 
