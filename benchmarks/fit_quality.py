@@ -22,7 +22,7 @@ A row is an arm; values are means over its links (links with the same meshes are
 - CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
   and with up to four by both searches.
 
-``--fits`` names ours that are measured; the residual search takes most of the time.
+``--fits`` names the fits of morphgen to measure; the residual search takes most of the time.
 scikit-robot comes with `pip install morphgen[bench]`; without it its columns are missing.
 """
 

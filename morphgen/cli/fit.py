@@ -128,6 +128,8 @@ def fit(args: argparse.Namespace) -> None:
         opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
     if args.max_primitives is None and not args.all:
         opt.reject_idle(several, "only with --max-primitives")
+    if args.enclose:
+        opt.reject_idle({"--search": args.search is not None}, "only without --enclose")
     options = FitOptions(
         1 if args.max_primitives is None else args.max_primitives,
         DEFAULT_IOU if args.iou is None else args.iou,

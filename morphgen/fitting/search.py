@@ -189,7 +189,7 @@ def _with_replacements(target: SampledSolid, candidates: Candidates, seed: int) 
     """Replace primitives of the best candidates, one at a time, as long as it helps."""
     subset = slice(REPLACEMENT_POINTS)
     cloud = target.points[subset], target.inside[subset], target.weights[subset]
-    best, iou = _best(target, candidates)
+    best, iou = _best_candidates(target, candidates)
     for round_seed in np.random.SeedSequence(seed).generate_state(MAX_ROUNDS):
         guesses = by_replacement(best, *cloud, int(round_seed))
         if guesses is None:
@@ -205,13 +205,13 @@ def _with_replacements(target: SampledSolid, candidates: Candidates, seed: int) 
             rate=(0.01, 0.002),
         )
         previous = iou
-        best, iou = _best(target, Candidates.stack([best, replaced]))
+        best, iou = _best_candidates(target, Candidates.stack([best, replaced]))
         if iou == previous:
             break
     return best
 
 
-def _best(target: SampledSolid, candidates: Candidates) -> tuple[Candidates, float]:
+def _best_candidates(target: SampledSolid, candidates: Candidates) -> tuple[Candidates, float]:
     """Return the candidates of largest IoU, and that of the best one."""
     ious = overlaps(candidates, target.points, target.inside, target.weights)
     order = np.argsort(-ious, kind="stable")[:NUM_REFINED]
@@ -221,7 +221,7 @@ def _best(target: SampledSolid, candidates: Candidates) -> tuple[Candidates, flo
 def _refine(target: SampledSolid, coarse: Candidates) -> SearchResult:
     """Improve the best candidates on all points, and return the best one."""
     points, inside, weights = target.points, target.inside, target.weights
-    best, _ = _best(target, coarse)
+    best, _ = _best_candidates(target, coarse)
     fine = ascend_finely(target, best, weights)
     ious = overlaps(fine, points, inside, weights)
     row = int(np.argmax(ious))
