@@ -8,6 +8,7 @@ replaced. The figures are reach.png, robots.png and similarity.png in docs/image
 
 from __future__ import annotations
 
+import argparse
 import re
 import runpy
 import sys
@@ -269,6 +270,9 @@ def similarity_rows() -> list[Any]:
 
 def main() -> int:
     """Write the page and the figures."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     PAGE.write_text(write_tables(tables(), PAGE.read_text("utf-8")), "utf-8")
     print(PAGE)
     print(save(bar_figure(), "reach.png"))

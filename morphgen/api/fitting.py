@@ -32,7 +32,7 @@ def fit(
     jobs: int = 1,
     library: LibraryFolders = (),
 ) -> FittedRobot:
-    """Replace the meshes of a robot by boxes, cylinders and spheres, and measure the fit.
+    """Replace the meshes of a robot by primitives, and measure the fit.
 
     Examples:
         >>> fitted = morphgen.fit("rethink", max_primitives=2)

@@ -55,7 +55,7 @@ class Target:
 
 @command(
     "fit",
-    "fit boxes, cylinders and spheres to meshes, and measure how good they are",
+    "fit primitives to meshes, and measure how good they are",
     option("words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {opt.ROBOTS_HELP}"),
     flag("--all", "fit every part with meshes, and store the fits in the library"),
     flag("--missing", "with --all: only the parts without stored fits"),
@@ -120,16 +120,7 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
-    several = {"--iou": args.iou is not None, "--search": args.search is not None}
-    if args.spheres is None:
-        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
-    else:
-        primitives = {"--max-primitives": args.max_primitives is not None, **several}
-        opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
-    if args.max_primitives is None and not args.all:
-        opt.reject_idle(several, "only with --max-primitives")
-    if args.enclose:
-        opt.reject_idle({"--search": args.search is not None}, "only without --enclose")
+    _reject_idle_options(args)
     options = FitOptions(
         1 if args.max_primitives is None else args.max_primitives,
         DEFAULT_IOU if args.iou is None else args.iou,
@@ -162,6 +153,24 @@ def fit(args: argparse.Namespace) -> None:
         results.append(_fit_robot(target, folder, options, args))
     if args.json:
         print(json.dumps(results if len(results) > 1 else results[0]))
+
+
+def _reject_idle_options(args: argparse.Namespace) -> None:
+    """Refuse options that have no effect on the kind of fit.
+
+    Raises:
+        MorphgenError: If there is one.
+    """
+    several = {"--iou": args.iou is not None, "--search": args.search is not None}
+    if args.spheres is None:
+        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
+    else:
+        primitives = {"--max-primitives": args.max_primitives is not None, **several}
+        opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
+    if args.max_primitives is None and not args.all:
+        opt.reject_idle(several, "only with --max-primitives")
+    if args.enclose:
+        opt.reject_idle({"--search": args.search is not None}, "only without --enclose")
 
 
 def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:

@@ -1,1 +1,1 @@
-"""Fit boxes, cylinders and spheres to the meshes of a robot, and measure how well they fit."""
+"""Fit primitives to the meshes of a robot, and measure how well they fit."""

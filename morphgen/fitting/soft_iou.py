@@ -195,7 +195,9 @@ def _distance(
     order = torch.argsort(flat, stable=True)
     local = _local(x, centres.reshape(-1, 3)[order], quaternions.reshape(-1, 4)[order])
     size = halves.reshape(-1, 3)[order][:, :, None]
-    boxes, cylinders, spheres = (int((flat == i).sum()) for i in (0, 1, 2))
+    boxes, cylinders, spheres = (
+        int((flat == SEARCH_KINDS.index(kind)).sum()) for kind in ("box", "cylinder", "sphere")
+    )
     distances = []
     if boxes:
         distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
