@@ -57,6 +57,7 @@ def arms():
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_gpu)])
+@pytest.mark.slow
 def test_joints_are_within_a_milliradian_of_mujoco_after_a_second_without_contact(device):
     scenes = [Scene(robot(words), ground=None) for words in DIFFERENT]
     ours = WarpSimulation(scenes, IN_FREE_SPACE, device=device)

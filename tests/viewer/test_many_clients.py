@@ -60,6 +60,7 @@ def require_nothing_left(on, sessions):
     wait_until(lambda: all(session() is None for session in sessions))
 
 
+@pytest.mark.slow
 def test_nothing_remains_of_clients_that_have_left(viewer):
     on = viewer()
     sessions = crowd(on, 6)

@@ -313,6 +313,7 @@ def test_robots_are_deleted_from_the_users_own_sets_only(folder, tmp_path):
             owned_set(text, files)
 
 
+@pytest.mark.slow
 def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
     monkeypatch.setattr(scene_population, "MAX_SHADOWS", 10)
     with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
