@@ -40,7 +40,7 @@ class FileFormat:
     """A format whose robots are one file each, named after the robot with the format as suffix."""
 
     summary: str
-    """What a file contains, for the help."""
+    """Content of an exported file in a few words, for the help of the command."""
     content: Callable[[Robot, ExportSettings], bytes]
     """Function that returns the content of a robot's file."""
     options: tuple[str, ...] = ()
@@ -52,7 +52,7 @@ class FolderFormat:
     """A format whose robots are one folder each."""
 
     summary: str
-    """What a folder contains, for the help."""
+    """Content of an exported folder in a few words, for the help of the command."""
     write: Callable[[Robot, Path, ExportSettings], None]
     """Function that writes a robot's files into an empty folder."""
     folder_name: Callable[[str], str]

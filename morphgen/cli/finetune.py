@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         "push: move the target line from near to far again (default: it stays far)",
         default=False,
     ),
+    # 64 is NUM_ENVS of morphgen.rl.finetuning, whose import takes seconds.
     *learning_options(100_000, 64),
     opt.LIBRARY,
     details="The run begins with the networks of the checkpoint, and with a new optimiser and "

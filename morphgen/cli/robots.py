@@ -72,12 +72,12 @@ def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class WrittenBundle:
-    """What a command says about a bundle that it wrote."""
+    """Summary of a bundle that was written, as JSON and as text, with the exit code."""
 
     data: dict[str, object]
-    """For ``--json``."""
+    """Folder and card of the bundle, printed with ``--json``."""
     text: str
-    """The summary."""
+    """Folder, sizes, repairs, findings and files of the bundle, in lines."""
     code: int
     """1 if the checks find an error in the robot, as ``morphgen check`` does, else 0."""
 
