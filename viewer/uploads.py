@@ -21,6 +21,7 @@ import re
 import secrets
 import shutil
 import zipfile
+from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 
 from lxml import etree
@@ -58,6 +59,8 @@ _FORMATS = {"robot": "URDF", "mujoco": "MJCF", "mujocoinclude": "included MJCF"}
 """Formats of descriptions by their root element."""
 _SUFFIXES = (".urdf", ".xml")
 """Suffixes of descriptions."""
+_Documents = dict[str, etree._Element | FormatError]
+"""Roots of descriptions by their paths, or why a file is not XML."""
 _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
 _MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
 """Suffixes of files that meshes refer to."""
@@ -102,18 +105,24 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
             f"{file}: expected a .urdf, an MJCF as .xml, or a .zip of a folder with one"
         )
     unpacked = _unzip(file, content) if suffix == ".zip" else {file: content}
-    formats = {path: _format(path, data) for path, data in unpacked.items()}
+    documents = _parse_descriptions(unpacked)
+    formats = {path: _format(document) for path, document in documents.items()}
     if suffix != ".zip" and formats[file] is None:
-        root = _parse(file, content)
+        root = _root(documents, file)
         raise UploadError(
             f"{file}: its root is <{shorten(str(root.tag))}>; expected <robot> of a URDF, or "
             "<mujoco> of an MJCF"
         )
-    stored = {path: data for path, data in unpacked.items() if formats[path] or _is_kept(path)}
-    main = _main_description(file, formats, unpacked)
+    main = _main_description(file, formats, documents, unpacked)
+    stored = {path: data for path, data in unpacked.items() if formats.get(path) or _is_kept(path)}
     for path, data in stored.items():
-        _require_inner_paths(path, data, formats[path])
-    folder = _write_upload(stored, formats, main, files)
+        if PurePosixPath(path).name == CARD:
+            _require_inner_card(path, data)
+        elif formats.get(path) or PurePosixPath(path).suffix == ".urdf":
+            _require_inner_paths(path, _root(documents, path), formats[path])
+    roots = {path: _root(documents, path) for path in stored if formats.get(path) == "URDF"}
+    mjcf = main if formats[main] == "MJCF" else None
+    folder = _write_upload(stored, roots, mjcf, files)
     is_bundle = (
         PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in stored
     )
@@ -135,15 +144,34 @@ def _unzip(name: str, content: bytes) -> dict[str, bytes]:
         ) from error
 
 
-def _format(path: str, data: bytes) -> str | None:
-    """Return the format of a description, a value of ``_FORMATS``; None for any other file."""
-    file = PurePosixPath(path)
-    if file.suffix.lower() not in _SUFFIXES or _is_hidden(file):
-        return None
-    try:
-        return _FORMATS.get(str(parse_xml(data, "").tag))
-    except FormatError:
-        return None
+def _parse_descriptions(unpacked: dict[str, bytes]) -> _Documents:
+    """Parse every file that may be a description, once."""
+    documents: _Documents = {}
+    for path, data in unpacked.items():
+        file = PurePosixPath(path)
+        if file.suffix.lower() in _SUFFIXES and not _is_hidden(file):
+            try:
+                documents[path] = parse_xml(data, path)
+            except FormatError as error:
+                documents[path] = error
+    return documents
+
+
+def _format(document: etree._Element | FormatError) -> str | None:
+    """Return the format of a description, a value of ``_FORMATS``; None for other XML."""
+    return None if isinstance(document, FormatError) else _FORMATS.get(str(document.tag))
+
+
+def _root(documents: _Documents, path: str) -> etree._Element:
+    """Return the root of a description.
+
+    Raises:
+        UploadError: If it is malformed.
+    """
+    document = documents[path]
+    if isinstance(document, FormatError):
+        raise UploadError(f"{document}; nothing was kept") from document
+    return document
 
 
 def _is_kept(path: str) -> bool:
@@ -160,7 +188,12 @@ def _is_hidden(file: PurePosixPath) -> bool:
     return any(part.startswith((".", "__MACOSX")) for part in file.parts)
 
 
-def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[str, bytes]) -> str:
+def _main_description(
+    name: str,
+    formats: dict[str, str | None],
+    documents: _Documents,
+    unpacked: Collection[str],
+) -> str:
     """Return the description to show.
 
     That is the URDF with the shortest path, which in a bundle is the bundle's own. Without one, it
@@ -173,13 +206,11 @@ def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[
     ]
     if urdfs:
         return min(urdfs, key=lambda path: (path.count("/"), path))
-    mjcfs = {path: unpacked[path] for path, form in formats.items() if form == "MJCF"}
+    mjcfs = {path: _root(documents, path) for path, form in formats.items() if form == "MJCF"}
     if mjcfs:
         return _main_mjcf(name, mjcfs)
-    for path, data in unpacked.items():
-        file = PurePosixPath(path)
-        if file.suffix.lower() in _SUFFIXES and not _is_hidden(file):
-            _parse(path, data)  # says why a malformed MJCF is none
+    for path in documents:
+        _root(documents, path)  # says why a malformed MJCF is none
     hint = ""
     if any(path.endswith(".xacro") for path in unpacked):
         hint = (
@@ -188,14 +219,14 @@ def _main_description(name: str, formats: dict[str, str | None], unpacked: dict[
     raise UploadError(f"{name}: holds no .urdf and no MJCF{hint}")
 
 
-def _main_mjcf(name: str, mjcfs: dict[str, bytes]) -> str:
+def _main_mjcf(name: str, mjcfs: dict[str, etree._Element]) -> str:
     stem = PurePosixPath(name).stem
     named = [path for path in mjcfs if PurePosixPath(path).stem == stem]
     # A name is relative to the main file, which lies beside the including file or above it.
     included = {
         posixpath.normpath(folder / element.get("file", ""))
-        for path, data in mjcfs.items()
-        for element in _parse(path, data).iter("include")
+        for path, root in mjcfs.items()
+        for element in root.iter("include")
         for folder in PurePosixPath(path).parents
     }
     mains = named or [path for path in mjcfs if path not in included] or [*mjcfs]
@@ -207,32 +238,25 @@ def _main_mjcf(name: str, mjcfs: dict[str, bytes]) -> str:
     return mains[0]
 
 
-def _require_inner_paths(path: str, data: bytes, form: str | None) -> None:
-    """Require that a description or card names files of its own upload only."""
-    file = PurePosixPath(path)
-    if file.name == CARD:
-        try:
-            card = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            raise UploadError(f"{path}: invalid JSON: {shorten(str(error))}") from error
-        hashes = card.get("hashes") if isinstance(card, dict) else None
-        for name in hashes if isinstance(hashes, dict) else ():
-            _require_inner_uri(path, name)
-    elif form or file.suffix == ".urdf":
-        root = _parse(path, data)
-        if form in ("URDF", None):
-            _require_plain_urdf(path, root)
-        for element in root.iter(etree.Element):
-            for key in _PATH_ATTRIBUTES:
-                if uri := element.get(key):
-                    _require_inner_uri(path, uri)
-
-
-def _parse(path: str, data: bytes) -> etree._Element:
+def _require_inner_card(path: str, data: bytes) -> None:
+    """Require that a card names files of its own upload only."""
     try:
-        return parse_xml(data, path)
-    except FormatError as error:
-        raise UploadError(f"{error}; nothing was kept") from error
+        card = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise UploadError(f"{path}: invalid JSON: {shorten(str(error))}") from error
+    hashes = card.get("hashes") if isinstance(card, dict) else None
+    for name in hashes if isinstance(hashes, dict) else ():
+        _require_inner_uri(path, name)
+
+
+def _require_inner_paths(path: str, root: etree._Element, form: str | None) -> None:
+    """Require that a description names files of its own upload only."""
+    if form in ("URDF", None):
+        _require_plain_urdf(path, root)
+    for element in root.iter(etree.Element):
+        for key in _PATH_ATTRIBUTES:
+            if uri := element.get(key):
+                _require_inner_uri(path, uri)
 
 
 def _require_plain_urdf(path: str, root: etree._Element) -> None:
@@ -262,9 +286,19 @@ def _require_inner_uri(path: str, uri: str) -> None:
 
 
 def _write_upload(
-    stored: dict[str, bytes], formats: dict[str, str | None], main: str, files: FileAccess
+    stored: dict[str, bytes],
+    urdfs: dict[str, etree._Element],
+    mjcf: str | None,
+    files: FileAccess,
 ) -> str:
-    """Write an upload into a new folder, or nothing; return the folder's name."""
+    """Write an upload into a new folder, or nothing; return the folder's name.
+
+    Args:
+        stored: Contents of its files by their paths.
+        urdfs: Roots of its URDFs by their paths.
+        mjcf: Path of the description to show, if that is an MJCF.
+        files: Has the folder of uploads.
+    """
     if sum(1 for _ in files.uploads.iterdir()) >= MAX_UPLOADS:
         raise UploadError(f"{MAX_UPLOADS} uploads are kept already; start the viewer again")
     folder = files.uploads / secrets.token_hex(16)  # cannot be guessed by other users of the viewer
@@ -273,11 +307,10 @@ def _write_upload(
             target = folder / path
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(data)
-        for path, data in stored.items():
-            if formats[path] == "URDF":
-                _require_inner_meshes(folder, path, data)
-        if formats[main] == "MJCF":
-            _require_inner_files(folder, main, files)
+        for path, root in urdfs.items():
+            _require_inner_meshes(folder, path, root)
+        if mjcf is not None:
+            _require_inner_files(folder, mjcf, files)
     except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, OSError):
@@ -302,13 +335,13 @@ def _require_inner_files(folder: Path, path: str, files: FileAccess) -> None:
         raise UploadError(f"{text}; nothing was kept") from error
 
 
-def _require_inner_meshes(folder: Path, path: str, data: bytes) -> None:
+def _require_inner_meshes(folder: Path, path: str, root: etree._Element) -> None:
     """Require that every mesh of a URDF exists in its upload.
 
     Checked by the function that later reads the meshes, after the text of each path has been
     checked: it also decodes escapes (``%2f``) and finds packages elsewhere on this machine.
     """
-    for element in _parse(path, data).iter("mesh"):
+    for element in root.iter("mesh"):
         uri = element.get("filename", "")
         try:
             mesh = resolve_uri(uri, folder / path, PackageFinder())
