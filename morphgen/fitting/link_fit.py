@@ -14,7 +14,7 @@ from morphgen.fitting.search import best_several, best_single, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.fitting.sphere_search import best_spheres
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
-from morphgen.model.geometry import Shape, Sphere
+from morphgen.model.geometry import Primitive, Shape, Sphere
 
 Search = Literal["clusters", "residual"]
 """How several primitives are searched for; ``residual`` is slower, better, and uses capsules."""
@@ -110,7 +110,8 @@ def fit_shapes(
 
     Args:
         shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
-            there are no more than ``max_primitives``; by a fit of spheres, if all are spheres.
+            there are no more than ``max_primitives``; by the residual search also capsules; by a
+            fit of spheres, if all are spheres.
         options: Options of the fit.
         solid: The solid of the shapes, if it is known already.
 
@@ -123,7 +124,11 @@ def fit_shapes(
     if options.spheres is not None:
         is_kept = all(isinstance(shape.geometry, Sphere) for shape in shapes)
     else:
-        is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
+        has_right_kinds = are_primitives(shapes) or (
+            options.search == "residual"
+            and all(isinstance(shape.geometry, Primitive) for shape in shapes)
+        )
+        is_kept = has_right_kinds and len(shapes) <= options.max_primitives
     if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None

@@ -106,6 +106,13 @@ def test_existing_primitives_are_unchanged():
     assert len(fit_shapes(shapes, FitOptions(max_primitives=1)).primitives) == 1
 
 
+def test_the_residual_search_keeps_capsules():
+    shapes = (Shape(Capsule(0.05, 0.2)), Shape(Box((0.1, 0.2, 0.3)), Pose((0.3, 0.0, 0.0))))
+    kept = fit_shapes(shapes, FitOptions(max_primitives=2, search="residual"))
+    assert kept.primitives == shapes
+    assert kept.solid == "primitives"
+
+
 def test_enclosing_primitives_contain_every_vertex(tmp_path, wedge):
     bent = trimesh.util.concatenate(
         [
