@@ -78,12 +78,13 @@ def import_robots(args: argparse.Namespace) -> int:
     if args.part is None:
         given = {"--parts": args.parts is not None, "--licence": args.licence is not None}
         opt.reject_idle(given, "only with --part")
-    if len(args.files) > 1:
+    sources = list(dict.fromkeys(args.files))
+    if len(sources) > 1:
         if args.name is not None:
-            raise FormatError(f"--name {args.name}: {len(args.files)} robots cannot have one name")
+            raise FormatError(f"--name {args.name}: {len(sources)} robots cannot have one name")
         if args.srdf is not None:
             raise FormatError(
-                f"--srdf {args.srdf}: is of one robot, and {len(args.files)} are named; import its "
+                f"--srdf {args.srdf}: is of one robot, and {len(sources)} are named; import its "
                 "robot alone"
             )
     elif args.name is not None:
@@ -94,9 +95,9 @@ def import_robots(args: argparse.Namespace) -> int:
             "--root-link"
         )
     xacro_args = _xacro_args(args.arg)
-    if len(args.files) > 1:
-        return _import_several(args, xacro_args)
-    robot = _import(find_description(args.files[0]), args.name, xacro_args, args)
+    if len(sources) > 1:
+        return _import_several(sources, args, xacro_args)
+    robot = _import(find_description(sources[0]), args.name, xacro_args, args)
     opt.print_result(args, robot.data, lambda: robot.text)
     return robot.code
 
@@ -110,16 +111,45 @@ def _xacro_args(words: Sequence[str]) -> dict[str, str]:
     return {key: value for key, _, value in pairs}
 
 
-def _import_several(args: argparse.Namespace, xacro_args: Mapping[str, str]) -> int:
+def _import_several(
+    sources: Sequence[str], args: argparse.Namespace, xacro_args: Mapping[str, str]
+) -> int:
     """Import every file that can be, and print what became of each; return the exit code."""
     from morphgen.formats.named_descriptions import find_description
 
     found: dict[str, NamedDescription | MorphgenError] = {}
-    for file in dict.fromkeys(args.files):
+    for file in sources:
         try:
             found[file] = find_description(file)
         except MorphgenError as error:
             found[file] = error
+    names = _bundle_names(found)
+    code = 0
+    objects: list[dict[str, object]] = []
+    for file, description in track(list(found.items()), args, "importing", "robot", len(found)):
+        try:
+            if isinstance(description, MorphgenError):
+                raise description
+            robot = _import(description, names[file], xacro_args, args)
+        except MorphgenError as error:
+            reason = one_line(str(error))
+            if Path(file).name not in reason:
+                reason = f"{file}: {reason}"
+            print(f"morphgen: {reason}", file=sys.stderr)
+            objects.append({"file": file, "error": type(error).__name__, "message": reason})
+            code = 2
+            continue
+        objects.append({"file": file, **robot.data})
+        code = max(code, robot.code)
+        if not args.json:
+            print(robot.text)
+    if args.json:
+        print(json.dumps(objects, default=str))
+    return code
+
+
+def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict[str, str]:
+    """Return the names of the bundles: those of the descriptions, without their suffixes."""
     names = {
         file: re.sub(r"\W", "_", description.path.stem, flags=re.ASCII)
         for file, description in found.items()
@@ -132,26 +162,7 @@ def _import_several(args: argparse.Namespace, xacro_args: Mapping[str, str]) -> 
                 f"{', '.join(files)}: these would all be named {name!r}; import one at a time, "
                 "with --name"
             )
-    code = 0
-    objects: list[dict[str, object]] = []
-    for file, description in track(list(found.items()), args, "importing", "robot", len(found)):
-        try:
-            if isinstance(description, MorphgenError):
-                raise description
-            robot = _import(description, names[file], xacro_args, args)
-        except MorphgenError as error:
-            reason = one_line(str(error))
-            print(f"morphgen: {reason}", file=sys.stderr)
-            objects.append({"file": file, "error": type(error).__name__, "message": reason})
-            code = 2
-            continue
-        objects.append({"file": file, **robot.data})
-        code = max(code, robot.code)
-        if not args.json:
-            print(robot.text)
-    if args.json:
-        print(json.dumps(objects, default=str))
-    return code
+    return names
 
 
 def _import(

@@ -82,13 +82,15 @@ def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(ru
     reasons = [each["message"] for each in objects[1:]]
     assert {each["error"] for each in objects[1:]} == {"FormatError"}
     assert err.splitlines() == [f"morphgen: {reason}" for reason in reasons]
+    for file, reason in zip(files[1:], reasons, strict=True):
+        assert file in reason
     for reason, part in zip(
         reasons,
         ("menagerie:no_such_robot: ", "type ball", "c.xml", "import its file alone"),
         strict=True,
     ):
         assert part in reason
-    code, out, _ = run("import", "a.xml", *words)
+    code, out, _ = run("import", "a.xml", "a.xml", *words)  # a file named twice is one file
     one = json.loads(out)
     assert (code, one["folder"], one["part"]) == (0, "robots/test", "parts/test.yaml")
 
