@@ -33,14 +33,18 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
 IMAGES = ROOT / "docs/images/results"
 STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
-TASKS = ("reach", "reach-obstacles", "push")
+TASKS = ("reach", "reach-obstacles", "push", "push-obstacles")
+EE_TASK = "composition/ee-task"
+"""The split whose robots have different tasks."""
 SPLITS = (
     "interpolation/arm3",
     "interpolation/panda",
     "composition/ee-arm",
     "extrapolation/primitives",
     "extrapolation/arms",
+    "extrapolation/arms-small",
 )
+FIGURE_SPLITS = SPLITS[:5]
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
 AGENTS = {
@@ -49,6 +53,8 @@ AGENTS = {
     f"me-tf{PAPER_AGENT}{CHANNELS}": "`me-tf`, kinematic channels",
     f"me-mlp{PAPER_AGENT}": "`me-mlp`, the paper's observations",
     f"me-tf{PAPER_AGENT}": "`me-tf`, the paper's observations",
+    f"se{PAPER_AGENT}": "`se`, the paper's observations",
+    f"se{PAPER_AGENT}@test": "`se` on the test robot",
 }
 BASELINES = ("scripted", "ik", "jacobian", "random")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
@@ -74,12 +80,13 @@ Modes = Mapping[str, Mapping[Side, Result]]
 """Results by mode, or by the name of a baseline."""
 
 
-def results_of(study: str, split: str) -> dict[tuple[str, int], Modes]:
+def results_of(study: str, split: str, task: str | None = None) -> dict[tuple[str, int], Modes]:
     """Return the results of a split by agent and transitions; baselines have 0 transitions.
 
     Args:
         study: Folder in results/.
-        split: Split with its task.
+        split: Name of the split.
+        task: Task of the robots; by default all robots of the split.
     """
     found: dict[tuple[str, int], dict[str, dict[Side, list[list[Score]]]]] = {}
     for path in sorted((ROOT / "results" / study / split).glob("*/**/scores.json")):
@@ -90,7 +97,8 @@ def results_of(study: str, split: str) -> dict[tuple[str, int], Modes]:
         modes = found.setdefault((agent, steps), {})
         for mode, scores in stored_cell(path, read_json(path)).scores.items():
             for side in SIDES:
-                if own := [score for score in scores if score.side == side]:
+                own = [score for score in scores if score.side == side]
+                if own := [score for score in own if task in (None, score.task)]:
                     modes.setdefault(mode, {}).setdefault(side, []).append(own)
     return {
         key: {
@@ -117,7 +125,7 @@ def by_mean(modes: Modes) -> Mapping[Side, Result]:
 def split_table(task: str) -> str:
     """Return the table of a task: every split with all agents and baselines."""
     lines = []
-    with_scores = task != "push"  # the score of push is its success
+    with_scores = task.startswith("reach")  # the score of push is its success
     for split in SPLITS:
         found: dict[tuple[str, int, str], Modes] = {}
         for study in STUDIES:
@@ -132,6 +140,27 @@ def split_table(task: str) -> str:
             split = ""
     score = ["MT", "success", "ZS", "success"] if with_scores else ["MT", "ZS"]
     headers = ["split", "agent", "transitions", "seeds", *score, "fine-tuned"]
+    if not any(line[-1] for line in lines):
+        headers, lines = headers[:-1], [line[:-1] for line in lines]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def ee_task_table() -> str:
+    """Return success of the split in which robots have different tasks, by side and task."""
+    push, reach = (results_of("ee-task-30m", EE_TASK, task) for task in ("push", "reach"))
+    order = [*AGENTS, *BASELINES]
+    lines = []
+    keys = [key for key in {*push, *reach} if key[0] in order]
+    for key in sorted(keys, key=lambda key: order.index(key[0])):
+        agent, steps = key
+        by_task = [by_mean(found[key]) if key in found else {} for found in (push, reach)]
+        (pushing, reaching) = by_task
+        seeds = max(result.seeds for sides in by_task for result in sides.values())
+        columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
+        cells = [AGENTS.get(agent, f"`{agent}`")]
+        cells += [f"{round(steps / 1e6)} million", str(seeds)] if steps else ["", ""]
+        lines.append([*cells, *(c.success.as_percent() if c else "" for c in columns)])
+    headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -139,7 +168,7 @@ def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) ->
     sides = by_mean(modes)
     cells = [AGENTS.get(agent, f"`{agent}`") + note]
     cells.append(f"{round(steps / 1e6)} million" if steps else "")
-    cells.append(str(sides["train"].seeds) if steps else "")
+    cells.append(str(sides["test"].seeds) if steps else "")
     for side in SIDES:
         if side not in sides:
             cells += [""] * (2 if with_scores else 1)
@@ -165,7 +194,7 @@ def pybullet_table() -> str:
         cells = ["/".join([*split, task]), AGENTS[agent], seed.removeprefix("seed")]
         cells += [f"{rate:.0f}%" for rate in rates] + [f"{rates[1] - rates[0]:+.0f} points"]
         scores = mujoco.score, bullet.score
-        same = task == "push"  # the score of push is its success
+        same = task.startswith("push")  # the score of push is its success
         cells += [] if same else [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
         lines.append(cells)
     rate, score = ("MuJoCo", "PyBullet", "difference"), ("score", "PyBullet", "difference")
@@ -196,9 +225,10 @@ def bar_figure() -> Figure:
     """Return bars of the zero-shot success of each agent on each split of reach."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     axes = figure.subplots()
-    width = 0.8 / (len(AGENTS) + 1)
-    results = [results_of("reach-30m", f"{split}/reach") for split in SPLITS]
-    names = {**AGENTS, "jacobian": "`jacobian`"}
+    results = [results_of("reach-30m", f"{split}/reach") for split in FIGURE_SPLITS]
+    names = {agent: name for agent, name in AGENTS.items() if agent.startswith("me-")}
+    names["jacobian"] = "`jacobian`"
+    width = 0.8 / len(names)
     for i, (agent, name) in enumerate(names.items()):
         label: str | None = name.replace("`", "")
         for x, found in enumerate(results):
@@ -207,7 +237,7 @@ def bar_figure() -> Figure:
                 continue
             rate = by_mean(modes[0])["test"].success
             axes.bar(
-                x + (i - len(AGENTS) / 2) * width,
+                x + (i - (len(names) - 1) / 2) * width,
                 100 * rate.value,
                 width,
                 yerr=[[100 * (rate.value - rate.low)], [100 * (rate.high - rate.value)]],
@@ -216,7 +246,7 @@ def bar_figure() -> Figure:
                 error_kw={"elinewidth": 0.8},
             )
             label = None  # once in the legend
-    axes.set_xticks(range(len(SPLITS)), SPLITS, fontsize=8)
+    axes.set_xticks(range(len(FIGURE_SPLITS)), FIGURE_SPLITS, fontsize=8)
     axes.set_ylabel("zero-shot success [%]")
     axes.set_ylim(0, 105)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
@@ -257,6 +287,7 @@ def tables() -> dict[str, str]:
     """Return the tables of the page by their names."""
     return {
         **{task: split_table(task) for task in TASKS},
+        "ee-task": ee_task_table(),
         "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
         "similarity": TRANSFER["table"](similarity_rows()),

@@ -122,10 +122,15 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
             _require_inner_paths(path, _root(documents, path), formats[path])
     roots = {path: _root(documents, path) for path in stored if formats.get(path) == "URDF"}
     mjcf = main if formats[main] == "MJCF" else None
-    folder = _write_upload(stored, roots, mjcf, files)
     is_bundle = (
         PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in stored
     )
+    if is_bundle and mjcf is not None:
+        raise UploadError(
+            f"{main}: is the {URDF} of a bundle, but an MJCF; give it another name, or send it "
+            f"without {CARD}"
+        )
+    folder = _write_upload(stored, roots, mjcf, files)
     target = str(PurePosixPath(main).parent) if is_bundle else main
     return f"{UPLOAD}{folder}/{target}".removesuffix("/.")
 

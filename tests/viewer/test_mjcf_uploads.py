@@ -26,6 +26,12 @@ def test_mjcf_upload_is_kept_and_read(access):
     assert read_robot_uri(store_upload("some.xml", URDF, access), access).root.name == "a"
 
 
+def test_a_bundle_whose_urdf_is_an_mjcf_is_refused(access):
+    files = {"p/robot.urdf": MJCF % BODY % b"a", "p/card.json": b"{}"}
+    with pytest.raises(UploadError, match=r"^p/robot\.urdf: is the robot\.urdf of a bundle, but"):
+        store_upload("card.zip", archive(files), access)
+
+
 def test_mjcf_of_a_zip_is_read_with_its_meshes_and_includes(access):
     worldbody = b"""<worldbody><body name="b"><geom type="mesh" mesh="x"/></body></worldbody>
     <compiler meshdir="../meshes/"/>"""
