@@ -51,7 +51,6 @@ class IkSolutions:
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
         self._moves_tool = tables.moves_tool[index]
-        self._turns = ~tables.is_prismatic[index] & self._moves_tool
         n, J = self._lower.shape
         device = tables.device
         # The first point of the sequence is zero, a corner of the range.
@@ -118,7 +117,7 @@ class IkSolutions:
             rotation_weight=metres_per_radian,
             iterations=ITERATIONS,
         )
-        q = self._nearest_turn(q, now, rows)
+        q = self._tables.nearest_turns(self._index[rows], q, now)
         distance = torch.linalg.vector_norm(error, dim=2)
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
         cost = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance))
@@ -132,10 +131,3 @@ class IkSolutions:
         best = torch.tensor(np.array(chosen), device=rows.device)
         column = torch.arange(len(rows), device=rows.device)
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
-
-    def _nearest_turn(self, q: torch.Tensor, now: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-        """Return configurations with turns of 360 degrees taken away where limits allow it."""
-        turn = 2 * math.pi * torch.round((q - now) / (2 * math.pi))
-        nearer = q - turn
-        allowed = (nearer >= self._lower[rows]) & (nearer <= self._upper[rows]) & self._turns[rows]
-        return torch.where(allowed, nearer, q)

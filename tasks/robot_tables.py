@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,23 @@ class RobotTables:
         joint = self.joint_of_link.clamp(min=0)
         mask = self.joint_of_link >= 0
         return mask if fingers else mask & torch.gather(self.moves_tool, 1, joint)
+
+    def nearest_turns(
+        self, robots: torch.Tensor, q: torch.Tensor, near: torch.Tensor
+    ) -> torch.Tensor:
+        """Return configurations that differ by full turns of joints, and are nearer to others.
+
+        Joints stay within their limits. Only joints that move the tool turn.
+
+        Args:
+            robots: Index of the robot of each column, shape (n,), int64.
+            q: Configurations, shape (..., n, J) [rad or m].
+            near: Configurations that they should be near to, shape (n, J) [rad or m].
+        """
+        nearer = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
+        turns = ~self.is_prismatic[robots] & self.moves_tool[robots]
+        allowed = turns & (nearer >= self.lower[robots]) & (nearer <= self.upper[robots])
+        return torch.where(allowed, nearer, q)
 
 
 def build_robot_tables(

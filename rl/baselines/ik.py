@@ -109,6 +109,8 @@ class InverseKinematics:
                 rows = torch.randint(len(nodes), (STARTS,), generator=self._generator)
                 starts[:, i, : nodes.shape[1]] = torch.from_numpy(nodes[rows.numpy()])
         q, distance = _solve_ik(task, envs, starts)
+        # A joint of two turns reaches a pose in two ways, of which one may outlast the episode.
+        q = task.robot_tables.nearest_turns(robots, q, now)
         steps = ((q - now) / task.robot_tables.max_step[robots].clamp(min=1e-9)).abs().amax(dim=2)
         # Solutions come before all others, by control steps; others by their distance.
         order = torch.where(distance < CLOSE, steps, 1e9 * (1 + distance)).argsort(dim=0)

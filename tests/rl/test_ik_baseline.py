@@ -1,5 +1,6 @@
 """The baseline ``ik`` reaches goals along collision-free paths; results of episodes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from helpers.scenes import robot
 from morphgen.rl.baselines.ik import STARTS, InverseKinematics, random_starts
+from morphgen.rl.baselines.path_planner import PathFollower
 from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.make import make_batch
@@ -44,6 +46,25 @@ def test_random_starts_do_not_move_fingers(made):
     idle = ~batch.robot_tables.moves_tool[0]
     assert idle.any()
     assert torch.equal(starts[..., idle], near[:, idle].expand(STARTS, -1, -1))
+
+
+def test_joints_of_two_turns_take_the_shorter_way(made):
+    batch = made("arm=ur5 ee=stick", 12)
+    tables, steps, follow = batch.robot_tables, [], PathFollower.follow
+    assert (tables.upper[0] - tables.lower[0])[tables.moves_tool[0]].max() > 4 * math.pi - 0.01
+    half_turn = math.pi / tables.max_step[0][tables.moves_tool[0]].min()
+
+    def record(follower, env, waypoints):
+        if len(waypoints) == 1:  # a straight path
+            change = torch.from_numpy(waypoints[0]) - batch.targets[env].double()
+            steps.append((change / tables.max_step[0]).abs().max())
+        follow(follower, env, waypoints)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PathFollower, "follow", record)
+        InverseKinematics(0).act(batch)
+    assert len(steps) > 6
+    assert max(steps) <= half_turn + 1e-3
 
 
 @pytest.mark.parametrize("words", [CLAW, CHAIN])
