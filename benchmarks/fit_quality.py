@@ -22,7 +22,8 @@ A row is an arm; values are means over its links (links with the same meshes are
 - CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
   and with up to four by both searches.
 
-``--fits`` names the fits of morphgen to measure; the residual search takes most of the time.
+``--fits`` names the fits of morphgen to measure; the residual search takes most of the time. With
+``--json``, an interrupted run goes on where it stopped.
 scikit-robot comes with `pip install morphgen[bench]`; without it its columns are missing.
 """
 
@@ -50,6 +51,7 @@ from tqdm import tqdm
 from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
+from morphgen.formats.files import write_atomic
 from morphgen.formats.fits import shapes_key, shapes_to_fit
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
@@ -59,6 +61,10 @@ from morphgen.model.mesh import is_flat, load_mesh
 from morphgen.typing import Array
 
 T = TypeVar("T")
+Row = dict[str, float]
+"""Measured values of a link by column."""
+RowKey = tuple[str, str]
+"""Definition of the solid, and key of the link's shapes."""
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
 """The arms for which issues of this project set targets."""
 UP_TO_FOUR = FitOptions(max_primitives=4, iou=1.0)
@@ -69,7 +75,7 @@ FITS = {
     "enclose": FitOptions(enclose=True),
 }
 """Fits that are measured, by their name in the columns."""
-COLUMNS: dict[str, Callable[[Sequence[dict[str, float]], str], float]] = {
+COLUMNS: dict[str, Callable[[Sequence[Row], str], float]] = {
     "iou trimesh": lambda rows, key: _mean(rows, key),
     "iou skrobot": lambda rows, key: _mean(rows, key),
     "iou one": lambda rows, key: _mean(rows, key),
@@ -106,7 +112,7 @@ def main() -> int:
     parser.add_argument("--solid", default="link", help=f"of {', '.join(SOLIDS)}; by commas")
     parser.add_argument("--fits", default=",".join(FITS), help="by commas (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="also write a row a link here")
+    parser.add_argument("--json", type=Path, help="write rows here; go on from those there")
     args = parser.parse_args()
     solids = args.solid.split(",")
     if unknown := set(solids) - set(SOLIDS):
@@ -117,27 +123,49 @@ def main() -> int:
     peer = find_spec("skrobot") is not None
     tasks = link_tasks({name for name in args.only.split(",") if name})
     unique = {shapes_key(task.shapes): task for task in tasks}
-    lines = []
+    rows = _read_rows(args.json, fits, peer=peer)
     for name in solids:
+        missing = {key: task for key, task in unique.items() if (name, key) not in rows}
         with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
             measure = partial(_measure, solid_name=name, fits=fits, peer=peer)
-            measured = pool.map(measure, unique.values())
-            row_of = dict(zip(unique, tqdm(measured, total=len(unique), unit="link"), strict=True))
-        found: dict[str, list[dict[str, float]]] = defaultdict(list)
+            measured = tqdm(pool.map(measure, missing.values()), total=len(missing), unit="link")
+            for key, row in zip(missing, measured, strict=True):
+                rows[name, key] = row
+                if args.json:
+                    _write_rows(args.json, rows, unique)
+        found: dict[str, list[Row]] = defaultdict(list)
         for task in tasks:
-            row = row_of[shapes_key(task.shapes)]
-            found[task.arm].append(row)
-            lines.append({"solid": name, "arm": task.arm, "link": task.link, **row})
+            found[task.arm].append(rows[name, shapes_key(task.shapes)])
         print(f"\nsolid: {name}")
         _print(found)
-    if args.json:
-        args.json.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
     if not peer:
         print("scikit-robot is not installed: no peer in this run (pip install 'morphgen[bench]')")
     return 0
 
 
-def _print(found: Mapping[str, Sequence[dict[str, float]]]) -> None:
+def _read_rows(path: Path | None, fits: Sequence[str], *, peer: bool) -> dict[RowKey, Row]:
+    """Return the rows of an earlier run that have all columns."""
+    if path is None or not path.exists():
+        return {}
+    needed = {f"iou {fit}" for fit in (*fits, *(["skrobot"] if peer else []))}
+    entries = json.loads(path.read_text("utf-8"))
+    return {
+        (entry["solid"], entry["shapes"]): entry["row"]
+        for entry in entries
+        if needed <= entry["row"].keys()
+    }
+
+
+def _write_rows(path: Path, rows: Mapping[RowKey, Row], unique: Mapping[str, Task]) -> None:
+    entries = [
+        {"solid": solid, "arm": task.arm, "link": task.link, "shapes": key, "row": row}
+        for (solid, key), row in rows.items()
+        if (task := unique.get(key))
+    ]
+    write_atomic(path, json.dumps(entries, indent=1) + "\n")
+
+
+def _print(found: Mapping[str, Sequence[Row]]) -> None:
     measured = {name for of in found.values() for row in of for name in row}
     columns = [name for name in COLUMNS if name in measured]
     rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
@@ -193,7 +221,7 @@ SOLIDS: dict[str, Callable[[Sequence[Shape]], Solid]] = {
 }
 
 
-def _measure(task: Task, *, solid_name: str, fits: Sequence[str], peer: bool) -> dict[str, float]:
+def _measure(task: Task, *, solid_name: str, fits: Sequence[str], peer: bool) -> Row:
     solid = SOLIDS[solid_name](task.shapes)
     row = {"iou trimesh": quality(solid, [_tightest(solid)]).iou}
     if peer:
@@ -259,7 +287,7 @@ def _timed(fit: Callable[[], T]) -> tuple[T, float]:
     return fit(), time.process_time() - start
 
 
-def _mean(rows: Sequence[dict[str, float]], key: str) -> float:
+def _mean(rows: Sequence[Row], key: str) -> float:
     return float(np.mean([row[key] for row in rows]))
 
 
