@@ -45,6 +45,8 @@ SPLITS = (
     "extrapolation/arms-small",
 )
 FIGURE_SPLITS = SPLITS[:5]
+TUNED = ("deterministic", "fine-tuned 10,000", "fine-tuned 30,000")
+"""Modes of a run before and after fine-tuning."""
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
 AGENTS = {
@@ -139,9 +141,7 @@ def split_table(task: str) -> str:
             lines.append([split, *_line(agent, steps, note, modes, with_scores)])
             split = ""
     score = ["MT", "success", "ZS", "success"] if with_scores else ["MT", "ZS"]
-    headers = ["split", "agent", "transitions", "seeds", *score, "fine-tuned"]
-    if not any(line[-1] for line in lines):
-        headers, lines = headers[:-1], [line[:-1] for line in lines]
+    headers = ["split", "agent", "transitions", "seeds", *score]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -153,14 +153,16 @@ def ee_task_table() -> str:
     keys = [key for key in {*push, *reach} if key[0] in order]
     for key in sorted(keys, key=lambda key: order.index(key[0])):
         agent, steps = key
-        by_task = [by_mean(found[key]) if key in found else {} for found in (push, reach)]
-        (pushing, reaching) = by_task
+        by_task = [by_mean(found[key]) if found.get(key) else {} for found in (push, reach)]
+        pushing, reaching = by_task
         seeds = max(result.seeds for sides in by_task for result in sides.values())
         columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
+        rates = [column.success.as_percent() if column else "" for column in columns]
+        score = f"{reaching['train'].score:.1f}" if reaching else ""
         cells = [AGENTS.get(agent, f"`{agent}`")]
         cells += [f"{round(steps / 1e6)} million", str(seeds)] if steps else ["", ""]
-        lines.append([*cells, *(c.success.as_percent() if c else "" for c in columns)])
-    headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "ZS, push"]
+        lines.append([*cells, rates[0], score, *rates[1:]])
+    headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -175,9 +177,29 @@ def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) ->
             continue
         success = sides[side].success.as_percent()
         cells += [f"{sides[side].score:.1f}", success] if with_scores else [success]
-    tuned = [modes[key]["test"] for key in modes if key.startswith("fine-tuned 30,000")]
-    cells.append(f"{tuned[0].success.value:.0%}" if tuned else "")
     return cells
+
+
+def fine_tuning_table() -> str:
+    """Return success on the test robots before and after fine-tuning, for runs that have both."""
+    found: dict[str, list[tuple[list[str], list[Result]]]] = {}
+    for path in sorted((ROOT / "results").glob("*-30m/**/scores.json")):
+        scores = stored_cell(path, read_json(path)).scores
+        if not scores.keys() >= set(TUNED):
+            continue
+        _, *split, agent, seed = path.relative_to(ROOT / "results").parent.parts
+        tests = [[score for score in scores[mode] if score.side == "test"] for mode in TUNED]
+        results = [_result([rows]) for rows in tests]
+        task = tests[0][0].task
+        names = ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
+        found.setdefault(task, []).append((names, results))
+    lines = []
+    for task, rows in sorted(found.items()):
+        lines += [[*names, *(x.success.as_percent() for x in results)] for names, results in rows]
+        means = [mean(results[i].success.value for _, results in rows) for i in range(len(TUNED))]
+        lines.append([f"**mean of {len(rows)}, {task}**", "", "", *(f"**{x:.1%}**" for x in means)])
+    headers = ["split", "agent", "seed", "zero-shot", "10,000 steps", "30,000 steps"]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
 def pybullet_table() -> str:
@@ -288,6 +310,7 @@ def tables() -> dict[str, str]:
     return {
         **{task: split_table(task) for task in TASKS},
         "ee-task": ee_task_table(),
+        "fine-tuning": fine_tuning_table(),
         "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
         "similarity": TRANSFER["table"](similarity_rows()),

@@ -31,7 +31,7 @@ RUNS = (
     ("`me-graph` with MuJoCo", r"me-graph|graph-", ("mujoco",)),
     ("`me-graph` without contacts", r"me-graph|graph-", ("kinematic",)),
     ("`me-graph` with MuJoCo Warp", r"me-graph|graph-", ("warp",)),
-    ("`me-mlp` and `me-tf`", r"me-mlp|me-tf", ("kinematic", "warp")),
+    ("`me-mlp` and `me-tf`", r"me-mlp|me-tf|se", ("kinematic", "warp")),
 )
 """Runs that the docs name, a pattern of their agents, and their simulators."""
 CONSTANTS = ("gamma", "num_steps", "learning_rate", "num_envs")
@@ -58,8 +58,8 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
     assert run_here(command, monkeypatch) == 0
     rows = json.loads((tmp_path / study / "results.json").read_text("utf-8"))["rows"]
     means = {
-        (row["split"], row["agent"]): {
-            f"{group['mean']:{'.0%' if row['split'].endswith('push') else '.1f'}}"
+        (row["split"], row["task"], row["agent"]): {
+            f"{group['mean']:{'.0%' if row['task'] == 'push' else '.1f'}}"
             for group in row["groups"].values()
         }
         for row in rows
