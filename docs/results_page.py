@@ -169,7 +169,8 @@ def ee_task_table() -> str:
 def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) -> list[str]:
     sides = by_mean(modes)
     cells = [AGENTS.get(agent, f"`{agent}`") + note]
-    cells.append(f"{round(steps / 1e6)} million" if steps else "")
+    share = " a robot" if agent.startswith("se") else ""
+    cells.append(f"{round(steps / 1e6)} million{share}" if steps else "")
     cells.append(str(sides["test"].seeds) if steps else "")
     for side in SIDES:
         if side not in sides:
