@@ -3,7 +3,7 @@
     python docs/results_page.py
 
 Each table stands between two comments of the page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
-replaced. The figures are reach.png, robots.png and similarity.png in docs/images/results.
+replaced. The figures are reach.png, push.png, robots.png and similarity.png in docs/images/results.
 """
 
 from __future__ import annotations
@@ -244,13 +244,18 @@ def write_tables(tables: Mapping[str, str], page: str) -> str:
     return page
 
 
-def bar_figure() -> Figure:
-    """Return bars of the zero-shot success of each agent on each split of reach."""
+def bar_figure(task: str, baseline: str) -> Figure:
+    """Return bars of the zero-shot success of each agent and a baseline on each split of a task."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     axes = figure.subplots()
-    results = [results_of("reach-30m", f"{split}/reach") for split in FIGURE_SPLITS]
-    names = {agent: name for agent, name in AGENTS.items() if agent.startswith("me-")}
-    names["jacobian"] = "`jacobian`"
+    results = [results_of(f"{task}-30m", f"{split}/{task}") for split in FIGURE_SPLITS]
+    found_agents = {agent for found in results for agent, _ in found}
+    names = {
+        agent: name
+        for agent, name in AGENTS.items()
+        if agent.startswith("me-") and agent in found_agents
+    }
+    names[baseline] = f"`{baseline}`"
     width = 0.8 / len(names)
     for i, (agent, name) in enumerate(names.items()):
         label: str | None = name.replace("`", "")
@@ -264,7 +269,7 @@ def bar_figure() -> Figure:
                 100 * rate.value,
                 width,
                 yerr=[[100 * (rate.value - rate.low)], [100 * (rate.high - rate.value)]],
-                color=(*COLOURS, "#a0aec0")[i],
+                color="#a0aec0" if agent == baseline else COLOURS[i],
                 label=label,
                 error_kw={"elinewidth": 0.8},
             )
@@ -330,7 +335,8 @@ def main() -> int:
     ).parse_args()
     PAGE.write_text(write_tables(tables(), PAGE.read_text("utf-8")), "utf-8")
     print(PAGE)
-    print(save(bar_figure(), "reach.png"))
+    print(save(bar_figure("reach", "jacobian"), "reach.png"))
+    print(save(bar_figure("push", "scripted"), "push.png"))
     print(save(curve_figure(), "robots.png"))
     TRANSFER["draw_figure"](similarity_rows(), IMAGES / "similarity.png")
     print(IMAGES / "similarity.png")
