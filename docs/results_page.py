@@ -206,20 +206,26 @@ def fine_tuning_table() -> str:
 def pybullet_table() -> str:
     """Return scores on the test robots in MuJoCo and in PyBullet, for runs that have both."""
     lines: list[list[str]] = []
+    differences: dict[str, list[float]] = {}
     for path in sorted((ROOT / "results/pybullet").rglob("seed*.json")):
         run = path.relative_to(ROOT / "results/pybullet").with_suffix("")
         stored = ROOT / "results" / run / "scores.json"
         ours = stored_cell(stored, read_json(stored)).scores["deterministic"]
-        mujoco = _result([[score for score in ours if score.side == "test"]])
+        tests = [score for score in ours if score.side == "test"]
+        mujoco = _result([tests])
         bullet = _result([[score_from_json(row) for row in read_json(path)["deterministic"]]])
-        _, *split, task, agent, seed = run.parts
+        _, *split, agent, seed = run.parts
         rates = [100 * result.success.value for result in (mujoco, bullet)]
-        cells = ["/".join([*split, task]), AGENTS[agent], seed.removeprefix("seed")]
+        differences.setdefault(tests[0].task, []).append(rates[1] - rates[0])
+        cells = ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
         cells += [f"{rate:.0f}%" for rate in rates] + [f"{rates[1] - rates[0]:+.0f} points"]
-        scores = mujoco.score, bullet.score
-        same = task.startswith("push")  # the score of push is its success
-        cells += [] if same else [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
+        if tests[0].task == "reach":  # the score of push is its success
+            scores = mujoco.score, bullet.score
+            cells += [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
         lines.append(cells)
+    for task, values in sorted(differences.items()):
+        mean_of = f"**mean of {len(values)}, {task}**"
+        lines.append([mean_of, "", "", "", "", f"**{mean(values):+.1f} points**"])
     rate, score = ("MuJoCo", "PyBullet", "difference"), ("score", "PyBullet", "difference")
     headers = ["split", "agent", "seed", *rate, *score]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
