@@ -3,7 +3,8 @@
     python docs/results_page.py
 
 Each table stands between two comments of the page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
-replaced. The figures are reach.png, push.png, robots.png and similarity.png in docs/images/results.
+replaced. The figures are in docs/images/results: reach.png, push.png, fine-tuning.png,
+robots.png and similarity.png.
 """
 
 from __future__ import annotations
@@ -181,8 +182,8 @@ def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) ->
     return cells
 
 
-def fine_tuning_table() -> str:
-    """Return success on the test robots before and after fine-tuning, for runs that have both."""
+def fine_tuned_runs() -> dict[str, list[tuple[list[str], list[Result]]]]:
+    """Return runs by their test task: split, agent and seed, and results by mode of ``TUNED``."""
     found: dict[str, list[tuple[list[str], list[Result]]]] = {}
     for path in sorted((ROOT / "results").glob("*-30m/**/scores.json")):
         scores = stored_cell(path, read_json(path)).scores
@@ -190,12 +191,15 @@ def fine_tuning_table() -> str:
             continue
         _, *split, agent, seed = path.relative_to(ROOT / "results").parent.parts
         tests = [[score for score in scores[mode] if score.side == "test"] for mode in TUNED]
-        results = [_result([rows]) for rows in tests]
-        task = tests[0][0].task
         names = ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
-        found.setdefault(task, []).append((names, results))
+        found.setdefault(tests[0][0].task, []).append((names, [_result([rows]) for rows in tests]))
+    return found
+
+
+def fine_tuning_table() -> str:
+    """Return success on the test robots before and after fine-tuning."""
     lines = []
-    for task, rows in sorted(found.items()):
+    for task, rows in sorted(fine_tuned_runs().items()):
         lines += [[*names, *(x.success.as_percent() for x in results)] for names, results in rows]
         means = [mean(results[i].success.value for _, results in rows) for i in range(len(TUNED))]
         lines.append([f"**mean of {len(rows)}, {task}**", "", "", *(f"**{x:.1%}**" for x in means)])
@@ -287,6 +291,29 @@ def bar_figure(task: str, baseline: str) -> Figure:
     return figure
 
 
+def fine_tuning_figure() -> Figure:
+    """Return success on the test robots of each split of push against the steps of fine-tuning."""
+    figure = Figure(figsize=(6.5, 3.2), layout="constrained")
+    axes = figure.subplots()
+    by_split: dict[str, list[list[float]]] = {}
+    for (split, *_), results in fine_tuned_runs()["push"]:
+        by_split.setdefault(split, []).append([100 * x.success.value for x in results])
+    steps = [0, 10, 30]
+    for i, (split, rows) in enumerate(by_split.items()):
+        label = f"{split.removesuffix('/push')} ({len(rows)})"
+        axes.plot(
+            steps, [mean(column) for column in zip(*rows, strict=True)], f"C{i}o-", label=label
+        )
+        for row in rows:
+            axes.plot(steps, row, color=f"C{i}", lw=0.5, alpha=0.5)
+    axes.set_xticks(steps)
+    axes.set_xlabel("thousand control steps on the test robot")
+    axes.set_ylabel("success at push [%]")
+    axes.set_ylim(0, 105)
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
+    return figure
+
+
 def curve_figure() -> Figure:
     """Return success on ten real arms against the number of training robots, by variant."""
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
@@ -343,6 +370,7 @@ def main() -> int:
     print(PAGE)
     print(save(bar_figure("reach", "jacobian"), "reach.png"))
     print(save(bar_figure("push", "scripted"), "push.png"))
+    print(save(fine_tuning_figure(), "fine-tuning.png"))
     print(save(curve_figure(), "robots.png"))
     TRANSFER["draw_figure"](similarity_rows(), IMAGES / "similarity.png")
     print(IMAGES / "similarity.png")
