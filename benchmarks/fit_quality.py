@@ -63,8 +63,6 @@ from morphgen.typing import Array
 T = TypeVar("T")
 Row = dict[str, float]
 """Measured values of a link by column."""
-RowKey = tuple[str, str]
-"""Definition of the solid, and key of the link's shapes."""
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
 """The arms for which issues of this project set targets."""
 UP_TO_FOUR = FitOptions(max_primitives=4, iou=1.0)
@@ -123,46 +121,33 @@ def main() -> int:
     peer = find_spec("skrobot") is not None
     tasks = link_tasks({name for name in args.only.split(",") if name})
     unique = {shapes_key(task.shapes): task for task in tasks}
-    rows = _read_rows(args.json, fits, peer=peer)
+    stored = json.loads(args.json.read_text("utf-8")) if args.json and args.json.exists() else []
+    entries: dict[tuple[str, str], dict[str, Any]] = {
+        (entry["solid"], entry["shapes"]): entry for entry in stored
+    }
+    needed = {f"iou {fit}" for fit in (*fits, *(["skrobot"] if peer else []))}
     for name in solids:
-        missing = {key: task for key, task in unique.items() if (name, key) not in rows}
+        missing = {
+            key: task
+            for key, task in unique.items()
+            if (name, key) not in entries or not needed <= entries[name, key]["row"].keys()
+        }
         with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
             measure = partial(_measure, solid_name=name, fits=fits, peer=peer)
             measured = tqdm(pool.map(measure, missing.values()), total=len(missing), unit="link")
-            for key, row in zip(missing, measured, strict=True):
-                rows[name, key] = row
+            for (key, task), row in zip(missing.items(), measured, strict=True):
+                link = {"arm": task.arm, "link": task.link}
+                entries[name, key] = {"solid": name, "shapes": key, **link, "row": row}
                 if args.json:
-                    _write_rows(args.json, rows, unique)
+                    write_atomic(args.json, json.dumps(list(entries.values()), indent=1) + "\n")
         found: dict[str, list[Row]] = defaultdict(list)
         for task in tasks:
-            found[task.arm].append(rows[name, shapes_key(task.shapes)])
+            found[task.arm].append(entries[name, shapes_key(task.shapes)]["row"])
         print(f"\nsolid: {name}")
         _print(found)
     if not peer:
         print("scikit-robot is not installed: no peer in this run (pip install 'morphgen[bench]')")
     return 0
-
-
-def _read_rows(path: Path | None, fits: Sequence[str], *, peer: bool) -> dict[RowKey, Row]:
-    """Return the rows of an earlier run that have all columns."""
-    if path is None or not path.exists():
-        return {}
-    needed = {f"iou {fit}" for fit in (*fits, *(["skrobot"] if peer else []))}
-    entries = json.loads(path.read_text("utf-8"))
-    return {
-        (entry["solid"], entry["shapes"]): entry["row"]
-        for entry in entries
-        if needed <= entry["row"].keys()
-    }
-
-
-def _write_rows(path: Path, rows: Mapping[RowKey, Row], unique: Mapping[str, Task]) -> None:
-    entries = [
-        {"solid": solid, "arm": task.arm, "link": task.link, "shapes": key, "row": row}
-        for (solid, key), row in rows.items()
-        if (task := unique.get(key))
-    ]
-    write_atomic(path, json.dumps(entries, indent=1) + "\n")
 
 
 def _print(found: Mapping[str, Sequence[Row]]) -> None:
