@@ -35,11 +35,9 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -58,6 +56,7 @@ from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.mesh import is_flat, load_mesh
+from morphgen.processes import parallel_map
 from morphgen.typing import Array
 
 T = TypeVar("T")
@@ -132,14 +131,14 @@ def main() -> int:
             for key, task in unique.items()
             if (name, key) not in entries or not needed <= entries[name, key]["row"].keys()
         }
-        with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-            measure = partial(_measure, solid_name=name, fits=fits, peer=peer)
-            measured = tqdm(pool.map(measure, missing.values()), total=len(missing), unit="link")
-            for (key, task), row in zip(missing.items(), measured, strict=True):
-                link = {"arm": task.arm, "link": task.link}
-                entries[name, key] = {"solid": name, "shapes": key, **link, "row": row}
-                if args.json:
-                    write_atomic(args.json, json.dumps(list(entries.values()), indent=1) + "\n")
+        measure = partial(_measure, solid_name=name, fits=fits, peer=peer)
+        measured = parallel_map(measure, list(missing.values()), args.jobs, chunk=1)
+        shown = tqdm(measured, total=len(missing), unit="link")
+        for (key, task), row in zip(missing.items(), shown, strict=True):
+            link = {"arm": task.arm, "link": task.link}
+            entries[name, key] = {"solid": name, "shapes": key, **link, "row": row}
+            if args.json:
+                write_atomic(args.json, json.dumps(list(entries.values()), indent=1) + "\n")
         found: dict[str, list[Row]] = defaultdict(list)
         for task in tasks:
             found[task.arm].append(entries[name, shapes_key(task.shapes)]["row"])
