@@ -14,9 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import files
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +27,7 @@ from morphgen.fitting.solid import solid_of
 from morphgen.formats.bundle import read_robot
 from morphgen.formats.fits import are_primitives, shapes_key, shapes_to_fit
 from morphgen.model.geometry import Shape
+from morphgen.processes import parallel_map
 
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 WORST = 10
@@ -47,9 +46,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()
     links, refused = _links([word for word in args.only.split(",") if word])
-    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-        measured = tqdm(pool.map(_measure, links.items()), total=len(links), unit="link")
-        found = list(measured)
+    measured = parallel_map(_measure, list(links.items()), args.jobs, chunk=1)
+    found = list(tqdm(measured, total=len(links), unit="link"))
     rows = [row for row in found if not isinstance(row, str)]
     refused += [row for row in found if isinstance(row, str)]
     print(f"{len(rows)} links; solids: {dict(Counter(row[1] for row in rows))}")
