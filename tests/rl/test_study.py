@@ -94,7 +94,7 @@ def test_a_cell_has_its_episodes_as_submissions(whole):
 def test_fine_tuning_is_added_to_finished_cells(whole, tmp_path):
     folder = tmp_path / "study"
     shutil.copytree(whole[0].folder.parents[2], folder)
-    mode, steps = "fine-tuned 1,024", 1024  # one update
+    mode, steps = "fine-tuned 2,048", 2048  # one update
     cells = cells_in(folder, finetune=(steps,))
     before = {cell: read_scores(cell) for cell in cells}
     finished(cells)
