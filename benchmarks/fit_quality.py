@@ -136,7 +136,8 @@ def main() -> int:
         shown = tqdm(measured, total=len(missing), unit="link")
         for (key, task), row in zip(missing.items(), shown, strict=True):
             link = {"arm": task.arm, "link": task.link}
-            entries[name, key] = {"solid": name, "shapes": key, **link, "row": row}
+            before = entries[name, key]["row"] if (name, key) in entries else {}
+            entries[name, key] = {"solid": name, "shapes": key, **link, "row": {**before, **row}}
             if args.json:
                 write_atomic(args.json, json.dumps(list(entries.values()), indent=1) + "\n")
         found: dict[str, list[Row]] = defaultdict(list)
@@ -150,7 +151,8 @@ def main() -> int:
 
 
 def _print(found: Mapping[str, Sequence[Row]]) -> None:
-    measured = {name for of in found.values() for row in of for name in row}
+    # Rows of earlier runs may have columns that others lack.
+    measured = set.intersection(*(set(row) for of in found.values() for row in of))
     columns = [name for name in COLUMNS if name in measured]
     rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
     table = [*rows, *_means("mean of all arms", rows)]

@@ -46,7 +46,8 @@ SPLITS = (
     "extrapolation/arms-small",
 )
 FIGURE_SPLITS = SPLITS[:5]
-TUNED = ("deterministic", "fine-tuned 10,000", "fine-tuned 30,000")
+TUNED_STEPS = (10_000, 30_000)
+TUNED = ("deterministic", *(f"fine-tuned {steps:,}" for steps in TUNED_STEPS))
 """Modes of a run before and after fine-tuning."""
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
@@ -100,8 +101,8 @@ def results_of(study: str, split: str, task: str | None = None) -> dict[tuple[st
         modes = found.setdefault((agent, steps), {})
         for mode, scores in stored_cell(path, read_json(path)).scores.items():
             for side in SIDES:
-                own = [score for score in scores if score.side == side]
-                if own := [score for score in own if task in (None, score.task)]:
+                own = [s for s in scores if s.side == side and task in (None, s.task)]
+                if own:
                     modes.setdefault(mode, {}).setdefault(side, []).append(own)
     return {
         key: {
@@ -160,19 +161,27 @@ def ee_task_table() -> str:
         columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
         rates = [column.success.as_percent() if column else "" for column in columns]
         score = f"{reaching['train'].score:.1f}" if reaching else ""
-        cells = [AGENTS.get(agent, f"`{agent}`")]
-        cells += [f"{round(steps / 1e6)} million", str(seeds)] if steps else ["", ""]
-        lines.append([*cells, rates[0], score, *rates[1:]])
+        lines.append([*_run_cells(agent, steps, seeds), rates[0], score, *rates[1:]])
     headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
+def _run_cells(agent: str, steps: int, seeds: int, note: str = "") -> list[str]:
+    """Return agent, transitions and seeds; the latter two are empty for a baseline."""
+    name = AGENTS.get(agent, f"`{agent}`") + note
+    share = " a robot" if agent.startswith("se") else ""
+    return [name, *([f"{round(steps / 1e6)} million{share}", str(seeds)] if steps else ["", ""])]
+
+
+def _names(run: Path) -> list[str]:
+    """Return split, agent and seed of a run's folder, relative to results/."""
+    _, *split, agent, seed = run.parts
+    return ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
+
+
 def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) -> list[str]:
     sides = by_mean(modes)
-    cells = [AGENTS.get(agent, f"`{agent}`") + note]
-    share = " a robot" if agent.startswith("se") else ""
-    cells.append(f"{round(steps / 1e6)} million{share}" if steps else "")
-    cells.append(str(sides["test"].seeds) if steps else "")
+    cells = _run_cells(agent, steps, sides["test"].seeds, note)
     for side in SIDES:
         if side not in sides:
             cells += [""] * (2 if with_scores else 1)
@@ -189,9 +198,8 @@ def fine_tuned_runs() -> dict[str, list[tuple[list[str], list[Result]]]]:
         scores = stored_cell(path, read_json(path)).scores
         if not scores.keys() >= set(TUNED):
             continue
-        _, *split, agent, seed = path.relative_to(ROOT / "results").parent.parts
         tests = [[score for score in scores[mode] if score.side == "test"] for mode in TUNED]
-        names = ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
+        names = _names(path.parent.relative_to(ROOT / "results"))
         found.setdefault(tests[0][0].task, []).append((names, [_result([rows]) for rows in tests]))
     return found
 
@@ -203,7 +211,8 @@ def fine_tuning_table() -> str:
         lines += [[*names, *(x.success.as_percent() for x in results)] for names, results in rows]
         means = [mean(results[i].success.value for _, results in rows) for i in range(len(TUNED))]
         lines.append([f"**mean of {len(rows)}, {task}**", "", "", *(f"**{x:.1%}**" for x in means)])
-    headers = ["split", "agent", "seed", "zero-shot", "10,000 steps", "30,000 steps"]
+    steps = [f"{number:,} steps" for number in TUNED_STEPS]
+    headers = ["split", "agent", "seed", "zero-shot", *steps]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -218,11 +227,10 @@ def pybullet_table() -> str:
         tests = [score for score in ours if score.side == "test"]
         mujoco = _result([tests])
         bullet = _result([[score_from_json(row) for row in read_json(path)["deterministic"]]])
-        _, *split, agent, seed = run.parts
         rates = [100 * result.success.value for result in (mujoco, bullet)]
         differences.setdefault(tests[0].task, []).append(rates[1] - rates[0])
-        cells = ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
-        cells += [f"{rate:.0f}%" for rate in rates] + [f"{rates[1] - rates[0]:+.0f} points"]
+        cells = [*_names(run), *(f"{rate:.0f}%" for rate in rates)]
+        cells.append(f"{rates[1] - rates[0]:+.0f} points")
         if tests[0].task == "reach":  # the score of push is its success
             scores = mujoco.score, bullet.score
             cells += [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
@@ -298,7 +306,7 @@ def fine_tuning_figure() -> Figure:
     by_split: dict[str, list[list[float]]] = {}
     for (split, *_), results in fine_tuned_runs()["push"]:
         by_split.setdefault(split, []).append([100 * x.success.value for x in results])
-    steps = [0, 10, 30]
+    steps = [0, *(number / 1000 for number in TUNED_STEPS)]
     for i, (split, rows) in enumerate(by_split.items()):
         label = f"{split.removesuffix('/push')} ({len(rows)})"
         axes.plot(

@@ -149,7 +149,11 @@ def _import_several(
 
 
 def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict[str, str]:
-    """Return the names of the bundles: those of the descriptions, without their suffixes."""
+    """Return the names of the bundles: those of the descriptions, without their suffixes.
+
+    Raises:
+        FormatError: If several descriptions would have one name.
+    """
     names = {
         file: re.sub(r"\W", "_", description.path.stem, flags=re.ASCII)
         for file, description in found.items()
