@@ -30,6 +30,7 @@ from morphgen.viewer.robot_uri import (
 from morphgen.viewer.scene_stage import BRAND, set_stage
 from morphgen.viewer.server import start_server, stop_server
 from morphgen.viewer.session import BUG, Session
+from morphgen.viewer.shared_results import SharedResults
 from morphgen.viewer.start_address import start_address
 from morphgen.viewer.tray import change_tray
 from morphgen.viewer.viser_internals import clear_page
@@ -58,7 +59,7 @@ class Viewer:
     """Current sessions of the connected browsers, by viser's client number."""
     browsers: dict[str, int] = field(default_factory=dict)
     """Numbers of the browsers by the secret token that their scripts send."""
-    cache: dict[str, object] = field(default_factory=dict)
+    cache: SharedResults = field(default_factory=SharedResults)
     """Results of slow work that all sessions share."""
 
     @property
@@ -164,7 +165,7 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
         return False
     (action, value), state = fields[0], dict(fields[1:])
     if action != "open":
-        session.enqueue(lambda: change_tray(session, action, value))
+        session.enqueue(lambda: change_tray(session, action, value), even_closed=True)
         return True
     following = session.next_session(
         parse_count(state.get("visit", ""), 0),
@@ -175,6 +176,7 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
 
     def find_address() -> None:
         following.address = parse_address(value) or viewer.start
+        following.chosen = session.chosen  # after the changes that were queued before
 
     following.enqueue(lambda: open_page(following, find_address))
     return True

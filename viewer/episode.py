@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
+from morphgen.formats.npz_files import read_all
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
@@ -176,8 +177,7 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
         MorphgenError: If a robot does not exist any more.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_all(path)
         about = json.loads(str(arrays["about"]))
         if about["format"] not in (1, FORMAT) or about["task"] not in TASKS:
             raise ValueError(f"format {about['format']}, task {about['task']!r}")
@@ -190,16 +190,19 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
             tracks.append(_parse_track(row, of_robot, files))
         if not tracks:
             raise ValueError("it has no robots")
+        period = float(about["period"])
+        if not 0 < period < math.inf:
+            raise ValueError(f"a period of {period:g} s")
         return Episode(
             about["task"],
             str(about["policy"]),
             int(about["seed"]),
             bool(about["obstacles"]),
             str(about["simulator"]),
-            float(about["period"]),
+            period,
             tracks,
         )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise EpisodeError(f"{path} is not an episode of morphgen view: {error}") from error
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 import viser
@@ -70,7 +70,7 @@ def show(session: Session) -> None:
         MorphgenError: If the address names invalid words, an unknown grammar or robot, or a robot
             without derivation.
     """
-    files, subject = session.files, session.address.subject or DEFAULT_WORDS
+    files, subject = session.files, session.address.subject.strip() or DEFAULT_WORDS
     derivation = subject_derivation(subject, files)
     words = DEFAULT_WORDS if derivation else subject
     grammar_name = DEFAULT_GRAMMAR
@@ -230,9 +230,11 @@ def _shown_robot(page: ComposePage) -> Robot:
 
 def _write_bundle(page: ComposePage, name: str) -> None:
     robot = _shown_robot(page)
-    write_robot(page.session, robot, name or robot.name)
+    name = name or robot.name
+    write_robot(page.session, replace(robot, name=name), name)
 
 
 def _send_bundle(page: ComposePage, name: str) -> None:
     robot = _shown_robot(page)
-    send_robot(page.session, robot, name or robot.name or "robot")
+    name = name or robot.name or "robot"
+    send_robot(page.session, replace(robot, name=name), name)

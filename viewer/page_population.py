@@ -74,7 +74,7 @@ def _load(session: Session, source: Source) -> None:
         session.set_status(f"reading {total} robots", done / total)
 
     population, faults = session.cached(
-        f"population {hash(source)}",
+        f"population {source.key}",
         lambda: load_population(source, session.files, session.workers, progress),
     )
     if not session.closed.is_set():

@@ -86,7 +86,7 @@ def _free_configurations(page: PopulationPage) -> tuple[Array, NDArray[np.bool_]
         session.set_status(f"testing {total} robots for collisions", done / total)
 
     return session.cached(
-        f"free {id(population)}",
+        f"free {page.source.key}",
         lambda: load_free_configurations(population, session.workers, progress),
     )
 
@@ -107,7 +107,7 @@ def _positions(page: PopulationPage) -> population_layout.Layout:
         session.set_status(f"comparing {total} robots", done / total)
 
     points = session.cached(
-        f"map {id(page.population)}",
+        f"map {page.source.key}",
         lambda: load_map(page.population, session.files, session.workers, progress),
     )
     return population_layout.similarity_map(points, cell)

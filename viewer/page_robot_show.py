@@ -124,7 +124,7 @@ def show_in_address(page: RobotPage) -> None:
     page.session.update_address(
         page.robot.name,
         q="" if at_home else format_joints(page.q),
-        show="" if toggles == "visual" else toggles,
+        show="" if toggles == "visual" else toggles or "none",
         angles="" if page.angles == "rad" else page.angles,
         link=page.selected,
         slice=slice_state(page.workspace) if is_on(page, "workspace") else "",

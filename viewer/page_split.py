@@ -139,7 +139,9 @@ def _rollout_link(name: str, split: Split) -> str:
 
 def _format(value: object) -> str:
     if isinstance(value, Mapping):
-        return f"{value['mean']:.3g} ({value['min']:.3g} to {value['max']:.3g})"
+        mean, low, high = (value.get(key) for key in ("mean", "min", "max"))
+        if all(isinstance(number, (int, float)) for number in (mean, low, high)):
+            return f"{mean:.3g} ({low:.3g} to {high:.3g})"
     return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
 
 

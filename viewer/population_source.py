@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.similarity import classical_mds, compared_tokens
-from morphgen.benchmark.split import SIDES
+from morphgen.benchmark.split import SIDES, split_id
 from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.benchmark.token_layout import default_max_links
@@ -23,7 +23,7 @@ from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
-from morphgen.grammar.grammar_file import SUFFIX, grammar_names
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
 from morphgen.grammar.sampling import robot_name, sample_robot
 from morphgen.model.kinematics import forward_kinematics, random_configurations, reach
 from morphgen.model.robot import Robot
@@ -35,6 +35,7 @@ from morphgen.viewer.robot_uri import (
     DERIVATION,
     FileAccess,
     UriError,
+    content_hash,
     read_robot_uri,
     resolve_grammar,
     resolve_split,
@@ -71,6 +72,13 @@ class Source:
     """Name or file of the grammar from which the robots are sampled; else empty."""
     seed: int = 0
     """Seed of the sample."""
+    stamp: str = ""
+    """Changes with the files of the robots, the split or the grammar."""
+
+    @property
+    def key(self) -> str:
+        """Name of the robots among the results that all browsers share."""
+        return f"{hash(self)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +112,17 @@ def find_source(subject: str, files: FileAccess, seed: int, number: int) -> Sour
         grammar = resolve_grammar(name, files)
         names = [robot_name(grammar, i) for i in range(number)]
         rows = [Row(text, text, grammar.name, order=i) for i, text in enumerate(names)]
-        return Source(tuple(rows), number, name, seed)
+        return Source(tuple(rows), number, name, seed, grammar_text(grammar))
     if name in split_names() or name.endswith(".yaml") or (files.path(name) / SPLIT_FILE).is_file():
-        rows = split_rows(name, resolve_split(name, files))
-        rows = [row for row in rows if side in ("", row.role)]
+        split = resolve_split(name, files)
+        rows = [row for row in split_rows(name, split) if side in ("", row.role)]
+        stamp = split_id(split)
     elif side:
         raise UriError(f"{subject}: only a split has sides; {name} is a folder")
     else:
         rows = folder_rows(name, files)
-    return Source(tuple(rows[:MAX_ROBOTS]), len(rows))
+        stamp = "\n".join(content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
+    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
 
 
 def load_population(
@@ -210,7 +220,7 @@ def free_configurations(robots: Sequence[tuple[int, Robot]]) -> list[Array]:
                     break
         except MorphgenError:
             free = []
-        results.append(np.array(free[:NUM_POSES]).reshape(-1, robot.dof))
+        results.append(np.array(free[:NUM_POSES]).reshape(min(len(free), NUM_POSES), robot.dof))
     return results
 
 

@@ -75,7 +75,7 @@ def thumbnail_of_picture(path: Path) -> str:
     try:
         with Image.open(path) as picture:
             return _data_url(picture)
-    except OSError:
+    except (OSError, Image.DecompressionBombError):
         return ""
 
 

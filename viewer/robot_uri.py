@@ -95,7 +95,8 @@ class FileAccess:
             raise UriError(
                 f"{shorten(text)}: is outside of the folders that this viewer was started for"
             )
-        if not exists:
+        # The folder of all uploads has the names of other users' folders.
+        if not exists or (text.startswith(UPLOAD) and path.resolve() == self.uploads.resolve()):
             raise UriError(f"{shorten(text)}: no such file or folder")
         return path
 
@@ -309,7 +310,9 @@ def with_library_meshes(robot: Robot, library: Library) -> Robot:
 
 
 def content_hash(uri: str, files: FileAccess) -> str:
-    """Return a hash that changes with the robot's files, its parts and morphgen's version.
+    """Return a hash that changes with the robot's description, its parts and morphgen's version.
+
+    Meshes and included xacro files are not looked at: who edits one restarts the viewer.
 
     Raises:
         MorphgenError: If the robot does not exist.

@@ -23,6 +23,7 @@ from morphgen.viewer.scene_shapes import (
     shape_colour,
     triangles,
 )
+from morphgen.viewer.scene_stage import MIN_EXTENT
 
 Layer = Literal["visual", "collision", "primitives", "inertia"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -35,8 +36,6 @@ _COLOURS: Mapping[Layer, Rgb] = {
     "inertia": (151, 117, 250),
 }
 _OPACITY: Mapping[Layer, float] = {"collision": 0.45, "primitives": 0.6, "inertia": 0.5}
-_MIN_EXTENT = 0.05
-"""Smallest extent by which axes and markers are scaled [m]."""
 
 
 @dataclass(eq=False)
@@ -217,7 +216,7 @@ def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array
 def robot_extent(robot: Robot) -> float:
     """Return the longest side of a robot's bounding box at home, at least 5 cm [m]."""
     low, high = robot_bounds(robot)
-    return max(float((high - low).max()), _MIN_EXTENT)
+    return max(float((high - low).max()), MIN_EXTENT)
 
 
 def _add_mesh(

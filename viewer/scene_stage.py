@@ -19,6 +19,8 @@ BRAND: Rgb = (24, 100, 171)
 """Colour of links, buttons and sliders."""
 CAMERA_DIRECTION = (0.72, -0.60, 0.34)
 """Direction from a robot to the camera, that of the thumbnails (``formats.picture``)."""
+MIN_EXTENT = 0.05
+"""Smallest extent of a robot by which axes, markers and the scale bar are drawn [m]."""
 _BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
     False: ((246, 248, 250), (206, 212, 219)),
     True: ((52, 57, 64), (24, 26, 30)),
@@ -107,7 +109,7 @@ def add_scale_bar(
         high: Highest corner of the box, shape (3,) [m].
         direction: From the box to the camera; decides which side is the front.
     """
-    extent = float((high - low).max())
+    extent = max(float((high - low).max()), MIN_EXTENT)  # a robot without shapes is a point
     length = bar_length(0.3 * extent)
     width, gap = 0.04 * length + 0.006 * extent, 0.08 * extent
     y = float(low[1]) - gap if direction[1] < 0 else float(high[1]) + gap

@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
 import viser
 
@@ -18,6 +18,7 @@ from morphgen.viewer.address import Address, require_few_chosen
 from morphgen.viewer.frame import REVEAL, bar_html, call, shown_address, tray_html
 from morphgen.viewer.location import DEFAULT_WIDTH
 from morphgen.viewer.robot_uri import FileAccess
+from morphgen.viewer.shared_results import SharedResults
 from morphgen.viewer.viser_internals import run_javascript
 from morphgen.viewer.workers import Workers
 
@@ -66,7 +67,7 @@ class Session:
     """URIs of the robots in the tray."""
     visit: int = 0
     """Number of the page in this browser, counted from the load of the browser's page."""
-    cache: dict[str, object] = field(default_factory=dict)
+    cache: SharedResults = field(default_factory=SharedResults)
     """Results of slow work, shared by all browsers."""
     closed: threading.Event = field(default_factory=threading.Event)
     """Set when the browser has left the page or disconnected; long work has to check it."""
@@ -116,15 +117,16 @@ class Session:
             events=self.events,
         )
 
-    def enqueue(self, work: Work, key: str = "") -> None:
+    def enqueue(self, work: Work, key: str = "", *, even_closed: bool = False) -> None:
         """Run work on the session's event thread, after everything that was enqueued before.
 
         Args:
             work: Called without arguments; the page shows a ``MorphgenError`` that it raises.
             key: If work of the same key is still queued, this call is dropped: the queued work will
                 see the newest state.
+            even_closed: Whether to run it although the browser has left the page meanwhile.
         """
-        self._submit(self.events, work, key)
+        self._submit(self.events, work, key, even_closed=even_closed)
 
     def run_in_background(self, work: Work, key: str = "") -> None:
         """Run slow work on the session's background thread; see ``enqueue``."""
@@ -145,10 +147,9 @@ class Session:
             key: Name of the result.
             make: Computes it; it may show its progress in the status line.
         """
-        if key not in self.cache:
-            self.cache[key] = make()
-            self.set_status("")
-        return cast(T, self.cache[key])
+        result = self.cache.get(key, make)
+        self.set_status("")
+        return result
 
     def call_later(self, seconds: float, work: Work, key: str) -> None:
         """Enqueue work after a delay; calls of the same key until then are merged into one."""
@@ -293,19 +294,21 @@ class Session:
         """Show the chosen robots in the browser's tray and check boxes."""
         self.run_script(call("tray", tray_html(self.chosen), self.chosen))
 
-    def _submit(self, threads: ThreadPoolExecutor, work: Work, key: str) -> None:
+    def _submit(
+        self, threads: ThreadPoolExecutor, work: Work, key: str, *, even_closed: bool = False
+    ) -> None:
         with self.lock:
             if self.closed.is_set() or (key and key in self.pending):
                 return
             self.pending.add(key)
-            future = threads.submit(self._run, work, key)
+            future = threads.submit(self._run, work, key, even_closed=even_closed)
         future.add_done_callback(self._print_bug)
 
-    def _run(self, work: Work, key: str) -> None:
+    def _run(self, work: Work, key: str, *, even_closed: bool) -> None:
         """Run queued work; show its error on the page, and raise an unexpected one again."""
         with self.lock:
             self.pending.discard(key)
-        if self.closed.is_set():
+        if self.closed.is_set() and not even_closed:
             return
         try:
             work()

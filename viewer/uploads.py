@@ -15,7 +15,6 @@ If any check fails, nothing of the upload is kept.
 from __future__ import annotations
 
 import io
-import json
 import posixpath
 import re
 import secrets
@@ -28,9 +27,10 @@ from lxml import etree
 
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import CARD, PICTURE, URDF
+from morphgen.formats.data_files import parse_json
 from morphgen.formats.mjcf_document import listed
 from morphgen.formats.resolve import PackageFinder, resolve_uri
-from morphgen.formats.urdf import UnsoundError
+from morphgen.formats.urdf import MAX_URDF_BYTES, UnsoundError
 from morphgen.formats.xml import parse_xml
 from morphgen.formats.zip_files import (
     UNREADABLE,
@@ -150,11 +150,22 @@ def _unzip(name: str, content: bytes) -> dict[str, bytes]:
 
 
 def _parse_descriptions(unpacked: dict[str, bytes]) -> _Documents:
-    """Parse every file that may be a description, once."""
+    """Parse every file that may be a description, once.
+
+    Raises:
+        UploadError: If they are too large together.
+    """
     documents: _Documents = {}
+    size = 0
     for path, data in unpacked.items():
         file = PurePosixPath(path)
         if file.suffix.lower() in _SUFFIXES and not _is_hidden(file):
+            size += len(data)
+            if size > MAX_URDF_BYTES:  # a tree takes thirty times the memory of its text
+                raise UploadError(
+                    f"{path}: the descriptions have more than {MAX_URDF_BYTES // 2**20} MB "
+                    "together; leave out files that the robot does not need; nothing was kept"
+                )
             try:
                 documents[path] = parse_xml(data, path)
             except FormatError as error:
@@ -246,9 +257,9 @@ def _main_mjcf(name: str, mjcfs: dict[str, etree._Element]) -> str:
 def _require_inner_card(path: str, data: bytes) -> None:
     """Require that a card names files of its own upload only."""
     try:
-        card = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise UploadError(f"{path}: invalid JSON: {shorten(str(error))}") from error
+        card = parse_json(data.decode(errors="replace"), path)
+    except FormatError as error:
+        raise UploadError(shorten(str(error))) from error
     hashes = card.get("hashes") if isinstance(card, dict) else None
     for name in hashes if isinstance(hashes, dict) else ():
         _require_inner_uri(path, name)

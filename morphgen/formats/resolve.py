@@ -49,7 +49,8 @@ class PackageFinder:
 
         The search order is: the folder in ``packages``; for each of ``files``, from the file
         upwards, a folder that is the package (by its ``package.xml`` or its name) or contains it
-        directly; in each root, a folder of that name or, up to two levels down, one whose
+        directly, above the file's tree (see ``resolve_uri``) only with a ``package.xml`` or ROS's
+        suffix; in each root, a folder of that name or, up to two levels down, one whose
         ``package.xml`` has that name. Descriptions are often copied into a folder without ROS's
         suffix, so ``x_description`` and ``x_support`` are then searched as ``x``. Names are
         case-sensitive, and the root of the file system is not searched.
@@ -79,11 +80,16 @@ class PackageFinder:
     def _candidates(self, name: str, files: Iterable[Path]) -> Iterator[Path]:
         """Yield the folders that may be the package ``name``, in search order."""
         for file in files:
-            for folder in _ancestors(file):
-                if folder.name == name or _declared_name(folder) == name:
-                    yield folder
-                if (folder / name).is_dir():
-                    yield folder / name
+            tree = _tree(file)
+            for folder, near in product(_ancestors(file), ("", name)):
+                package = folder / near
+                # Above the tree may be the user's home, of which any folder could be named.
+                may_be_plain = package.is_relative_to(tree) or _has_suffix(package)
+                is_named = package.name == name and package.is_dir()
+                if _declared_name(package) == name or (
+                    is_named and (may_be_plain or _is_package(package))
+                ):
+                    yield package
         for root in self.roots:
             if root.name == name or _declared_name(root) == name:
                 yield root
@@ -205,7 +211,7 @@ def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> Non
     if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
         return
     trees = [_tree(path, for_text=True) for file in files for path in (file, file.resolve())]
-    packaged = any((folder / "package.xml").is_file() for folder in _ancestors(real))
+    packaged = any(map(_is_package, _ancestors(real)))
     if not packaged and not _is_in(real, trees):
         raise RefusedError(
             f"{str(path)!r} is not in {trees[0]}, the folder of the description, nor in a ROS"
@@ -233,7 +239,7 @@ def portable_uri(path: Path) -> str:
     its path.
     """
     for folder in path.parents:
-        if (folder / "package.xml").is_file() or _PACKAGE_SUFFIX.search(folder.name):
+        if _is_package(folder) or _has_suffix(folder):
             return f"package://{folder.name}/{path.relative_to(folder).as_posix()}"
     return path.as_posix()
 
@@ -276,7 +282,7 @@ def _tree(file: Path, *, for_text: bool = False) -> Path:
     """
     file = _absolute(file)
     ancestors = _ancestors(file)
-    declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
+    declared = [folder for folder in ancestors if _is_package(folder)]
     named = [folder for folder in ancestors if _has_suffix(folder)]
     is_above_allowed = not for_text or file.parent.name.lower() in _SUBFOLDERS
     above = ancestors[1:2] if is_above_allowed else []
@@ -295,12 +301,16 @@ def _is_in_package(path: Path, finder: PackageFinder) -> bool:
     """Return whether an absolute path is in one of the finder's folders or in a ROS package."""
     known = (*finder.roots, *(folder for _, folder in finder.packages))
     return _is_in(path, known) or any(
-        _has_suffix(folder) or (folder / "package.xml").is_file() for folder in path.parents
+        _has_suffix(folder) or _is_package(folder) for folder in path.parents
     )
 
 
 def _has_suffix(folder: Path) -> bool:
     return _PACKAGE_SUFFIX.search(folder.name) is not None
+
+
+def _is_package(folder: Path) -> bool:
+    return (folder / "package.xml").is_file()
 
 
 def _ancestors(file: Path) -> list[Path]:

@@ -53,6 +53,9 @@ class UnsoundError(FormatError):
         self.origin = origin
         self.findings = tuple(findings)
 
+    def __reduce__(self) -> tuple[type[UnsoundError], tuple[str, tuple[Finding, ...]]]:
+        return type(self), (self.origin, self.findings)
+
 
 def read_urdf(
     path: Path,

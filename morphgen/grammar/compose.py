@@ -11,7 +11,7 @@ from morphgen.errors import CompositionError, nearest
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
-from morphgen.grammar.parameters import MOUNT_YAW
+from morphgen.grammar.parameters import MOUNT_YAW, MOUNT_YAW_PARAMETER, require_range
 from morphgen.grammar.part import Part, load_part
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair
@@ -112,7 +112,14 @@ class _Assembly:
         )
         self.joints += (self._scoped_joint(joint, scoped) for joint in part.fragment.joints)
         self.home += part.fragment.home
+        taken: set[str] = set()
         for port, child in node.children:
+            if port in taken:
+                raise CompositionError(
+                    f"port {port!r} of {part.manifest.name!r} is already taken: it cannot hold "
+                    f"{child.label!r}, too"
+                )
+            taken.add(port)
             if port not in part.ports:
                 raise CompositionError(
                     f"{part.manifest.name!r} has no port {port!r}{nearest(port, part.ports)}"
@@ -179,14 +186,23 @@ def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart
         The parts by label, parents before their children.
 
     Raises:
-        CompositionError: If two parts have the same label.
+        CompositionError: If two parts have the same label, or the first part has a ``mount_yaw``.
+        PartError: If a parameter is unknown or out of range.
     """
     parts: dict[str, ScopedPart] = {}
     for node in derivation.walk():
         if node.label in parts:
             raise CompositionError(f"two parts are labelled {node.label!r}")
         part = load_part(library.manifest(node.part), part_values(node))
-        yaw = dict(node.parameters).get(MOUNT_YAW, 0.0)
+        yaw = dict(node.parameters).get(MOUNT_YAW)
+        if yaw is None:
+            yaw = 0.0
+        elif not parts:
+            raise CompositionError(
+                f"{node.label!r} is not attached to a port: it has no {MOUNT_YAW}"
+            )
+        else:
+            require_range(yaw, MOUNT_YAW_PARAMETER, f"{node.label}.{MOUNT_YAW}")
         parts[node.label] = ScopedPart(node.label, part, yaw)
     return parts
 

@@ -64,7 +64,10 @@ def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> 
 
 
 class _CacheKey:
-    """A manifest and values, equal as long as the files of the part do not change."""
+    """A manifest and values, equal as long as the manifest and the part's source do not change.
+
+    Files that the source includes, and meshes, are not looked at.
+    """
 
     def __init__(self, manifest: Manifest, values: Mapping[str, float]) -> None:
         self.manifest, self.values = manifest, values

@@ -73,7 +73,7 @@ class PushConfig:
                 f"a block of {self.block_mass:g} kg with friction {self.friction:g}: expected a "
                 "positive mass and no negative friction"
             )
-        nearest_line = self.line * min(1.0, self.curriculum_start)
+        nearest_line = min(self.line, self.line * self.curriculum_start)
         if not (0 < low <= high < math.inf and self.start < nearest_line and self.start_depth >= 0):
             raise TaskError(
                 f"a block of {low:g} to {high:g} that starts {self.start_depth:g} below "

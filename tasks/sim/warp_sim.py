@@ -40,8 +40,8 @@ class WarpSimulation:
 
     The model of a scene, the control law and the physics step are those of ``MujocoSimulation``,
     in single precision. The law uses the inertia of the current state, which on the CPU is that of
-    one physics step before. Contacts are found by other algorithms, and a world holds at most
-    48 of them.
+    one physics step before. Contacts are found by other algorithms, and a world holds a limited
+    number of them (``max_contacts``).
 
     Attributes:
         scenes: Scene of each environment.

@@ -57,6 +57,19 @@ def test_a_package_is_found_beside_an_ancestor_of_the_file(urdf: Path) -> None:
     assert resolve_uri("package://hand_description/a.stl", urdf, NOWHERE) == mesh
 
 
+def test_a_plain_folder_above_the_description_is_no_package(tmp_path: Path) -> None:
+    """A stranger's file in a download folder must not read from the user's home."""
+    home = tmp_path / "alice"
+    urdf = touch(home / "Downloads" / "robot" / "robot.urdf")
+    touch(home / "secret" / "part.stl")
+    for uri in ("package://alice/secret/part.stl", "package://secret/part.stl"):
+        assert "not found" in failure(uri, urdf)
+    beside = touch(home / "Downloads" / "hand" / "part.stl")
+    assert resolve_uri("package://hand/part.stl", urdf, NOWHERE) == beside
+    touch(home / "secret" / "package.xml", "<package><name>other</name></package>")
+    assert resolve_uri("package://secret/part.stl", urdf, NOWHERE).is_file()
+
+
 def test_a_package_is_found_in_a_root_also_two_levels_down(tmp_path: Path, urdf: Path) -> None:
     finder = PackageFinder((tmp_path / "root",))
     direct = touch(tmp_path / "root" / "one" / "a.stl")

@@ -1,5 +1,6 @@
 """Reading and writing URDF: round trips, and errors with line numbers."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,8 @@ def test_a_missing_mesh_is_an_error(tmp_path):
     with pytest.raises(UnsoundError, match=r"gone\.stl") as caught:
         read_urdf(path)
     assert caught.value.findings[0].code == "mesh-unresolved"
+    sent = pickle.loads(pickle.dumps(caught.value))  # as a worker process sends it
+    assert (str(sent), sent.findings) == (str(caught.value), caught.value.findings)
 
 
 def test_missing_files_and_arguments_without_a_xacro_are_errors(tmp_path):

@@ -274,12 +274,32 @@ def test_an_empty_root_link_of_a_part_adds_no_link():
             "two parts are labelled 'base'",
         ),
         (Derivation("arm", "yumi"), "'yumi' needs a base: its mount is not its root"),
+        (
+            Derivation("arm", "ur5", (("mount_yaw", 1.0),)),
+            "'arm' is not attached to a port: it has no mount_yaw",
+        ),
+        (
+            Derivation(
+                "base",
+                "fixed",
+                (),
+                (("top", Derivation("arm", "ur5")), ("top", Derivation("arm2", "ur5"))),
+            ),
+            "port 'top' of 'fixed' is already taken: it cannot hold 'arm2', too",
+        ),
     ],
 )
 def test_incompatible_parts_are_an_error(node, message):
     with pytest.raises(CompositionError) as caught:
         compose(node, LIBRARY, "robot")
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("yaw", [100.0, float("inf"), float("nan")])
+def test_a_derivation_with_a_mount_yaw_out_of_range_is_an_error(yaw):
+    arm = Derivation("arm", "ur5", (("mount_yaw", yaw),))
+    with pytest.raises(PartError, match=r"arm\.mount_yaw=\w+: out of range"):
+        compose(Derivation("base", "fixed", (), (("top", arm),)), LIBRARY, "robot")
 
 
 def test_a_derivation_with_an_unknown_part_is_an_error():

@@ -229,6 +229,7 @@ def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
         ({"num_goals": 0}, "PushConfig: num_goals 0: expected an integer >= 1"),
         ({"block_size": (0.2, 0.1)}, "a block of 0.2 to 0.1"),
         ({"start": 0.3}, "is to cross 0.2: sizes must be positive, and the start"),
+        ({"line": -0.3}, "starts 0.05 below -0.15 and is to cross -0.3"),
     ],
 )
 def test_invalid_constants_are_rejected(changes, text, cache):

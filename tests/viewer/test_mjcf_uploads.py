@@ -94,6 +94,7 @@ def test_mjcf_that_names_files_elsewhere_or_code_is_rejected(access, files, why)
 def test_an_included_mjcf_that_is_addressed_reads_no_file_elsewhere(access):
     (access.uploads.parent / "q").mkdir()
     (access.uploads.parent / "q" / "m.stl").write_bytes(box_stl())
+    (access.uploads.parent / "q" / "package.xml").write_text("<package><name>q</name></package>")
     part = MJCF % (MESH_ASSET % b"package://q/m.stl" + BODY % b"a")
     sent = {"a.xml": MJCF % BODY % b"a", "b.xml": part, "b.urdf": part, "package.xml": part}
     uri = store_upload("a.zip", archive({**sent, "c.urdf": URDF}), access)

@@ -277,6 +277,21 @@ def test_random_poses_are_free_and_within_the_limits():
     assert ((q >= lower) & (q <= upper)).all()
 
 
+def test_a_robot_without_joints_has_no_random_pose_of_its_own():
+    (q,) = free_configurations([(0, Robot("rock", (Link("rock"),), ()))])
+    assert q.shape[1] == 0
+
+
+def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
+    shutil.copytree(folder / "robots" / "some-arm", tmp_path / "some-arm")
+    files = FileAccess((), (tmp_path,), tmp_path / "none")
+    before = find_source(".", files, 0, 0).key
+    assert find_source(".", files, 0, 0).key == before
+    urdf = tmp_path / "some-arm" / "robot.urdf"
+    urdf.write_text(urdf.read_text() + "\n")
+    assert find_source(".", files, 0, 0).key != before
+
+
 def test_tokens_are_vectors_and_missing_where_there_are_none(files):
     (table,) = token_rows([arm()], 16, files)
     assert table.ndim == 1

@@ -174,6 +174,14 @@ def test_folders_are_listed(files, tmp_path):
         folder_rows("uploads", files)
 
 
+def test_the_folder_of_all_uploads_has_no_address(files):
+    (files.uploads / "secret").mkdir(parents=True)
+    assert files.path("upload:secret").name == "secret"
+    for uri in ("upload:", "upload:.", "upload:secret/.."):
+        with pytest.raises(UriError, match="no such file or folder"):
+            files.path(uri)
+
+
 def test_splits_and_parts_are_listed(files):
     rows = split_rows(SPLIT, resolve_split(SPLIT, files))
     assert [row.role for row in rows] == ["train"] * 10 + ["test"] * 2

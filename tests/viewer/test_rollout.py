@@ -108,6 +108,32 @@ def test_episode_is_restored_from_its_file(episode, files, root):
         assert file["1/tool"][-1, :3] == pytest.approx(last[:3, 3], abs=1e-6)
 
 
+def test_a_damaged_episode_is_an_error_that_names_it(episode, files, root):
+    content, path, refused = episode_bytes(episode), root / "damaged.npz", []
+    for position in range(0, len(content), max(1, len(content) // 60)):
+        damaged = bytearray(content)
+        damaged[position] ^= 0x55
+        path.write_bytes(damaged)
+        try:
+            read_episode(path, files)  # not every byte matters
+        except EpisodeError as error:
+            refused.append(str(error))
+    assert all("damaged.npz is not an episode" in message for message in refused)
+    assert len(refused) > 40
+
+
+@pytest.mark.parametrize("period", [0, -1, "nan"])
+def test_an_episode_without_a_period_is_an_error(episode, files, root, period):
+    path = root / "period.npz"
+    path.write_bytes(episode_bytes(episode))
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(str(arrays["about"])) | {"period": period}
+    np.savez(path, **(arrays | {"about": np.array(json.dumps(about))}))
+    with pytest.raises(EpisodeError, match=f"a period of {period} s"):
+        read_episode(path, files)
+
+
 def test_a_viewer_can_be_started_for_an_episode(episode, files, root, monkeypatch):
     monkeypatch.chdir(root)
     (root / "episode.npz").write_bytes(episode_bytes(episode))

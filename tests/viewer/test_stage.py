@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from morphgen.viewer.scene_stage import look_at
+from morphgen.viewer.scene_stage import add_scale_bar, look_at
 
+POINT = np.zeros(3)
 LOW, HIGH = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.5])
 
 
@@ -65,3 +66,13 @@ def test_a_camera_that_the_user_has_moved_stays():
     before = camera.position.copy()
     camera.resize(0.9)
     np.testing.assert_array_equal(camera.position, before)
+
+
+def test_a_robot_without_shapes_has_a_scale_bar():
+    labels = []
+    scene = SimpleNamespace(
+        add_batched_meshes_simple=lambda *args, **options: None,
+        add_label=lambda name, text, position: labels.append(text),
+    )
+    add_scale_bar(scene, POINT, POINT, (1.0, 0.0, 0.0))
+    assert labels == ["1 cm"]

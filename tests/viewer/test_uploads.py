@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 import trimesh
+from PIL import Image
 
 from helpers.robots import arm
 from helpers.uploads import URDF, archive
@@ -18,7 +19,7 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.viewer import uploads
-from morphgen.viewer.robot_files import bundle_files, zip_files
+from morphgen.viewer.robot_files import bundle_files, thumbnail_of_picture, zip_files
 from morphgen.viewer.robot_uri import UriError, read_robot_uri
 from morphgen.viewer.uploads import UploadError, store_upload
 
@@ -158,7 +159,7 @@ def patched(whole, old, new):
         (archive({"a.urdf": URDF, "m.xml": b'<mujoco><asset><mesh file="/x"/></asset></mujoco>'}),
          "leads out"),
         (archive({"robot.urdf": URDF, "card.json": b"["}), "card.json: invalid JSON"),
-        (archive({"robot.urdf": URDF, "card.json": b"[" * 100_000}), "card.json: invalid JSON"),
+        (archive({"robot.urdf": URDF, "card.json": b"[" * 100_000}), "card.json: is nested deeper"),
         (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"/etc/passwd": "0"}}'}),
          "leads out"),
         (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"../x": "0"}}'}), "leads out"),
@@ -166,6 +167,8 @@ def patched(whole, old, new):
         (archive({"a.urdf": MESHED % b"..%2f..%2fx.stl"}), "is not in the upload"),
         (archive({"a.urdf": MESHED % b"package://rtb_data/x.stl"}), "is not in the upload"),
         (archive({"a.urdf": MESHED % b""}), "is not in the upload"),
+        (archive({"a.urdf": URDF, "b.xml": b"<a>" + b"<a/>" * 2**21 + b"</a>"}),
+         "descriptions have more than 8 MB together"),
     ],
     ids=lambda each: each[:40] if isinstance(each, str) else "",
 )  # fmt: skip
@@ -363,3 +366,8 @@ def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
         shown += [m["updates"].get("content", "") for m in client.messages if "updates" in m]
         assert name in "".join(shown)
         assert "<img src=x" not in "".join(shown)
+
+
+def test_a_picture_of_too_many_pixels_is_none(tmp_path):
+    Image.new("1", (20_000, 20_000)).save(tmp_path / "preview.png")
+    assert thumbnail_of_picture(tmp_path / "preview.png") == ""
