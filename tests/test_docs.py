@@ -1,5 +1,6 @@
 """The documentation pages match the code, and build as a site."""
 
+import glob
 import os
 import re
 import runpy
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from helpers.outside_robots import add_outside_robots
 from morphgen.cli import build_parser, main
 from morphgen.cli.command import parse
 from morphgen.grammar.library import default_library
@@ -133,6 +135,7 @@ def test_pages_work_from_top_to_bottom(name, tmp_path, monkeypatch):
     """Save the files of a page, run its commands and examples; training is shortened."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    add_outside_robots(tmp_path, monkeypatch)
     simulator, _, *defaults = EvalProtocol.__init__.__defaults__
     monkeypatch.setattr(EvalProtocol.__init__, "__defaults__", (simulator, 2, *defaults))
     _, _, text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").partition("\n## ")
@@ -146,6 +149,8 @@ def test_pages_work_from_top_to_bottom(name, tmp_path, monkeypatch):
         for archive in re.findall(r"^ +unzip -q (\S+)$", block["commands"] or "", re.MULTILINE):
             shutil.unpack_archive(archive)
         for words in commands(block):
+            # As a shell does it; a pattern of parts is in quotes and names no file.
+            words = [name for word in words for name in sorted(glob.glob(word)) or [word]]
             assert main([*words, *shortened(words)]) == 0, words
 
 

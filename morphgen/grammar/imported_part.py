@@ -11,6 +11,7 @@ import yaml
 
 from morphgen.errors import CompositionError, FormatError, MorphgenError
 from morphgen.formats.files import write_atomic
+from morphgen.grammar.library import Library, shipped_folders
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.robot import TOOL, Robot
@@ -51,13 +52,18 @@ def part_manifest(
 
     Raises:
         CompositionError: If the robot has no frame ``tool``.
-        FormatError: If derivations cannot hold its name, ``folder`` is a file, or the manifest
-            exists with other content.
+        FormatError: If derivations cannot hold its name, morphgen has a part of this name,
+            ``folder`` is a file, or the manifest exists with other content.
     """
     if not _NAME.fullmatch(robot.name):
         raise FormatError(
             f"name {robot.name!r} of a part: expected letters, digits and underscores, no digit "
             "first; import its file alone, and choose a name by --name"
+        )
+    if robot.name in Library(shipped_folders()).paths:
+        raise FormatError(
+            f"name {robot.name!r} of a part: morphgen has a part of this name; import its file "
+            "alone, and choose another by --name"
         )
     if all(frame.name != TOOL for frame in robot.frames):
         raise CompositionError(

@@ -110,6 +110,11 @@ def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(ru
             "robot 'test' has no frame 'tool', which is the flange or the tool of a part; name its "
             "link by --tool",
         ),
+        (
+            ("a.xml", "--part", "arm", "--licence", "MIT", "--tool", "left", "--name", "z1"),
+            "name 'z1' of a part: morphgen has a part of this name; import its file alone, and "
+            "choose another by --name",
+        ),
         (("a.xml", "b.xml", "--name", "x"), "--name x: 2 robots cannot have one name"),
         (
             ("a.xml", "b/a.xml"),
