@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from morphgen.formats.data_files import read_json
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.leaderboard import random_scores, relative_scores
 from morphgen.rl.reference_scores import References
-from morphgen.rl.scores import Score
 from morphgen.rl.study import SCORES
 from morphgen.rl.study_cells import StoredCell, require_all_robots, stored_cell, stored_split
 from morphgen.tasks.eval_protocol import tasks_of_split
@@ -72,7 +70,9 @@ def study_results(folder: Path, split: Split) -> BaselineResults:
             )
         _require_same_evaluation(cells, name, file, split)
         require_all_robots(scores, split, file)
-        results[name] = {(each.side, each.robot): _result(each, file) for each in scores}
+        results[name] = {
+            (each.side, each.robot): BaselineResult(each.score, each.success) for each in scores
+        }
     return results
 
 
@@ -131,14 +131,3 @@ def _evaluation(cell: StoredCell, split: Split) -> dict[str, Any]:
         "goal_seed": cell.goals.seed,
         **{f"{task}.{key}": value for task in tasks for key, value in constants[task].items()},
     }
-
-
-def _result(score: Score, file: Path) -> BaselineResult:
-    """Return the result of a robot; JSON may hold other things than numbers."""
-    values = (score.score, score.success)
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        raise BenchmarkError(
-            f"{file}: {score.side} robot {score.robot}: score {score.score!r}, success "
-            f"{score.success!r}; expected finite numbers"
-        )
-    return BaselineResult(*values)

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import distributed
 
@@ -136,9 +137,19 @@ def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
 
 
 def merged_metrics(metrics: Sequence[Metrics]) -> Metrics:
-    """Return the metrics of a rollout from those of the processes, which have equal sizes."""
+    """Return the metrics of a rollout from those of the processes, which have equal sizes.
+
+    Args:
+        metrics: Of each process; ``robot_sums`` and ``robot_envs`` become ``scores``, the mean
+            score of each robot, nan for one without an environment.
+    """
+    sums = np.sum([each["robot_sums"] for each in metrics], axis=0)
+    envs = np.sum([each["robot_envs"] for each in metrics], axis=0)
+    with np.errstate(invalid="ignore"):
+        scores = {"scores": tuple((sums / envs).tolist())}
     if len(metrics) == 1:
-        return metrics[0]
+        kept = {k: v for k, v in metrics[0].items() if k not in ("robot_sums", "robot_envs")}
+        return kept | scores
     episodes = [each["episodes"] for each in metrics]
     successes = sum(e["success"] * n for e, n in zip(metrics, episodes, strict=True) if n)
 
@@ -148,10 +159,7 @@ def merged_metrics(metrics: Sequence[Metrics]) -> Metrics:
     return {
         "reward": mean("reward"),
         "score": mean("score"),
-        "scores": tuple(
-            sum(scores) / len(metrics)
-            for scores in zip(*(each["scores"] for each in metrics), strict=True)
-        ),
+        **scores,
         "success": successes / sum(episodes) if sum(episodes) else math.nan,
         "episodes": sum(episodes),
         "unstable": sum(each["unstable"] for each in metrics),

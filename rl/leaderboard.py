@@ -14,7 +14,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.records import FiniteNumber, Record
 from morphgen.rl.eval_report import SIDES as SIDE_NAMES
 from morphgen.rl.intervals import stratified_mean_interval
-from morphgen.rl.scores import finite_or_none
+from morphgen.rl.scores import finite_or_none, score_decimals
 from morphgen.rl.submission import RobotOutcomes, Submission
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
@@ -61,6 +61,8 @@ class Row(Record, frozen=True):
     episodes: int
     """Episodes per robot."""
     sides: tuple[SideScore, ...]
+    finetuned: int = 0
+    """Transitions of fine-tuning on the test robots."""
 
     def __post_init__(self) -> None:
         if not self.method.isprintable():
@@ -68,6 +70,19 @@ class Row(Record, frozen=True):
         groups = [(side.side, side.task) for side in self.sides]
         if len(set(groups)) < len(groups):
             raise ValueError("a side and task is there twice; expected once")
+
+    @property
+    def run(self) -> tuple[object, ...]:
+        """What tells the row from others of the same split."""
+        return self.method, self.mode, self.seeds, self.finetuned
+
+    @property
+    def label(self) -> str:
+        """Method, and how the policy acts and was fine-tuned if that is not the usual way."""
+        remarks = ["stochastic"] if self.mode == "stochastic" else []
+        if self.finetuned:
+            remarks.append(f"fine-tuned {self.finetuned:,}")
+        return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
 
     def group(self, side: Side, task: str) -> SideScore | None:
         """Return the result of a side at a task."""
@@ -106,6 +121,7 @@ def score_submission(
         () if seed is None else (seed,),
         min(len(each.score) for each in submission.robots),
         tuple(sides),
+        submission.finetuned,
     )
 
 
@@ -169,18 +185,22 @@ def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
     headers = ["rank", "method", "from", "seeds"]
     for side, task in groups:
         headers += [f"{SIDE_NAMES[side]} {task}", "95%", "success"]
+    decimals = {}
+    for group in groups:
+        scores = [row.group(*group) for row in rows]
+        decimals[group] = score_decimals(side.score for side in scores if side is not None)
     lines = []
     for rank, row in enumerate(ranked(rows), 1):
-        name = f"{row.method} ({row.mode})" if row.mode == "stochastic" else row.method
-        cells = [str(rank), name, row.source, ", ".join(map(str, row.seeds)) or "-"]
+        cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
         for side, task in groups:
-            cells += _cells(row.group(side, task))
+            cells += _cells(row.group(side, task), decimals[side, task])
         lines.append([*cells, str(row.episodes)])
     return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
 
 
-def _cells(score: SideScore | None) -> list[str]:
+def _cells(score: SideScore | None, decimals: int) -> list[str]:
     if score is None:
         return ["-", "", ""]
-    interval = "" if score.low is None else f"{score.low:.1f} to {score.high:.1f}"
-    return [f"{score.score:.1f}", interval, f"{score.success:.0%}"]
+    ends = (score.low, score.high)
+    interval = " to ".join(f"{end:.{decimals}f}" for end in ends if end is not None)
+    return [f"{score.score:.{decimals}f}", interval, f"{score.success:.0%}"]

@@ -163,8 +163,10 @@ class Learner:
         """Continue in the environments of a batch, where all begin new episodes."""
         self.batch = batch
         self.env_robot_index = batch.env_robot_index.to(self.device)
-        self._envs_of_robots = torch.bincount(batch.env_robot_index).cpu().numpy()
-        self.num_robots = len(self._envs_of_robots)
+        # Of several processes, one may have no environment of a robot.
+        self.num_robots = len(batch.specs)
+        counts = torch.bincount(batch.env_robot_index, minlength=self.num_robots)
+        self._envs_of_robots: list[int] = counts.tolist()
         self._step_graph = StepGraph(batch) if can_record(batch) else None
         self.restart_episodes()
 
@@ -228,6 +230,9 @@ class Learner:
     def _rollout_metrics(self, terms: Mapping[str, torch.Tensor]) -> Metrics:
         """Return rewards and scores of the rollout, and counts of the episodes that ended in it.
 
+        Of each robot they are the sum of its environments' mean scores, and their number: see
+        ``merged_metrics``.
+
         Args:
             terms: Mean of each reward term, shape ().
         """
@@ -252,7 +257,8 @@ class Learner:
             "success": success,
             "episodes": int(episodes),
             "unstable": int(unstable),
-            "scores": tuple((np.array(means[len(terms) :]) / self._envs_of_robots).tolist()),
+            "robot_sums": means[len(terms) :],
+            "robot_envs": self._envs_of_robots,
             "terms": dict(zip(terms, means[: len(terms)], strict=True)),
         }
 

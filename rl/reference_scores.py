@@ -23,7 +23,7 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.leaderboard import Row, SideScore, random_scores, score_submission
 from morphgen.rl.scores import Score, finite_or_none
 from morphgen.rl.study import SCORES
-from morphgen.rl.study_cells import require_all_robots, stored_cell, stored_split
+from morphgen.rl.study_cells import acting, require_all_robots, stored_cell, stored_split
 from morphgen.rl.submission import (
     Submission,
     is_submission,
@@ -73,8 +73,8 @@ class References:
         """Return the scores of the submissions, and the rows of other runs in studies."""
         random = random_scores(self.random) if self.random else None
         scored = [score_submission(each, random, "reference") for each in self.submissions]
-        known = {(row.method, row.mode, row.seeds) for row in scored}
-        others = (row for row in self.rows if (row.method, row.mode, row.seeds) not in known)
+        known = {row.run for row in scored}
+        others = (row for row in self.rows if row.run not in known)
         return [*scored, *others]
 
 
@@ -126,7 +126,7 @@ def collect_references(
             raise BenchmarkError(f"{path}: no scores of split {split.name}, id {split_id(split)}")
     # Sorted, so that the order of the paths does not change the files.
     submissions = dict(sorted(submissions.items()))
-    rows = sorted(_rows(cells), key=lambda row: (row.method, row.mode))
+    rows = sorted(_rows(cells), key=lambda row: (row.method, row.mode, row.finetuned))
     references = References(tuple(rows), tuple(submissions.values()))
     if references.random is None:
         require_same_random([*submissions.items()])
@@ -172,6 +172,8 @@ class _Cell:
     file: Path
     method: str
     mode: str
+    finetuned: int
+    """Transitions of fine-tuning on the test robots."""
     seed: int | None
     scores: tuple[Score, ...]
 
@@ -206,20 +208,21 @@ def _cells(
     is_seed = parent.removeprefix("seed").isdecimal() and parent.startswith("seed")
     seed = int(parent.removeprefix("seed")) if is_seed else None
     method = file.parent.parent.name if is_seed else parent
-    for mode, records in cell.scores.items():
-        yield _Cell(file, method, "" if mode in BASELINES else mode, seed, records)
+    for name, records in cell.scores.items():
+        mode, finetuned = ("", 0) if name in BASELINES else acting(name)
+        yield _Cell(file, method, mode, finetuned, seed, records)
 
 
 def _rows(cells: Sequence[_Cell]) -> list[Row]:
-    """Return a row per method and mode: means over seeds and robots."""
-    groups: dict[tuple[str, str], dict[int | None, _Cell]] = {}
+    """Return a row per method, mode and fine-tuning: means over seeds and robots."""
+    groups: dict[tuple[str, str, int], dict[int | None, _Cell]] = {}
     for cell in cells:
-        group = groups.setdefault((cell.method, cell.mode), {})
+        group = groups.setdefault((cell.method, cell.mode, cell.finetuned), {})
         other = group.setdefault(cell.seed, cell)
         if other.scores != cell.scores:
             raise BenchmarkError(f"{cell.file}: other scores of the same run are in {other.file}")
     rows = []
-    for (method, mode), group in groups.items():
+    for (method, mode, finetuned), group in groups.items():
         scores = [score for cell in group.values() for score in cell.scores]
         pairs = {(s.side, s.task): None for side in SIDES for s in scores if s.side == side}
         sides = []
@@ -239,7 +242,7 @@ def _rows(cells: Sequence[_Cell]) -> list[Row]:
             )
         seeds = tuple(sorted(seed for seed in group if seed is not None))
         episodes = min(score.episodes for score in scores)
-        rows.append(Row(method, "study", mode, seeds, episodes, tuple(sides)))
+        rows.append(Row(method, "study", mode, seeds, episodes, tuple(sides), finetuned))
     return rows
 
 
@@ -254,6 +257,8 @@ def _path(submission: Submission) -> str:
     words = [submission.method]
     if submission.mode == "stochastic":
         words.append(submission.mode)
+    if submission.finetuned:
+        words.append(f"fine-tuned-{submission.finetuned}")
     if submission.training_seed is not None:
         words.append(f"seed{submission.training_seed}")
     return f"{SUBMISSIONS_DIR}/{re.sub(r'[^A-Za-z0-9+_-]', '_', '-'.join(words))}.json"

@@ -41,7 +41,8 @@ class Interface:
     kind: ActionKind = "continuous"
     """Kind of the actions."""
     max_links: int | None = None
-    """Links that observations and actions are padded to; None: those of the largest robot."""
+    """Links that observations and actions are padded to; None: the number of the benchmark, or the
+    links of the largest robot if it has more."""
     channels: ObservationConfig = field(default_factory=ObservationConfig)
     """Channels of the observations."""
 
@@ -217,6 +218,8 @@ def config_from(data: object) -> RunConfig:
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
     for name, values in tasks.items():
+        if not isinstance(values, Mapping):
+            raise TaskError(f"run: {name}: invalid value {shown(values)}; expected keys and values")
         read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
     nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
     values = read_fields(entries, RunConfig, "run", given=nested)
@@ -278,9 +281,10 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
 
 
 def _require_format(path: Path, data: Mapping[str, Any]) -> None:
-    if data["format"] not in READABLE or isinstance(data["format"], bool):
+    found = data["format"]
+    if type(found) is not int or found not in READABLE:
         raise TaskError(
-            f"{path} has format {data['format']!r}; expected {' or '.join(map(str, READABLE))}: it "
+            f"{path} has format {shown(found)}; expected {' or '.join(map(str, READABLE))}: it "
             "was written by another version of morphgen"
         )
 

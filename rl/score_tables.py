@@ -26,6 +26,7 @@ from morphgen.rl.intervals import (
     wilson_interval,
 )
 from morphgen.rl.leaderboard import relative_scores
+from morphgen.rl.scores import score_decimals
 from morphgen.rl.submission import (
     RobotOutcomes,
     Submission,
@@ -33,6 +34,7 @@ from morphgen.rl.submission import (
     json_files,
     submission_from,
 )
+from morphgen.rl.submission_checks import require_full_lists
 from morphgen.typing import Array
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -88,7 +90,11 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
         before = len(found)
         for file, data in json_files(path, "**/*.json"):
             if is_submission(data) or file == path:
-                found[str(file)] = submission_from(data, file)
+                found[str(file)] = submission = submission_from(data, file)
+                if not submission.robots:
+                    raise BenchmarkError(f"{file}: robots: none; expected one or more")
+                for robot in submission.robots:
+                    require_full_lists(robot, f"{file}: {robot.side} robot {robot.robot}")
         if len(found) == before:
             raise BenchmarkError(
                 f"{path}: no submissions below it; morphgen study writes them beside scores.json"
@@ -97,7 +103,7 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
 
 
 def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
-    """Return a row for every split, task, method, mode and amount of fine-tuning.
+    """Return a row for every split, task, method, mode, training and amount of fine-tuning.
 
     Args:
         submissions: Submissions by the name of their file.
@@ -112,23 +118,22 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
     rows: list[ResultRow] = []
     for split, own in by_split.items():
         _require_comparable(split, own)
-        groups: dict[tuple[str, str, int], dict[int | None, tuple[str, Submission]]] = {}
+        groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
         for where, each in own.items():
-            finetuned = each.training.finetuned if each.training else 0
-            group = groups.setdefault((each.method, each.mode, finetuned), {})
+            group = groups.setdefault(_key(each), {})
             if each.training_seed in group:
                 other = group[each.training_seed][0]
                 raise BenchmarkError(f"{where}: the same run, seed and mode as {other}")
             group[each.training_seed] = where, each
         tasks = dict.fromkeys(robot.task for each in own.values() for robot in each.robots)
         for task in tasks:
-            reference = groups.get((REFERENCES.get(task, ""), "", 0), {}).get(None)
-            for (method, mode, finetuned), group in groups.items():
+            baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
+            reference = baseline.get(None)
+            for (method, mode, finetuned, transitions, simulator), group in groups.items():
                 runs = [each for _, each in group.values()]
                 sides = dict(_side_results(runs, task, reference[1] if reference else None))
                 if not sides:
                     continue
-                training = runs[0].training
                 rows.append(
                     ResultRow(
                         split,
@@ -136,13 +141,29 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
                         method,
                         mode,
                         finetuned,
-                        training.transitions if training else None,
-                        training.simulator if training else "",
+                        transitions,
+                        simulator,
                         tuple(sorted(seed for seed in group if seed is not None)),
                         sides,
                     )
                 )
     return rows
+
+
+_Key = tuple[str, str, int, int | None, str]
+"""Method, mode, transitions of fine-tuning and of training, and simulator of the training."""
+
+
+def _key(submission: Submission) -> _Key:
+    """Return what the seeds of one row have in common."""
+    training = submission.training
+    return (
+        submission.method,
+        submission.mode,
+        submission.finetuned,
+        training.transitions if training else None,
+        training.simulator if training else "",
+    )
 
 
 def _require_comparable(split: str, submissions: Mapping[str, Submission]) -> None:
@@ -224,6 +245,12 @@ def _difference(
     strata: list[Array] = []
     for name in robots:
         own = relative_scores(reference[name])
+        for table in tables:
+            if len(table[name].score) % len(own):
+                raise BenchmarkError(
+                    f"robot {name}: {len(table[name].score)} episodes; expected a multiple of the "
+                    f"{len(own)} of the reference"
+                )
         # Policies of single robots have the episodes of each policy one after another.
         seeds = [
             relative_scores(table[name]).reshape(-1, len(own)).mean(axis=0) for table in tables
@@ -247,14 +274,15 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
         for side in SIDES:
             name = SIDE_NAMES[side]
             headers += [f"{name} mean", f"{name} IQM", f"{name} success", reference]
-        lines = [_line(row) for row in own]
+        decimals = score_decimals(side.mean for row in own for side in row.sides.values())
+        lines = [_line(row, decimals) for row in own]
         title = split if split.endswith(f"/{task}") else f"{split}: {task}"
         table = tabulate(lines, headers, tablefmt=style, disable_numparse=True)
         parts.append(f"{'## ' * (style == 'github')}{title}\n\n{table}\n")
     return "\n".join(parts)
 
 
-def _line(row: ResultRow) -> list[str]:
+def _line(row: ResultRow, decimals: int) -> list[str]:
     trained = "-" if row.transitions is None else f"{row.transitions:,} {row.simulator}"
     name = f"{row.method} ({row.mode})" if row.mode == "stochastic" else row.method
     tuned = f"{row.finetuned:,}" if row.finetuned else "-"
@@ -265,16 +293,15 @@ def _line(row: ResultRow) -> list[str]:
             line += ["-"] * 4
             continue
         line += [
-            f"{result.mean:.1f}",
-            _text(result.iqm),
+            f"{result.mean:.{decimals}f}",
+            _text(result.iqm, f".{decimals}f"),
             result.success.as_percent(),
-            "-" if result.difference is None else _text(result.difference, sign="+"),
+            "-" if result.difference is None else _text(result.difference, f"+.{decimals}f"),
         ]
     return line
 
 
-def _text(interval: Interval, sign: str = "") -> str:
-    value = f"{interval.value:{sign}.1f}"
+def _text(interval: Interval, form: str) -> str:
     if math.isnan(interval.low):
-        return value
-    return f"{value} ({interval.low:{sign}.1f} to {interval.high:{sign}.1f})"
+        return f"{interval.value:{form}}"
+    return f"{interval.value:{form}} ({interval.low:{form}} to {interval.high:{form}})"

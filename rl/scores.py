@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from morphgen.benchmark.split import Side
+
+_TEXTS = ("robot", "side", "task")
+"""Fields of a score that are no numbers."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,31 @@ def finite_or_none(value: Any) -> Any:  # noqa: ANN401
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def score_decimals(scores: Iterable[float]) -> int:
+    """Return the number of decimals with which scores of a task are shown, at least three digits.
+
+    Args:
+        scores: All scores of a column; those of push are from 0 to 1, those of reach up to 300.
+    """
+    return 1 if any(abs(score) >= 10 for score in scores) else 2
+
+
 def score_from_json(data: Mapping[str, Any]) -> Score:
     """Return the score that ``scores_to_json`` made a dictionary of.
 
     Raises:
         TypeError: If a field is missing or unknown.
+        ValueError: If a field is of another type, or score or success is not finite.
     """
     values: dict[str, Any] = {k: math.nan if v is None else v for k, v in data.items()}
-    return Score(**values)
+    score = Score(**values)
+    where = f"{score.side} robot {score.robot}"
+    for field in fields(Score):
+        value = getattr(score, field.name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if is_number is (field.name in _TEXTS):
+            expected = "text" if field.name in _TEXTS else "a number"
+            raise ValueError(f"{where}: {field.name} {value!r}; expected {expected}")
+        if field.name in ("score", "success") and not math.isfinite(value):
+            raise ValueError(f"{where}: {field.name} {value!r}; expected a finite number")
+    return score

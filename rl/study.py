@@ -239,7 +239,7 @@ def do_cell(
         folder, config, sides = cell.folder, cell.config, cell.sides
         if config is not None and steps:
             folder, sides = folder / FINETUNED / str(steps), ("test",)
-            config = _finetuning(cell, config, steps)
+            config = finetuning_run(cell, config, steps)
             learn(folder, config)
         recorder = SubmissionRecorder(split)
         records: list[Score] = []
@@ -260,8 +260,14 @@ def do_cell(
         _write_scores(cell, scores)
 
 
-def _finetuning(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
-    """Return the config of a cell's fine-tuning: on a CPU, in a simulator that CPUs run."""
+def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
+    """Return the config of a cell's fine-tuning: on a CPU, in a simulator that CPUs run.
+
+    Args:
+        cell: The cell.
+        config: Config of its run.
+        steps: Transitions of the fine-tuning.
+    """
     tuned = finetuning_config(
         config,
         other_side(cell.source, "test"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,13 @@ from morphgen.benchmark.split import Split, split_id
 from morphgen.benchmark.split_file import parse_split
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.rl.aliases import renamed
+from morphgen.rl.inference import MODES
 from morphgen.rl.robot_source import RobotSource
 from morphgen.rl.scores import Score, score_from_json
 from morphgen.tasks.env_specs import GoalConfig, task_configs
 from morphgen.tasks.registry import TASKS
+
+_FINE_TUNED = re.compile(r"fine-tuned (\d[\d,]*)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +86,21 @@ def _source(data: object) -> RobotSource:
 
 
 def _malformed(file: Path, error: Exception) -> BenchmarkError:
+    is_message = isinstance(error, ValueError | MorphgenError)
     return BenchmarkError(
-        f"{file}: neither a submission nor the scores of a study's cell: {error!r}"
+        f"{file}: neither a submission nor the scores of a study's cell: "
+        f"{error if is_message else repr(error)}"
     )
+
+
+def acting(name: str) -> tuple[str, int]:
+    """Return how a policy acts, and the transitions of its fine-tuning; see ``Cell.modes``.
+
+    Args:
+        name: Name of a mode of a cell, such as ``stochastic`` or ``fine-tuned 10,000``.
+    """
+    match = _FINE_TUNED.fullmatch(name)
+    return (MODES[0], int(match[1].replace(",", ""))) if match else (name, 0)
 
 
 def require_all_robots(scores: Sequence[Score], split: Split, file: Path) -> None:

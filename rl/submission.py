@@ -91,6 +91,11 @@ class Submission(Record, frozen=True):
     training: Training | None = None
     """How the policy was trained, if it is known."""
 
+    @property
+    def finetuned(self) -> int:
+        """Transitions of fine-tuning on the test robots."""
+        return self.training.finetuned if self.training else 0
+
     def __post_init__(self) -> None:
         if self.format != FORMAT:
             raise ValueError(f"format {self.format}; this version reads {FORMAT}")

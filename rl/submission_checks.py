@@ -190,12 +190,7 @@ def _check_robot(
         raise BenchmarkError(
             f"{at}: score: {count} episodes; expected {protocol.episodes} to {MAX_EPISODES}"
         )
-    for name in LISTS:
-        if len(getattr(outcomes, name)) != count:
-            raise BenchmarkError(
-                f"{at}: {name}: {len(getattr(outcomes, name))} episodes; expected {count}, as in "
-                "score"
-            )
+    require_full_lists(outcomes, at)
     random_count = len(outcomes.random_score)
     if random_count < protocol.episodes or len(outcomes.random_success) != random_count:
         raise BenchmarkError(
@@ -203,6 +198,34 @@ def _check_robot(
             f"{len(outcomes.random_success)}; expected {protocol.episodes} or more, as many of both"
         )
     _check_episodes(outcomes, at, expected, protocol)
+
+
+def require_full_lists(outcomes: RobotOutcomes, at: str) -> None:
+    """Require an entry for every episode in the lists of a robot, and one episode or more.
+
+    Args:
+        outcomes: The episodes of the robot.
+        at: Its place, for the message.
+
+    Raises:
+        BenchmarkError: If a list is shorter or longer than the others.
+    """
+    count, random_count = len(outcomes.score), len(outcomes.random_score)
+    if not count:
+        raise BenchmarkError(f"{at}: score: no episodes; expected one or more")
+    for name in LISTS:
+        if len(getattr(outcomes, name)) != count:
+            raise BenchmarkError(
+                f"{at}: {name}: {len(getattr(outcomes, name))} episodes; expected {count}, as in "
+                "score"
+            )
+    if len(outcomes.random_success) != random_count:
+        raise BenchmarkError(
+            f"{at}: random_score: {random_count} episodes, random_success: "
+            f"{len(outcomes.random_success)}; expected as many of both"
+        )
+    if not random_count and TASKS[outcomes.task].relative_to_random:
+        raise BenchmarkError(f"{at}: random_score: no episodes; expected one or more")
 
 
 def _check_episodes(

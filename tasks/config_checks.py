@@ -23,16 +23,20 @@ def require_task_config(config: TaskConfig) -> None:
         numbers = value if isinstance(value, tuple) else (value,)
         if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
             raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
-    for field_name, minimum in (
-        ("max_episode_steps", 1),
-        ("num_goals", 1),
-        ("obstacles", 0),
-        ("train_layouts", 1),
-        ("eval_layouts", 1),
+    # The largest are far above all uses: a file from elsewhere shall not fill the memory.
+    for field_name, minimum, maximum in (
+        ("max_episode_steps", 1, 1_000_000),
+        ("num_goals", 1, 1_000_000),
+        ("obstacles", 0, 1_000),
+        ("train_layouts", 1, 1_000_000),
+        ("eval_layouts", 1, 1_000_000),
     ):
         value = getattr(config, field_name)
-        if not isinstance(value, int) or value < minimum:
-            raise TaskError(f"{name}: {field_name} {value!r}: expected an integer >= {minimum}")
+        if not isinstance(value, int) or not minimum <= value <= maximum:
+            raise TaskError(
+                f"{name}: {field_name} {value!r}: expected an integer >= {minimum} and "
+                f"<= {maximum:,}"
+            )
     low, high = config.obstacle_size
     if not 0 < low <= high:
         raise TaskError(

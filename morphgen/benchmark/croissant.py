@@ -71,7 +71,7 @@ _FIELDS = (
     ("movable", "Integer", "Number of movable joints"),
     ("movable_to_tool", "Integer", "Number of movable joints between root and tool"),
     ("dof", "Integer", "Number of independent joints"),
-    ("reach", "Float", "Largest distance of the tool from the shoulder [m]"),
+    ("reach", "Float", "Largest distance of the tool from the root's origin [m]"),
     ("mass", "Float", "Mass [kg]"),
     ("path", "Text", "Folder of the robot's files"),
 )

@@ -82,7 +82,7 @@ LAYOUT = (INDEX, PARENT, TOOL, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITIO
 
 def default_max_links(link_counts: Iterable[int]) -> int:
     """Return the number of links that robots are padded to: the paper's, or the largest count."""
-    return max(MAX_LINKS, *link_counts)
+    return max([MAX_LINKS, *link_counts])
 
 
 def require_max_links(n_links: int, what: str, max_links: int) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option, whole_number
 from morphgen.cli.progress import track
-from morphgen.errors import one_line
+from morphgen.errors import FormatError, one_line
 
 if TYPE_CHECKING:
     from morphgen.checks.conformance import ConformanceReport
@@ -37,8 +37,9 @@ SEVERITIES = ("error", "warning", "info")
 def check(args: argparse.Namespace) -> int:
     """Check every robot and print the findings."""
     library, sources = opt.library_of(args), opt.sources_of(args)
+    written: dict[Path, str] = {}
     results = [
-        (source.label, *_findings(source, library, args))
+        (source.label, *_findings(source, library, args, written))
         for source in track(sources, args, "checking", "robot", len(sources))
     ]
     data = {
@@ -54,9 +55,20 @@ def check(args: argparse.Namespace) -> int:
 
 
 def _findings(
-    source: RobotSource, library: Library, args: argparse.Namespace
+    source: RobotSource, library: Library, args: argparse.Namespace, written: dict[Path, str]
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
-    """Return a robot's findings, and those that its repair into ``--fix`` removed."""
+    """Return a robot's findings, and those that its repair into ``--fix`` removed.
+
+    Args:
+        source: The robot.
+        library: The library of parts.
+        args: The options.
+        written: Robots of the bundles that the command has written; the new one is added.
+
+    Raises:
+        FormatError: If another robot of the same name was repaired.
+        MorphgenError: If the robot cannot be read.
+    """
     from morphgen.api.checks import bundle_of, check_source
     from morphgen.checks import check, fix
     from morphgen.formats.bundle import bundle_folder, write_bundle
@@ -72,9 +84,15 @@ def _findings(
     robot, repaired = fix(robot)
     is_robot = source.path is None or bundle_of(source) is not None
     findings = check(robot, tool_required=is_robot)
-    written = bundle_folder(args.fix, robot.name)
-    write_bundle(robot, written, findings)
-    print(f"written: {written}", file=sys.stderr)
+    folder = bundle_folder(args.fix, robot.name)
+    if folder in written:
+        raise FormatError(
+            f"{source.label}: {folder} is that of {written[folder]}, which has the same name; "
+            "repair them one at a time, into folders of their own"
+        )
+    write_bundle(robot, folder, findings)
+    written[folder] = source.label
+    print(f"written: {folder}", file=sys.stderr)
     return findings, repaired
 
 

@@ -155,7 +155,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         no_record,
     )
     from morphgen.rl.inference import MODES
-    from morphgen.rl.runs import read_checkpoint
+    from morphgen.rl.runs import read_checkpoint, read_config
     from morphgen.rl.submission import Training
     from morphgen.rl.training import checkpoint_files
     from morphgen.tasks.device import require_device
@@ -172,6 +172,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
                 f"{run.num_updates}",
                 file=sys.stderr,
             )
+    if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
+        run = read_config(path)
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
     sources = _sources(args) if args.words else [run.source]
     tasks = _with_goal(config.tasks, sources, args)

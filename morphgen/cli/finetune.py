@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
+from morphgen.cli.agent_options import on_off
 from morphgen.cli.command import command, option, path_option
-from morphgen.cli.train import NETWORK_SWITCHES, RESUME, learning_options, on_off, run_training
+from morphgen.cli.train import NETWORK_SWITCHES, RESUME, learning_options, run_training
 from morphgen.cli.training_robots import (
     GOAL_SEED,
     SIDES,

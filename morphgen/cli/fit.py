@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -145,6 +146,8 @@ def fit(args: argparse.Namespace) -> None:
         _fit_mesh(args, options)
         return
     targets = _targets(args)
+    if args.out:
+        _require_own_names(targets)
     results = []
     for target in targets:
         folder = _folder(args, target, several=len(targets) > 1) if args.out else None
@@ -153,6 +156,22 @@ def fit(args: argparse.Namespace) -> None:
         results.append(_fit_robot(target, folder, options, args))
     if args.json:
         print(json.dumps(results if len(results) > 1 else results[0]))
+
+
+def _require_own_names(targets: Sequence[Target]) -> None:
+    """Require that no two robots have one name, which is that of their folder.
+
+    Raises:
+        FormatError: If two have; better now than after the fits.
+    """
+    labels: dict[str, str] = {}
+    for target in targets:
+        other = labels.setdefault(target.robot.name, target.label)
+        if other != target.label:
+            raise FormatError(
+                f"{target.label} and {other} are both named {target.robot.name!r}; fit them one "
+                "at a time, into folders of their own"
+            )
 
 
 def _reject_idle_options(args: argparse.Namespace) -> None:

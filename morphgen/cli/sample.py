@@ -186,7 +186,18 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
                 f"{folder} has primitives of morphgen fit, which its derivation does not include: "
                 "replay the robot that was fitted"
             )
-        robot = with_geometry(robot, "primitive", library.folders)
+        if "spheres" in primitives:
+            from morphgen.fitting.sphere_robot import as_spheres
+
+            number, cover = primitives["spheres"], primitives.get("cover")
+            if not isinstance(number, int) or not isinstance(cover, float | None):
+                raise FormatError(
+                    f"{folder / CARD}: primitives: spheres {number!r}, cover {cover!r}; expected "
+                    "an integer, and a number or null"
+                )
+            robot = as_spheres(robot, library.folders, spheres=number, cover=cover)
+        else:
+            robot = with_geometry(robot, "primitive", library.folders)
     with tempfile.TemporaryDirectory() as scratch:
         bundle = write_bundle(robot, Path(scratch) / robot.name, picture=False)
         return (bundle / URDF).read_text(encoding="utf-8")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option
+from morphgen.errors import BenchmarkError
 
 MODES = ("deterministic", "stochastic", "all")
 
@@ -44,11 +45,14 @@ def score(args: argparse.Namespace) -> None:
     from morphgen.rl.score_tables import read_submissions, result_rows, result_tables
     from morphgen.rl.scores import finite_or_none
 
-    found = {
-        where: each
-        for where, each in read_submissions(args.files).items()
-        if args.mode == "all" or each.mode in ("", args.mode)
-    }
+    submissions = read_submissions(args.files)
+    modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
+    found = {where: each for where, each in submissions.items() if each.mode in modes}
+    if not found:
+        raise BenchmarkError(
+            f"--mode {args.mode}: none of the {len(submissions)} submissions acts so; expected "
+            f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
+        )
     rows = result_rows(found)
     data = [finite_or_none(asdict(row)) for row in rows]
     notes = "MT: train robots, ZS: test robots; intervals: 95%"

@@ -78,6 +78,10 @@ def _require_writable(args: argparse.Namespace) -> None:
         if path is not None and option_name != "--csv" and path.suffix.lower() != ".png":
             raise BenchmarkError(f"{option_name} {path}: expected a name that ends in .png")
         opt.require_writable(option_name, path)
+    given = [path for path in (args.heatmap, args.map, args.csv) if path is not None]
+    for path in given:
+        if sum(other.resolve() == path.resolve() for other in given) > 1:
+            raise BenchmarkError(f"{path}: is named for two files; name another for one of them")
 
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:

@@ -98,6 +98,7 @@ def release(args: argparse.Namespace) -> None:
     if args.private_test:
         test_grammars(split, library)  # refuses other splits before a secret is made
     is_new_secret = args.secret_file is not None and not args.secret_file.exists()
+    before = _archives(args.out)
     request = ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -124,8 +125,8 @@ def release(args: argparse.Namespace) -> None:
                 jobs=args.jobs,
                 progress=update,
             )
-    except BaseException:  # an interrupt, too: no release needs the new secret
-        if is_new_secret:
+    except BaseException:  # an interrupt, too, which may come after the archive was written
+        if is_new_secret and _archives(args.out) == before:  # no release needs the new secret
             args.secret_file.unlink(missing_ok=True)
         raise
     private = report.release.private_test
@@ -152,6 +153,11 @@ def release(args: argparse.Namespace) -> None:
     lines += [f"  note: {note}" for note in notes]
     lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
     opt.print_result(args, data, lambda: "\n".join(lines))
+
+
+def _archives(out: Path) -> set[Path]:
+    """Return the archives in a folder, which may not exist."""
+    return set(out.glob("*.zip"))
 
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:

@@ -16,9 +16,10 @@ from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
 from morphgen.cli.training_robots import robots_to_train
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, evaluation_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 
 if TYPE_CHECKING:
+    from morphgen.rl.runs import RunConfig
     from morphgen.rl.study import Cell
 
 PAPER = "paper"
@@ -99,9 +100,8 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.robot_source import other_side, tasks_of
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.rl.training import is_done, require_runnable, subruns_of
-    from morphgen.tasks.device import require_device
-    from morphgen.tasks.env_specs import default_configs
+    from morphgen.tasks.env_specs import GoalConfig, default_configs
+    from morphgen.tasks.eval_protocol import EvalProtocol
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
@@ -110,14 +110,23 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
-    here_on_gpu = args.device != "cpu" and args.ray is None
     finetune = _finetune(args.finetune)
     cells: list[Cell] = []
+    words: dict[str, str] = {}
+    """What names each split."""
     for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
         source = robots_to_train([name], args)
+        if source.name in words:
+            raise TaskError(
+                f"{name}: split {source.name!r} is also in {words[source.name]}; expected splits "
+                "of different names"
+            )
+        words[source.name] = name
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
         tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))
         eval_config = EvalConfig(num_episodes, sim, tasks=tasks)
+        if sim in SIMULATORS.builtin:  # the episodes become submissions, whose number is limited
+            EvalProtocol(sim, num_episodes, goals=GoalConfig(source.goal_seed, tasks))
         cells += baseline_cells(args.out, source, eval_config)
         for label, spec, side in agents:
             config = run_config(other_side(source, side), spec, args)
@@ -125,12 +134,32 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
                 seeded = matched_budget(replace(config, seed=seed))
                 cell = agent_cell(args.out, label, seeded, eval_config, finetune)
                 cells.append(cell)
-                parts = () if args.report else subruns_of(cell.folder, seeded)
-                for part in parts:
-                    require_runnable(part.config)
-                if here_on_gpu and not all(map(is_done, parts)):
-                    require_device(args.device)  # policies are evaluated on the CPU
+                if not args.report:
+                    _require_startable(cell, seeded, args)
     return cells
+
+
+def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) -> None:
+    """Require that training and fine-tuning of a cell can begin, before any of them does.
+
+    Raises:
+        MorphgenError: If they cannot.
+    """
+    from morphgen.rl.study import finetuning_run
+    from morphgen.rl.training import is_done, require_runnable, subruns_of
+    from morphgen.tasks.device import require_device
+
+    parts = subruns_of(cell.folder, config)
+    for part in parts:
+        require_runnable(part.config)
+    for steps in cell.finetune:
+        try:
+            require_runnable(finetuning_run(cell, config, steps))
+        except TaskError as error:
+            raise TaskError(f"--finetune {steps}: {error}") from error
+    is_on_gpu = args.device != "cpu" and args.ray is None
+    if is_on_gpu and not all(map(is_done, parts)):
+        require_device(args.device)  # policies are evaluated on the CPU
 
 
 def _splits(word: str) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
+from morphgen.cli.agent_options import AGENT, AGENT_OPTIONS, agent_spec
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import status, training_progress
 from morphgen.cli.training_robots import (
@@ -21,10 +22,9 @@ from morphgen.cli.training_robots import (
     robots_to_draw,
     robots_to_train,
 )
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.presets import PRESETS, preset_of
-from morphgen.tasks.channels import CHANNELS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
@@ -35,31 +35,10 @@ if TYPE_CHECKING:
     from morphgen.rl.training import ExecutionConfig
     from morphgen.tasks.task import TaskConfig
 
-SWITCHES = {
-    "symlog": "the critic predicts the symlog of returns (default: on)",
-    "slow-critic": "compute returns with a moving average of the critic (default: on)",
-    "discrete": "discrete actions (default: on if the task of all robots is reach)",
-    "task-reweighting": "weight the robots randomly (default: off)",
-    "curriculum": "push: move the target line from near to far during training (default: on)",
-    "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
-    "mask-morphology": "hide the robot's morphology from the agent (default: off)",
-    "tool-position": "add the tool's position to the observations (default: off)",
-    "residual": "add the actions to the steps that the channel ik shows (default: off)",
-    "normalize": "normalize the kinematic channels of observations (default: off)",
-    "robot-advantages": "normalize advantages robot by robot (default: off)",
-    "joint-entropy": "weigh the mean entropy of the joints instead of their sum (default: off)",
-}
 NETWORK_SWITCHES = {
     "bf16": "run the networks in bfloat16",
     "compile": "run networks and losses with torch.compile",
 }
-
-
-def on_off(name: str, help: str, default: bool | None = None) -> Option:
-    """Return an option ``--name`` with its opposite ``--no-name``."""
-    return Option(
-        (f"--{name}",), {"action": argparse.BooleanOptionalAction, "default": default, "help": help}
-    )
 
 
 def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Option, ...]:
@@ -126,12 +105,6 @@ TRAINING_OPTIONS = (
     *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
 )
 """Options of the commands that train from random weights."""
-OBSERVE = option(
-    "--observe",
-    metavar="A,B,...",
-    default="",
-    help="further channels of the observations: " + ", ".join(CHANNELS).replace("_", "-"),
-)
 RESUME = flag("--resume", "continue the run in the output folder")
 
 
@@ -141,15 +114,14 @@ RESUME = flag("--resume", "continue the run in the output folder")
     option(
         "words", nargs="+", metavar="SPLIT", help=f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}"
     ),
-    option("--agent", default="me-graph", help=f"one of {', '.join(AGENTS)} (default: me-graph)"),
+    AGENT,
     opt.SEED,
     option("--on", choices=SIDES, default="train", help="side of the split"),
     opt.OBSTACLES,
     path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
     RESUME,
     *DRAWN_OPTIONS,
-    *(on_off(name, help) for name, help in SWITCHES.items()),
-    OBSERVE,
+    *AGENT_OPTIONS,
     *TRAINING_OPTIONS,
     opt.LIBRARY,
     details="The algorithm is PPO. The policy is written to the run folder. With --resume, an "
@@ -176,11 +148,10 @@ def train(args: argparse.Namespace) -> None:
             source = other_side(robots_to_train(args.words, args), args.on)
         else:
             source = robots_to_draw(args)
-    if source.grammars:
-        config = _drawn_config(source, spec, args)
-    else:
-        config = run_config(source, spec, args)
+    config = run_config(source, spec, args)
     _require_used(config, args)
+    if source.grammars:
+        config = _drawn(config, args)
     name = _folder_name(source) + "-pose" * (args.goal == "pose")
     folder = args.out or Path("runs") / name / str(spec) / f"seed{args.seed}"
     run_training(folder, config, args)
@@ -216,28 +187,15 @@ def _next_command(folder: Path, config: RunConfig) -> str:
     program = "morphgen"
     if source.task is not None and not TASKS.is_installed(source.task):
         program = f"python {sys.argv[0]}"
-    if source.task is not None and not source.grammars:
-        words = f"{source.task} {source.name} --policy {folder} --sim {config.sim}"
-        return f"watch it: {program} play {words} --out episode.mp4"
+    if source.grammars:
+        return f"score it: {program} eval {folder} --split SPLIT"
+    if source.task is not None:
+        words = [source.task, source.name, *["--obstacles"] * source.obstacles]
+        words += ["--policy", str(folder), "--sim", config.sim]
+        for library in source.library:
+            words += ["--library", str(library)]
+        return f"watch it: {program} play {' '.join(words)} --out episode.mp4"
     return f"score it: {program} eval {folder}"
-
-
-def agent_spec(args: argparse.Namespace) -> AgentSpec:
-    """Return the agent with the switches that were given.
-
-    Raises:
-        TaskError: If the agent is unknown.
-    """
-    from morphgen.rl.agent_spec import OBSERVATION_SWITCHES, parse_agent
-
-    values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
-    spec = parse_agent(args.agent)
-    switches = {name: value for name, value in values.items() if value is not None}
-    observed = [name for name in args.observe.split(",") if name]
-    for name in observed:
-        if name not in OBSERVATION_SWITCHES:
-            raise TaskError(f"--observe {name}{nearest(name, OBSERVATION_SWITCHES)}")
-    return replace(spec, switches={**spec.switches, **switches, **dict.fromkeys(observed, True)})
 
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
@@ -271,32 +229,34 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     )
 
 
-def _drawn_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
-    """Draw the robots of a source; return the configuration of a run.
+def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
+    """Draw the robots of a run, after all that can be checked before; return its configuration.
 
     Raises:
         TaskError: If a number is out of its range or has no effect.
         MorphgenError: If a robot cannot be drawn.
     """
+    from morphgen.rl.training import require_runnable
     from morphgen.rl.training_batches import default_slice_updates, num_slices
     from morphgen.tasks.env_specs import GoalConfig
 
-    tasks = _task_configs(source, args)
-    source, max_links = draw_robots(source, GoalConfig(tasks=tasks), args)
-    args = argparse.Namespace(**{**vars(args), "max_links": max_links})
-    config = run_config(source, spec, args)
     if args.slice_updates is not None and num_slices(config) == 1:
         raise TaskError(
-            f"--slice-updates {args.slice_updates}: {source.name} has an environment for every "
-            "robot at all times"
+            f"--slice-updates {args.slice_updates}: {config.source.name} has an environment for "
+            "every robot at all times"
         )
-    return replace(config, slice_updates=args.slice_updates or default_slice_updates(config))
+    slice_updates = args.slice_updates or default_slice_updates(config)
+    config = replace(config, slice_updates=slice_updates)
+    require_runnable(config)
+    source, max_links = draw_robots(config.source, GoalConfig(tasks=config.tasks), args)
+    return replace(config, source=source, max_links=max_links)
 
 
 def _max_links(source: RobotSource) -> int:
     """Return the number of links that observations are padded to, unless ``--max-links`` is given.
 
-    For a split it is the split's number. For one robot it is the benchmark's, or the number of the
+    For a split it is the split's number. For drawn robots, of which the largest is not known yet,
+    it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
     from morphgen.benchmark.token_layout import default_max_links
@@ -305,6 +265,8 @@ def _max_links(source: RobotSource) -> int:
 
     if source.split:
         return split_of(source).max_links
+    if source.grammars:
+        return default_max_links([])
     robot = load_robot(source.name, library=map(Path, source.library))
     return default_max_links([len(robot.links)])
 

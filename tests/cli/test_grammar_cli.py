@@ -261,6 +261,17 @@ def test_derive_prints_one_line_per_part(run, cubes):
     assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
 
 
+@pytest.mark.parametrize("geometry", ["primitive", "sphere"])
+def test_derive_reproduces_fitted_collision_shapes(run, geometry):
+    words = ("--geometry", geometry, "--no-picture")
+    assert run("compose", "base=gantry", "ee=plane", "--name", "it", *words)[0] == 0
+    assert run("derive", "robots/it", "--replay") == (
+        0,
+        "robots/it/robot.urdf: the same bytes\n",
+        "",
+    )
+
+
 @pytest.mark.parametrize("light", [True, False])
 @pytest.mark.parametrize("category", ["chain", "panda_variations"])
 def test_derive_reproduces_the_same_bytes(run, light, category):

@@ -81,6 +81,11 @@ def test_json_holds_the_matrices(run, bundles):
         )
 
 
+def test_one_file_for_two_pictures_is_refused(refused, bundles):
+    words = ("--heatmap", "x.png", "--map", "./x.png")
+    assert "x.png: is named for two files" in refused("similarity", "robots", *words)
+
+
 def test_tree_is_the_default_measure(run, bundles):
     _, out, _ = run("similarity", "robots", "--json")
     assert list(json.loads(out)["measures"]) == ["tree"]

@@ -135,6 +135,21 @@ def test_a_release_that_is_refused_leaves_no_new_secret_and_keeps_an_old_one(run
     assert old.read_text() == "5a" * 32
 
 
+@pytest.mark.parametrize("published", [True, False])
+def test_an_interrupt_keeps_the_secret_of_a_release_that_was_written(run, monkeypatch, published):
+    def interrupted(split, out, *args, **options):
+        if published:
+            out.mkdir()
+            (out / "my-sticks-1.0.0.zip").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morphgen.tasks.split_release.release_split", interrupted)
+    run(*STICKS, "my/sticks")
+    words = ("my/sticks.yaml", "--private-test", "2", "--secret-file", "new.txt")
+    assert run(*RELEASE, *words)[0] != 0
+    assert Path("new.txt").exists() == published
+
+
 def test_reveal_refuses_releases_without_a_private_side(run, refused, small):
     run(*RELEASE, small)
     Path("secret.txt").write_text("5a" * 32)
@@ -270,3 +285,15 @@ def test_submissions_are_recorded_scored_and_ranked(run, refused, small):
     Path("broken.json").write_text(json.dumps(broken))
     err = refused("split", "score", "ik.json", "broken.json", "--split", archive)
     assert err.startswith("morphgen: broken.json: test robot planar-plane: score[0]: 999; expected")
+
+
+@pytest.mark.slow
+def test_the_submission_of_policies_of_single_robots_is_of_their_run(run, small):
+    words = ("--agent", "se", "--seed", "3", "--steps", "256", "--envs", "8", "--no-tensorboard")
+    words += ("--set", "num_steps=16", "--set", "minibatches=2", "--sim", "mujoco")
+    assert run("train", small, *words, "--out", "run")[0] == 0
+    words = ("--split", small, "--mode", "deterministic", "--submission", "a.json")
+    assert run("eval", "run", *words)[0] == 0
+    submission = json.loads(Path("a.json").read_text())
+    assert submission["training_seed"] == 3
+    assert submission["training"]["transitions"] == 256

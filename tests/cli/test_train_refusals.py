@@ -2,7 +2,8 @@
 
 import pytest
 
-from helpers.runs import RUN
+from helpers.runs import RUN, small_split
+from morphgen.benchmark.split_file import write_split
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -75,10 +76,33 @@ pytestmark = pytest.mark.usefixtures("own_cache")
         (("study", "interpolation/arm3/reach", "--agents", "se,se"), "is there twice"),
         (("study", "interpolation/arm3/reach", "--agents", "me-tf@test"), "only se"),
         (("study", "interpolation/arm3/reach", "--steps", "10"), "an update takes"),
+        (
+            ("study", "interpolation/arm3/reach", "--finetune", "1000"),
+            "--finetune 1000: --steps 1000 with --envs 64: an update takes 2,048 transitions",
+        ),
+        (
+            ("study", "interpolation/arm3/reach", "--eval-steps", "4000000"),
+            "13334 episodes",
+        ),
+        (
+            ("train", "task=reach", "--robots", "chain:3000", "--steps", "1000"),
+            "an update takes",
+        ),
+        (
+            ("train", "task=reach", "--robots", "chain:3000", "--agent", "se"),
+            "--agent se: learns one robot",
+        ),
     ],
 )
 def test_invalid_arguments_are_rejected_in_one_line(refused, words, message):
     assert message in refused(*words)
+
+
+def test_splits_of_one_name_are_refused_in_a_study(refused, tmp_path):
+    for name in ("a", "b"):
+        write_split(small_split(), tmp_path / f"{name}.yaml")
+    message = "b.yaml: split 'mine/small' is also in a.yaml; expected splits of different names"
+    assert message in refused("study", "a.yaml", "b.yaml")
 
 
 def test_foreign_folders_and_checkpoints_are_rejected(run, refused, tmp_path):

@@ -16,7 +16,8 @@ _LINK = """<link name="{}"><inertial><mass value="1"/>
     <collision><geometry><sphere radius="0.05"/></geometry></collision></link>"""
 _DESCRIPTION = f"""<robot name="z1_description">{_LINK.format("link00")}{_LINK.format("link06")}
   <joint name="j" type="revolute"><parent link="link00"/><child link="link06"/>
-    <origin xyz="0 0 0.3"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    <origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
 def add_outside_robots(folder, monkeypatch):

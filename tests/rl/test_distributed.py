@@ -1,6 +1,7 @@
 """Training by several processes that torchrun starts."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -86,14 +87,27 @@ def test_environments_are_shared_equally():
 
 
 def test_metrics_of_processes_are_merged():
-    one = {"reward": 1.0, "score": 2.0, "scores": (1.0, 3.0), "success": 0.5, "episodes": 2}
+    one = {"reward": 1.0, "score": 2.0, "success": 0.5, "episodes": 2}
     one |= {"unstable": 1, "terms": {"near": 0.0}}
-    none = {**one, "reward": 3.0, "scores": (3.0, 5.0), "success": float("nan"), "episodes": 0}
+    one |= {"robot_sums": [1.0, 6.0, 0.0, 0.0], "robot_envs": [1, 2, 0, 0]}
+    none = {**one, "reward": 3.0, "success": float("nan"), "episodes": 0}
+    none |= {"robot_sums": [9.0, 0.0, 8.0, 0.0], "robot_envs": [1, 0, 2, 0]}
     merged = merged_metrics([one, {**none, "terms": {"near": 1.0}}])
     assert merged["reward"] == 2.0
-    assert merged["scores"] == (2.0, 4.0)
+    # A mean over environments, and none for a robot without one.
+    assert merged["scores"] == pytest.approx((5.0, 3.0, 4.0, float("nan")), nan_ok=True)
+    assert not merged.keys() & {"robot_sums", "robot_envs"}
     assert (merged["success"], merged["episodes"], merged["unstable"]) == (0.5, 2, 2)
     assert merged["terms"] == {"near": 0.5}
+
+
+@pytest.mark.slow
+def test_two_processes_share_more_robots_than_each_has_environments(tmp_path):
+    train_by_two(tmp_path / "few", 1, "--envs", "10", "--task-reweighting")
+    lines = (tmp_path / "few" / "metrics.jsonl").read_text().splitlines()
+    scores = [json.loads(line)["scores"] for line in lines]
+    assert [len(each) for each in scores] == [10] * 4
+    assert all(math.isfinite(score) for each in scores for score in each)
 
 
 def test_a_numbered_device_is_refused_with_several_processes(monkeypatch):

@@ -86,6 +86,11 @@ def nested(levels, wide):
             lambda _, own: own["optimiser"]["state"][0]["exp_avg"].fill_(torch.inf),
             "exp_avg: 16 of 16 numbers are not finite",
         ),
+        (
+            lambda run, _: run["run"].update(reach=[1]),
+            "run: reach: invalid value [1]; expected keys and values",
+        ),
+        (lambda run, _: run.update(format=torch.tensor(3)), "has format tensor(3); expected"),
         (put("actor_lr_scale", value=float("nan")), "learner.actor_lr_scale is nan: not finite"),
         (
             put("actor", ENTER, value=torch.ones(3)),

@@ -12,6 +12,7 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.distributed import merged_metrics
 from morphgen.rl.learning_rate import KL_FACTOR, MIN_ACTOR_LR_SCALE, next_actor_lr_scale
 from morphgen.rl.metrics import explained_variance
 from morphgen.rl.ppo import (
@@ -101,7 +102,7 @@ def test_the_metrics_of_a_rollout_by_hand():
     trainer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
     trainer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
     terms = {"one": torch.tensor(0.25), "success": torch.tensor(7.0)}  # push has a term "success"
-    metrics = trainer._rollout_metrics(terms)
+    metrics = merged_metrics([trainer._rollout_metrics(terms)])
     assert metrics["terms"] == {"one": 0.25, "success": 7.0}
     assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
     assert metrics["scores"] == (2.0, 2.0)

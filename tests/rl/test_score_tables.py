@@ -96,6 +96,46 @@ def changed(values, **changes):
     return values
 
 
+def test_runs_of_other_trainings_have_rows_of_their_own():
+    longer = TRAINING | {"transitions": 100_000_000}
+    files = {
+        name: data() | {"training_seed": seed, "training": training}
+        for seed, (name, training) in enumerate({"a": TRAINING, "b": longer, "c": TRAINING}.items())
+    }
+    rows = [row for row in result_rows(read(**files)) if row.task == "reach"]
+    assert [(row.transitions, row.seeds) for row in rows] == [
+        (30_000_000, (0, 2)),
+        (100_000_000, (1,)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"score": []}, "score: no episodes; expected one or more"),
+        ({"random_score": [], "random_success": []}, "random_score: no episodes; expected one"),
+        ({"success": []}, "success: 0 episodes; expected 4, as in score"),
+        ({"random_success": []}, "random_score: 4 episodes, random_success: 0; expected as many"),
+    ],
+)
+def test_lists_of_other_lengths_are_refused(tmp_path, changes, why):
+    (tmp_path / "a.json").write_text(json.dumps(changed(data(), **changes)))
+    with pytest.raises(BenchmarkError, match=rf"a\.json: train robot \S+: {why}"):
+        read_submissions([tmp_path])
+
+
+def test_a_submission_without_robots_is_refused(tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(data() | {"robots": []}))
+    with pytest.raises(BenchmarkError, match=r"a\.json: robots: none; expected one or more"):
+        read_submissions([tmp_path])
+
+
+def test_small_scores_have_two_decimals():
+    for near, shown in ((0.25, "2.69"), (150.0, "115.0")):
+        (line,) = result_tables(result_rows(read(a=data(near=near)))).splitlines()[4:5]
+        assert line.split()[4] == shown
+
+
 SHIPPED = read_split("interpolation/arm3/reach")
 
 

@@ -226,6 +226,28 @@ def test_rows_are_ranked_by_the_test_robots():
     assert first.split()[:6] == ["1", "high", "study", "-", "20.0", "10%"]
 
 
+def test_fine_tuned_policies_are_told_from_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
+    training = {"simulator": "warp", "transitions": 1000}
+    tuned = data() | {"training": training | {"finetuned": 30_000}}
+    for name, values in (("zero-shot", data() | {"training": training}), ("tuned", tuned)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(values))
+    write_cell(tmp_path / "study" / "mine" / "small" / "ours" / "seed0", tuned=True)
+    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json", "study")]
+    references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
+    assert set(reference_files(references)) == {
+        *("scores.json", "submissions/ours-seed0.json"),
+        "submissions/ours-fine-tuned-30000-seed0.json",
+    }
+    rows = references.all_rows()
+    assert {(each.source, each.label) for each in rows} == {
+        ("reference", "ours"),
+        ("reference", "ours (fine-tuned 30,000)"),
+        ("study", "ours (fine-tuned 10,000)"),
+    }
+    assert "ours (fine-tuned 30,000)" in ranking_table(rows)
+
+
 def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
     monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
     baseline = data("random") | {"mode": "", "training_seed": None}
@@ -265,8 +287,8 @@ def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
         score_submission(submission(), random_scores(submission(baseline)))
 
 
-def write_cell(folder, **changes):
-    """Write the scores of a study's cell."""
+def write_cell(folder, *, tuned=False, **changes):
+    """Write the scores of a study's cell, of one that was fine-tuned too."""
     from dataclasses import asdict
 
     from morphgen.rl.evaluation import EvalConfig
@@ -279,7 +301,7 @@ def write_cell(folder, **changes):
     content = {
         "eval": EvalConfig(episodes=4, sim="mujoco").as_data(),
         "source": asdict(small_source()),
-        "scores": {"deterministic": scores},
+        "scores": {"deterministic": scores, **({"fine-tuned 10,000": scores} if tuned else {})},
     }
     folder.mkdir(parents=True)
     (folder / "scores.json").write_text(json.dumps(content | changes))

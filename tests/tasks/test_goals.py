@@ -247,6 +247,8 @@ def test_negative_seed_is_rejected(body, cache):
     ("changes", "text"),
     [
         ({"num_goals": 0}, "num_goals 0: expected an integer >= 1"),
+        ({"num_goals": 10**9}, "num_goals 1000000000: expected an integer >= 1 and <= 1,000,000"),
+        ({"obstacles": 1001}, "obstacles 1001: expected an integer >= 0 and <= 1,000"),
         ({"num_goals": 2.5}, "num_goals 2.5: expected an integer >= 1"),
         ({"max_episode_steps": 0}, "max_episode_steps 0: expected an integer >= 1"),
         ({"obstacles": -1}, "obstacles -1: expected an integer >= 0"),
