@@ -229,7 +229,10 @@ def pybullet_table() -> str:
         bullet = _result([[score_from_json(row) for row in read_json(path)["deterministic"]]])
         rates = [100 * result.success.value for result in (mujoco, bullet)]
         differences.setdefault(tests[0].task, []).append(rates[1] - rates[0])
-        cells = [*_names(run), *(f"{rate:.0f}%" for rate in rates)]
+        split, agent, seed = _names(run)
+        if run.parts[0].endswith("100m"):
+            agent += ", 100 million"
+        cells = [split, agent, seed, *(f"{rate:.0f}%" for rate in rates)]
         cells.append(f"{rates[1] - rates[0]:+.0f} points")
         if tests[0].task == "reach":  # the score of push is its success
             scores = mujoco.score, bullet.score
