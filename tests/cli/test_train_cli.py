@@ -275,6 +275,7 @@ def test_study_report_of_gpu_runs_needs_no_gpu(run, split_yaml, tmp_path):
     assert "missing" in out
 
 
+@pytest.mark.slow
 def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)

@@ -303,6 +303,7 @@ def own_parts(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.mark.slow
 def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch, capsys):
     assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
     stored = own_parts / f"my_wedge{SUFFIX}"

@@ -268,6 +268,7 @@ def test_pieces_give_three_reproducible_guesses_per_clustering():
     assert scores.max() > 0.6
 
 
+@pytest.mark.slow
 def test_residual_search_finds_a_capsule_between_boxes():
     """The earlier result has half of the upright box; the third primitive must not fill it up."""
     capsule = Capsule(0.06, 0.25)
