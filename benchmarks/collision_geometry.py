@@ -65,6 +65,7 @@ from morphgen.typing import Array
 from worlds import Make, MujocoWorld, PybulletWorld, World
 
 OUT = Path("results/collision-geometry.json")
+DEFAULTS = (4000, 7, 0)  # steps of a block, blocks and seed of the stored rows
 CONFIGURATIONS = 1000
 """Number of random configurations of the agreement."""
 LOADS = 5
@@ -139,16 +140,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", help="names of arms, separated by commas")
-    parser.add_argument("--steps", type=int, default=4000, help="steps of a block")
-    parser.add_argument("--blocks", type=int, default=7)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", help="names of arms, with commas between them")
+    parser.add_argument("--steps", type=int, default=DEFAULTS[0], help="steps of a block")
+    parser.add_argument("--blocks", type=int, default=DEFAULTS[1])
+    parser.add_argument("--seed", type=int, default=DEFAULTS[2])
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--report", action="store_true", help="print the rows, measure nothing")
     args = parser.parse_args()
     library = default_library()
     names = _names(library, args.only)
     rows = _read_rows(args.out)
+    if args.out == OUT and (args.steps, args.blocks, args.seed) != DEFAULTS:
+        parser.error(f"{OUT} is of other --steps, --blocks and --seed; name another --out")
     left_out = []
     for name in () if args.report else tqdm(names, unit="arm", file=sys.stderr):
         missing = [key for key in GEOMETRIES if (name, key) not in rows]

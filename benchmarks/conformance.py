@@ -35,6 +35,7 @@ from tqdm import tqdm
 from morphgen.api.checks import conform
 from morphgen.checks.hold import MAX_DRIFT
 from morphgen.formats.bundle import MJCF, write_bundle
+from morphgen.formats.files import write_file
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, grammar_names, load_grammar
 from morphgen.grammar.library import Library, default_library
@@ -241,8 +242,11 @@ def _read(file: Path) -> list[Row]:
 
 
 def _append(file: Path, row: Row) -> None:
+    """Add a row; one that was cut off before is removed."""
     file.parent.mkdir(parents=True, exist_ok=True)
     is_new = not file.exists()
+    if not is_new and not (content := file.read_bytes()).endswith(b"\n"):
+        write_file(file, content[: content.rfind(b"\n") + 1])
     with file.open("a", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
         if is_new:

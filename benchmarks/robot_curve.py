@@ -35,6 +35,7 @@ REAL_ARMS = (
     *("jaco2", "lwr", "widowx", "z1", "ur10"),
 )
 REAL_EPISODES = 20
+AGENT, OUT = "me-graph", Path("results/robot-curve")
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,13 @@ def file_of(out: Path, name: str, robots: int, seed: int) -> Path:
     return out / f"{name}-serial{robots}-seed{seed}.json"
 
 
+def run_of(name: str, robots: int, seed: int, args: argparse.Namespace) -> Path:
+    """Return the folder of a run; another agent or number of steps has a folder of its own."""
+    own = "" if args.agent == AGENT else f"-{args.agent}"
+    own += f"-{args.steps}" if args.steps else ""
+    return Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}{own}"
+
+
 def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace) -> None:
     """Train one policy, and write its scores on each split and real arm that has none."""
     variant, path = VARIANTS[name], file_of(args.out, name, robots, seed)
@@ -109,7 +117,7 @@ def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace)
     missing = {test: words for test, words in tests_of(variant).items() if test not in scores}
     if not missing:
         return
-    run = Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}"
+    run = run_of(name, robots, seed, args)
     if not is_trained(run):  # else train would draw the robots again before it finds that out
         morphgen(
             *("train", f"task={variant.task}", *variant.options),
@@ -184,10 +192,13 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--steps", type=float, help="transitions (default: 1e6, push: 1.5e6, push-long: 4e6)"
     )
-    parser.add_argument("--agent", default="me-graph")
-    parser.add_argument("--out", type=Path, default=Path("results/robot-curve"))
+    parser.add_argument("--agent", default=AGENT)
+    parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--report", action="store_true", help="only print the tables")
-    return parser.parse_args(words)
+    args = parser.parse_args(words)
+    if args.out == OUT and (args.agent != AGENT or args.steps):
+        parser.error("--agent and --steps: name another --out, which has the scores of such runs")
+    return args
 
 
 def main() -> None:

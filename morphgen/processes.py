@@ -80,15 +80,14 @@ def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: i
     try:
         running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
         while running:
-            try:
-                results: list[R] = running.popleft().result()
-            except BrokenProcessPool as error:
-                raise MorphgenError(
-                    "a worker died, perhaps for lack of memory; finished results are kept: run "
-                    "again, or with fewer jobs"
-                ) from error
+            results: list[R] = running.popleft().result()
             running.extend(_submit(pool, itertools.islice(waiting, 1)))
             yield from results
+    except BrokenProcessPool as error:
+        raise MorphgenError(
+            "a worker died, perhaps for lack of memory; finished results are kept: run again, or "
+            "with fewer jobs"
+        ) from error
     finally:
         stopped.value = 1
         pool.shutdown(wait=True, cancel_futures=True)

@@ -4,6 +4,7 @@ import ast
 import doctest
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -118,6 +119,18 @@ def test_robots_may_be_named(tmp_path):
     assert reports[0] == reports[1]
 
 
+def test_a_name_that_is_a_path_leaves_the_folder_alone(tmp_path):
+    robot = replace(morphgen.compose("prims"), name="../x")
+    with pytest.raises(MorphgenError, match=r"name '\.\./x': use letters"):
+        morphgen.write(robot, tmp_path / "out", picture=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_repairs_take_a_robot_by_its_name():
+    robot, repaired = morphgen.fix("prims")
+    assert (robot.name, repaired) == ("prims", ())
+
+
 def test_fit_returns_robot_and_report(tmp_path):
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     box.export(tmp_path / "box.stl")
@@ -209,6 +222,10 @@ def test_vector_environments_of_one_keep_their_axis():
     [
         (lambda: morphgen.compose("arm=lwrr"), "did you mean 'lwr'"),
         (lambda: morphgen.compose("prims", geometry="meshes"), "did you mean 'mesh'"),
+        (lambda: morphgen.sample("arm3", 1, seed=-1), "sample: seed -1: expected a whole number"),
+        (lambda: morphgen.sample("arm3", 1.5), "sample: n 1.5: expected a whole number, 0 or mor"),
+        (lambda: morphgen.split(hold_out="arm=lwr", train="3"), "train '3': expected a whole num"),
+        (lambda: morphgen.split(hold_out="arm=lwr", max_links=None), "max_links None: expected"),
         (lambda: morphgen.check(3), "3 is no robot; expected a Robot, a path, or a name"),
         (lambda: morphgen.conform("no/such/folder"), "no/such/folder: no such file or folder"),
         (lambda: morphgen.conform("prims", samples=0), "0 samples, seed 0: expected 1 sample"),

@@ -1,11 +1,12 @@
 """Results of parallel work equal those of serial work."""
 
 import os
+import time
 from functools import partial
 
 import pytest
 
-from helpers.worker_functions import die, fail, power
+from helpers.worker_functions import die, die_at_three, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.processes import CHUNK_SIZE, parallel_map
 
@@ -34,6 +35,15 @@ def test_worker_error_is_raised(jobs):
 def test_dead_process_is_reported():
     with pytest.raises(MorphgenError, match=r"a worker died.*finished results are kept: run again"):
         list(parallel_map(die, range(20), 2))
+
+
+def test_a_process_that_dies_while_results_are_used_is_reported():
+    def slowly(result):
+        time.sleep(0.1)  # meanwhile the pool breaks, before the next item is submitted
+        return result
+
+    with pytest.raises(MorphgenError, match="a worker died"):
+        list(map(slowly, parallel_map(die_at_three, range(40), 2, chunk=1)))
 
 
 @pytest.mark.parametrize("jobs", [0, -1])

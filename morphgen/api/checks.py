@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 from morphgen import checks
 from morphgen.api.library import LibraryFolders, open_library
-from morphgen.checks import fix
 from morphgen.checks.conformance import ConformanceReport, conformance
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
@@ -21,6 +20,7 @@ from morphgen.grammar.robot_source import (
     RobotSource,
     find_robot,
     read_source,
+    resolve_robot,
 )
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
@@ -53,6 +53,22 @@ def check(
     if isinstance(robot, Robot):
         return checks.check(robot, tool_required=tool_required)
     return check_source(find_robot(robot), open_library(library), tool_required=tool_required)
+
+
+def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple[Finding, ...]]:
+    """Apply all safe repairs to a robot.
+
+    Args:
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
+        library: Folders of your own parts.
+
+    Returns:
+        The repaired robot, whose provenance lists the repairs, and the repaired findings.
+
+    Raises:
+        MorphgenError: If the robot cannot be composed or read.
+    """
+    return checks.fix(resolve_robot(robot, open_library(library)))
 
 
 def check_source(

@@ -8,8 +8,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from morphgen.benchmark.audit import NEAR_THRESHOLDS, Audit, NearThresholds, audit
+from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
+from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds
 from morphgen.benchmark.split import Split, compose_side
 from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.split_writing import split_paths, write_new_splits

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 
@@ -11,13 +12,13 @@ from morphgen.checks import check
 from morphgen.errors import CompositionError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.collision_geometry import GEOMETRIES, with_geometry
-from morphgen.formats.bundle import read_robot, write_bundle
+from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
-from morphgen.grammar.sampling import sample_robots
+from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
@@ -91,13 +92,17 @@ def sample(
 
     Raises:
         GrammarError: If the grammar or the condition is invalid.
-        SamplingError: While iterating, if no robot meets the conditions in 500 draws.
+        SamplingError: If ``n`` or ``seed`` is negative or no integer; while iterating, if no robot
+            meets the conditions in 500 draws.
     """
     parts = open_library(library)
     loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:
         require_condition(condition)
+    for name, value in (("n", n), ("seed", seed)):
+        if not isinstance(value, Integral) or value < 0:
+            raise SamplingError(f"sample: {name} {value!r}: expected a whole number, 0 or more")
     samples = sample_robots(loaded, parts, n, seed=seed, where=conditions)
     return (sample.robot for sample in samples)
 
@@ -149,4 +154,5 @@ def write(
         MorphgenError: If the robot cannot be composed or read.
     """
     robot = resolve_robot(robot, open_library(library))
-    return write_bundle(robot, Path(folder) / robot.name, check(robot), picture=picture)
+    target = bundle_folder(Path(folder), robot.name)  # names of strangers may be paths
+    return write_bundle(robot, target, check(robot), picture=picture)

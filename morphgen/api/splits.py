@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from numbers import Integral
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
@@ -147,7 +148,7 @@ def split(
             replace(each, statistics=statistics(each, parts, jobs=jobs)) for each in splits
         )
     loaded = tuple(LoadedSplit(each, parts) for each in splits)
-    return loaded[0] if train is None or isinstance(train, int) else loaded
+    return loaded[0] if train is None or isinstance(train, Integral) else loaded
 
 
 def _parse(
@@ -175,7 +176,11 @@ def _parse(
         raise BenchmarkError(f"task {list(tasks)}: expected one or more, all different")
     if train is None:
         train = () if regime == "composition" else DEFAULT_TRAIN
-    sizes = (train,) if isinstance(train, int) else tuple(train)
+    sizes = tuple(train) if isinstance(train, Iterable) else (train,)
+    for what, value in (("max_links", max_links), *(("train", size) for size in sizes)):
+        if not isinstance(value, Integral):
+            raise BenchmarkError(f"split: {what} {value!r}: expected a whole number")
+    sizes, max_links = tuple(map(int, sizes)), int(max_links)
     name = name or default_name(rules, tasks, obstacles, seed)
     return rules, SplitRequest(name, sizes, test, tasks, obstacles, seed, max_links)
 

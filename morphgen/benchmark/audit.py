@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.benchmark.extrapolation import parse_bound
 from morphgen.benchmark.hold_out_audit import has_hold_out_rules, hold_out_findings
+from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES, most_alike
 from morphgen.benchmark.split import SIDES, Member, Side, Split
@@ -18,26 +20,6 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, no_progress
-
-
-@dataclass(frozen=True)
-class NearThresholds:
-    """Thresholds of near duplicates: both conditions must hold."""
-
-    tree: float
-    """Tree distance below which two robots are near."""
-    cosine: float
-    """Cosine of the tokens above which two robots are near."""
-
-
-NEAR_THRESHOLDS = NearThresholds(0.001, 0.99999)
-"""Thresholds for sizes that differ by about one per cent, which is a manufacturing tolerance.
-
-Changing the sizes of robots of the shipped grammars by 1 % gives tree distances of 0.0002 to 0.0011
-and cosines above 0.999997; by 3 %, distances of 0.0007 to 0.0033 and cosines down to 0.99997. Both
-measures are needed: the tree distance ignores where along a link the next one is attached, and the
-cosine depends little on sizes, because most token entries are flags and unit quaternions.
-"""
 
 _FIXES = {
     "part-missing": "name the folder of your parts with --library, or correct the derivation",
@@ -177,7 +159,9 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
     """Yield test robots that are train robots, or near duplicates of them."""
     split = survey.split
     names = {member.name: member for member in split.train}
-    tree, cosine = survey.by_measure("tree"), survey.by_measure("cosine")
+    tree, cosine, workspace = map(survey.by_measure, ("tree", "cosine", "workspace"))
+    is_one_workspace = _same_reach(survey, near) & (workspace > near.workspace)
+    is_near = (tree < near.tree) & ((cosine > near.cosine) | is_one_workspace)
     for j, member in enumerate(split.test):
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
         shared = [i for i in rivals if split.train[i].robot_hash == member.robot_hash]
@@ -185,22 +169,31 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
             twin = _first_of(split, shared)
             why = f"train robot {twin} has the same body, and learns the same task"
             yield _finding("body-shared", "test", member, why)
-        close = (tree[:, j] < near.tree) & (cosine[:, j] > near.cosine)
         duplicates = sorted(
-            (i for i in rivals if close[i] and i not in shared), key=tree[:, j].item
+            (i for i in rivals if is_near[i, j] and i not in shared), key=tree[:, j].item
         )
         if duplicates:
             first = duplicates[0]
             why = (
                 f"train robot {_first_of(split, duplicates)} is nearly the same: tree distance "
-                f"{tree[first, j]:.2g} (below {near.tree:g}), cosine {cosine[first, j]:.6f} "
-                f"(above {near.cosine:g})"
+                f"{tree[first, j]:.2g} (below {near.tree:g}), cosine {cosine[first, j]:.6f} and "
+                f"workspace overlap {workspace[first, j]:.4f} (one above {near.cosine:g} or "
+                f"{near.workspace:g}, the latter at the same reach)"
             )
             yield _finding("body-near", "test", member, why)
         other = names.get(member.name)
         if other is not None and other.robot_hash != member.robot_hash:
             why = "a train robot of another body has the same name"
             yield _finding("name-shared", "test", member, why)
+
+
+def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
+    """Return which pairs have nearly one reach, shape (n_train, n_test)."""
+    train, test = (
+        [np.nan if isinstance(robot, Fault) else robot.shoulder_reach for robot in robots]
+        for robots in (survey.train, survey.test)
+    )
+    return np.array([[is_same_reach(a, b, near) for b in test] for a in train])
 
 
 def _repeated(split: Split) -> Iterator[Finding]:

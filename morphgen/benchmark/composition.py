@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from morphgen.benchmark.generate import SplitRequest, assemble
+from morphgen.benchmark.near_duplicates import NearReason
 from morphgen.benchmark.part_patterns import NOTHING, pattern_robots
 from morphgen.benchmark.regimes import combination, parts
-from morphgen.benchmark.robot_factory import ComposedRecipe, Progress, RobotFactory, make_robots
+from morphgen.benchmark.robot_factory import (
+    Candidate,
+    ComposedRecipe,
+    Progress,
+    RobotFactory,
+    make_robots,
+)
 from morphgen.benchmark.split import Member, Split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
@@ -62,9 +69,10 @@ def composition(
     unique = {
         candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
     }
-    factory = RobotFactory(library.folders, max_links=request.max_links)
+    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
     composed_robots = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
     robot_of = dict(zip(unique, composed_robots, strict=True))
+    _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
     robots = []
     for candidate in members:
         robot = robot_of[candidate.text]
@@ -80,6 +88,25 @@ def composition(
         robots[-len(test) :],
         {"from": list(patterns), "tasks": list(request.tasks)},
     )
+
+
+def _require_no_near(
+    test: Sequence[HoldOutCandidate],
+    train: Sequence[HoldOutCandidate],
+    robot_of: Mapping[str, Candidate],
+) -> None:
+    """Require that no test robot is nearly a train robot of its task, as the audit does.
+
+    Raises:
+        BenchmarkError: If one is.
+    """
+    for each in test:
+        others = [robot_of[other.text] for other in train if other.task == each.task]
+        if reason := NearReason(others)(robot_of[each.text]):
+            raise BenchmarkError(
+                f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
+                "--from, or name another --seed"
+            )
 
 
 def _candidates(

@@ -17,8 +17,9 @@ from morphgen.processes import Progress, no_progress
 from morphgen.typing import Array
 
 DIGITS = 6
-"""Decimals of all numbers. Near duplicates differ in the fourth one (``audit.NEAR_THRESHOLDS``);
-rounding errors, which depend on the processor, are far smaller."""
+"""Decimals of all numbers. Near duplicates differ in the fourth one
+(``near_duplicates.NEAR_THRESHOLDS``); rounding errors, which depend on the processor, are far
+smaller."""
 
 
 @dataclass(frozen=True)

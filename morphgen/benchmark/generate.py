@@ -180,10 +180,10 @@ class TestRobotSearch:
             self._num_composed += 1
             return error.reason
         # The robot comes from a later draw if the conditions of the grammar reject the first one.
-        reason = reject_derivation(robot.derivation) or reject_robot(robot)
+        reason = reject_derivation(robot.derivation)
         if not reason and robot.hash in self._name_by_hash:
             reason = f"the body of {self._name_by_hash[robot.hash]}"
-        if reason:
+        if reason := reason or reject_robot(robot):
             self._num_composed += 1
             return reason
         self._name_by_hash[robot.hash] = robot.name

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
-from morphgen.benchmark.audit import NEAR_THRESHOLDS
 from morphgen.benchmark.generate import MAX_COMPOSED, SplitRequest
 from morphgen.benchmark.hold_out_pool import Draft, DraftMaker
+from morphgen.benchmark.near_duplicates import is_near
 from morphgen.benchmark.robot_factory import Candidate, Progress, RobotFactory, UnfitRobotError
-from morphgen.benchmark.similarity import cosine, tree_distance
 from morphgen.benchmark.stratified import TestBalance, TrainBalance, stratified
 from morphgen.errors import BenchmarkError
 from morphgen.processes import parallel_map
@@ -183,4 +182,4 @@ class HoldOutSearch:
         x, y = self.robots[a].features, self.robots[b].features
         assert x is not None
         assert y is not None
-        return cosine(x, y) > NEAR_THRESHOLDS.cosine and tree_distance(x, y) < NEAR_THRESHOLDS.tree
+        return is_near(x, y)

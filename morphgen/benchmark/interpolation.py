@@ -13,6 +13,7 @@ from morphgen.benchmark.generate import (
     assemble_drawn,
     require_size,
 )
+from morphgen.benchmark.near_duplicates import NearReason
 from morphgen.benchmark.regimes import HULLS, ON_HULL, hull_distance, parameters, structure
 from morphgen.benchmark.robot_factory import Candidate, Progress, RobotFactory, make_robots
 from morphgen.benchmark.split import Split
@@ -58,12 +59,12 @@ def interpolation(
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
     train_stream = RobotStream.of(grammar, grammar.name, request)
     test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
-    factory = RobotFactory(library.folders, max_links=request.max_links)
+    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
     recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
     train = make_robots(recipes, factory, jobs=jobs, progress=progress)
     criterion = StructureAndHull(train, request.train[0], hull, library)
     search = TestRobotSearch(request, train, factory, progress)
-    if not search.find([test_stream], criterion):
+    if not search.find([test_stream], criterion, NearReason(train)):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
     return assemble_drawn(

@@ -6,12 +6,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from morphgen.benchmark.audit import NEAR_THRESHOLDS
 from morphgen.benchmark.extrapolation import SimilarityBound, UntrainedStructure, parse_bound
 from morphgen.benchmark.generate import RejectDerivation, RejectRobot
 from morphgen.benchmark.interpolation import StructureAndHull
+from morphgen.benchmark.near_duplicates import NearReason
 from morphgen.benchmark.robot_factory import Candidate, DerivedRecipe, RobotFactory, make_robots
-from morphgen.benchmark.similarity import cosine, tree_distance
 from morphgen.benchmark.split import SIDES, Side, Split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.derivation import parse_derivation
@@ -50,27 +49,16 @@ def private_source(split: Split, library: Library) -> PrivateSource:
             grammars,
             public,
             StructureAndHull(train, len(train), hull, library),
-            lambda robot: _near_reason(robot, public),
+            NearReason(public),
         )
     bound = parse_bound(str(made["similarity"])) if "similarity" in made else None
-    violates_bound = SimilarityBound(train, len(train), bound)
+    violates_bound, is_near_public = SimilarityBound(train, len(train), bound), NearReason(public)
     return PrivateSource(
         grammars,
         public,
         UntrainedStructure(train, library),
-        lambda robot: violates_bound(robot) or _near_reason(robot, public),
+        lambda robot: violates_bound(robot) or is_near_public(robot),
     )
-
-
-def _near_reason(robot: Candidate, public: Sequence[Candidate]) -> str:
-    """Return the reason why a robot is rejected that the audit would call nearly a public one."""
-    for other in public:
-        if robot.features is None or other.features is None:
-            continue
-        is_near = cosine(robot.features, other.features) > NEAR_THRESHOLDS.cosine
-        if is_near and tree_distance(robot.features, other.features) < NEAR_THRESHOLDS.tree:
-            return f"almost the sizes of {other.name}"
-    return ""
 
 
 def test_grammars(split: Split, library: Library) -> tuple[Grammar, ...]:

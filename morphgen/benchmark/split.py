@@ -109,9 +109,16 @@ class Split:
 
 
 def split_id(split: Split) -> str:
-    """Return a hash of the regime and of the members of each side in order: 32 hex digits."""
+    """Return a hash of the regime and of the members of each side in order: 32 hex digits.
+
+    It covers ``max_links`` where a split names it: the tokens of its robots depend on it.
+
+    Raises:
+        BenchmarkError: If ``max_links`` is no valid number.
+    """
     sides = [[list(member.as_dict().values()) for member in split.side(side)] for side in SIDES]
-    return digest([split.regime, *sides])
+    links = [split.max_links] if MAX_LINKS_KEY in split.provenance else []
+    return digest([split.regime, *sides, *links])
 
 
 def compose_side(split: Split, side: Side, library: Library) -> Iterator[Robot]:

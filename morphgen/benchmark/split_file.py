@@ -132,8 +132,7 @@ class _Reader:
             self._free(fields.get("statistics"), "statistics"),
             names["morphgen"],
         )
-        line = fields["id"].start_mark.line + 1
-        return SplitFile(self._path, split, names["id"], line)
+        return SplitFile(self._path, split, names["id"], fields["id"].start_mark.line + 1)
 
     def _fail(self, node: Node, what: str) -> BenchmarkError:
         return BenchmarkError(f"{self._path}:{node.start_mark.line + 1}: {what}")
@@ -236,7 +235,10 @@ class _Reader:
     def _value(self, node: Node) -> object:
         if node.tag == "tag:yaml.org,2002:str":
             return node.value
-        return self._loader.construct_object(node, deep=True)
+        try:
+            return self._loader.construct_object(node, deep=True)
+        except (ValueError, KeyError) as error:  # such as a date with a thirteenth month
+            raise self._fail(node, f"{node.value!r:.60}: no valid {node.tag[18:]}") from error
 
 
 def split_names() -> list[str]:

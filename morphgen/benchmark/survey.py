@@ -67,6 +67,8 @@ class SurveyedRobot:
     robot_hash: str
     """Hash of the robot; see ``morphgen.benchmark.robot_hash``."""
     stats: RobotStats
+    shoulder_reach: float
+    """Largest distance of the tool from the shoulder, the unit of ``Workspace`` [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +143,9 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
     if len(robot.links) > max_links:
         why = f"it has {len(robot.links)} links, more than max_links {max_links}"
         return Fault("links-many", why)
-    surveyed = SurveyedRobot(robot_hash(robot), robot_stats(robot))
-    return MeasuredRobot(
-        surveyed, features(robot, token_shapes(robot, folders), max_links=max_links)
-    )
+    found = features(robot, token_shapes(robot, folders), max_links=max_links)
+    surveyed = SurveyedRobot(robot_hash(robot), robot_stats(robot), found.workspace.reach)
+    return MeasuredRobot(surveyed, found)
 
 
 def survey_split(

@@ -15,7 +15,8 @@ from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError, GrammarError, PartError
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.audit import Audit, NearThresholds
+    from morphgen.benchmark.audit import Audit
+    from morphgen.benchmark.near_duplicates import NearThresholds
     from morphgen.benchmark.split import Split
     from morphgen.benchmark.verify import Difference
     from morphgen.model.findings import Finding
@@ -74,21 +75,24 @@ def audit(args: argparse.Namespace) -> int:
 
 
 def _near(text: str | None) -> NearThresholds:
-    from morphgen.benchmark.audit import NEAR_THRESHOLDS, NearThresholds
+    from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds
 
     if text is None:
         return NEAR_THRESHOLDS
     try:
-        tree, cosine = map(float, text.split(","))
-    except ValueError as error:
+        tree, cosine, *more = map(float, text.split(","))
+        near = NearThresholds(tree, cosine, *more)
+    except (ValueError, TypeError) as error:
         raise BenchmarkError(
-            f"--near {text}: expected a tree distance and a cosine, such as 0.001,0.99999"
+            f"--near {text}: expected a tree distance and a cosine, such as 0.001,0.99999; a third "
+            "number is the workspace overlap"
         ) from error
-    if not (0 <= tree <= 1 and -1 <= cosine <= 1):
+    if not (0 <= tree <= 1 and -1 <= cosine <= 1 and 0 <= near.workspace <= 1):
         raise BenchmarkError(
-            f"--near {text}: a tree distance is from 0 to 1, and a cosine from -1 to 1"
+            f"--near {text}: a tree distance is from 0 to 1, a cosine from -1 to 1, and a "
+            "workspace overlap from 0 to 1"
         )
-    return NearThresholds(tree, cosine)
+    return near
 
 
 def _audit_goals(

@@ -117,7 +117,8 @@ def _loaders(bundle: Path) -> Iterator[Entry]:
 def _loader(row: ConformanceRow) -> Entry:
     name = f"loader {row.loader}"
     if row.passed is None:
-        return Entry(name, "absent", f"{row.message}: pip install 'morphgen[conform]'")
+        extra = "usd" if row.loader == "usd" else "conform"
+        return Entry(name, "absent", f"{row.message}: pip install 'morphgen[{extra}]'")
     if not row.passed:
         return Entry(name, "error", f"disagrees with morphgen: {row.message}")
     return Entry(name, "ok", f"agrees with morphgen in {CONFIGURATIONS} configurations")

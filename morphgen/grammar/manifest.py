@@ -183,7 +183,7 @@ def _load_yaml(path: Path) -> tuple[bytes, Any]:
         return text, yaml.load(text, Loader=_Loader) or {}
     except yaml.YAMLError as error:
         raise PartError(f"{path}{yaml_problem(error)}") from error
-    except ValueError as error:
+    except (ValueError, KeyError) as error:
         raise PartError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
     except FormatError as error:
         raise PartError(str(error)) from error

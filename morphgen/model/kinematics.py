@@ -56,20 +56,23 @@ def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
 def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
     """Shift periodic joints by whole turns to their positions nearest to a reference.
 
+    A joint beyond its limits from where no turn leads within them stays.
+
     Args:
         robot: The robot.
         q_reference: Reference configuration, shape (dof,).
         q: Configurations, shape (..., dof).
 
     Returns:
-        Configurations within the joint limits that give the same poses of all links, in the shape
-        of ``q``.
+        Configurations that give the same poses of all links, in the shape of ``q``; within the
+        joint limits if those of ``q`` are.
     """
     q_reference, q = np.asarray(q_reference, dtype=np.float64), np.asarray(q, dtype=np.float64)
     lower, upper = joint_limits(robot).T
-    turns = np.round((q_reference - q) / (2 * np.pi)) * periodic_joints(robot)
-    min_turns, max_turns = ((limit - q) / (2 * np.pi) for limit in (lower, upper))
-    return np.asarray(q + 2 * np.pi * np.clip(turns, np.ceil(min_turns), np.floor(max_turns)))
+    turns = np.round((q_reference - q) / (2 * np.pi))
+    least, most = np.ceil((lower - q) / (2 * np.pi)), np.floor((upper - q) / (2 * np.pi))
+    may_turn = periodic_joints(robot) & (least <= most)
+    return np.asarray(q + 2 * np.pi * np.where(may_turn, np.clip(turns, least, most), 0.0))
 
 
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:

@@ -286,6 +286,7 @@ def test_the_id_depends_on_regime_and_robots_only():
         replace(split, train=(second, first)),
         replace(split, train=(first,)),
         replace(split, train=split.test, test=split.train),
+        replace(split, provenance={**split.provenance, "max_links": 40}),
         replace(split, train=(first,), test=(second, *split.test)),
         *(
             replace(split, train=(replace(first, **change), second))

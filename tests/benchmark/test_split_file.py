@@ -168,6 +168,8 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
         ("name: ur5-stick", "name: ../x", 0, "name: '../x': use letters, digits"),
         ("name: arm3-000001", "name: ur5-plane", 0, "train: two robots are named 'ur5-plane'"),
         ('body: "1e5', 'body: "1g5', 0, "body: '1g500"),
+        ("seed: 3", "seed: 2024-13-45", 0, "'2024-13-45': no valid timestamp"),
+        ("seed: 3", "seed: !!bool xx", 0, "'xx': no valid bool"),
         ("seed: 3", "seed: &a [*a]", 0, "invalid YAML: found unconstructable recursive node"),
         (
             "accepted:\n  part",

@@ -20,6 +20,12 @@ def die(number):
     os._exit(number)
 
 
+def die_at_three(number):
+    if number == 3:
+        os._exit(1)
+    return number
+
+
 def die_later(seconds):
     time.sleep(seconds)
     os._exit(0)

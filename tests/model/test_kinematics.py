@@ -127,6 +127,18 @@ def test_unwrapped_configurations_are_nearest_to_the_reference():
     assert (apart < np.abs(ends - start) - 6).any()
 
 
+def test_joints_beyond_their_limits_do_not_jump():
+    arm3 = compose("arm=arm3 ee=stick")
+    lower, upper = joint_limits(arm3).T
+    assert unwrap_joints(arm3, lower, upper + 1e-9) == pytest.approx(
+        np.where(upper - lower >= 2 * np.pi, lower + 1e-9, upper + 1e-9)
+    )
+    gantry = compose("base=gantry ee=plane")
+    slides = [gantry.joints[k].kind == "prismatic" for k in gantry.independent_joints]
+    lower, upper = joint_limits(gantry).T
+    assert unwrap_joints(gantry, lower, upper + 1e-9)[slides] == pytest.approx(upper[slides])
+
+
 def test_a_joint_with_followers_is_not_unwrapped():
     turns = periodic_joints(compose("arm=panda ee=panda_hand"))
     assert turns.tolist() == [True] * 7 + [False]

@@ -43,7 +43,7 @@ def test_robot_is_written_to_a_bundle(see, folder):
     name.locator("xpath=ancestor::*[.//input][1]//input").fill("by-hand")
     page.get_by_role("button", name="Write to robots/").click()
     page.get_by_text("Written", exact=True).wait_for()
-    assert read_bundle(folder / "robots" / "by-hand").name == "planar-cube"
+    assert read_bundle(folder / "robots" / "by-hand").name == "by-hand"
     assert (folder / "robots" / "by-hand" / "preview.png").is_file()
 
 
