@@ -36,9 +36,10 @@ def _goal_seed(help: str) -> Option:
     option("split", metavar="SPLIT", help="name of a split, its file, or its built folder"),
     option(
         "--near",
-        metavar="TREE,COSINE",
-        help="robots are nearly the same if their tree distance is below and their cosine "
-        "similarity above (default: 0.001,0.99999)",
+        metavar="TREE,COSINE[,WORKSPACE]",
+        help="robots are nearly the same if their tree distance is below, and their cosine "
+        "similarity or, at one reach, their workspace overlap above "
+        "(default: 0.001,0.99999,0.999)",
     ),
     flag("--strict", "fail on warnings, too"),
     flag("--goals", "audit goal sets even if the split ships none"),
