@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -36,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 for success, 1 for findings or failed checks, 2 for invalid input, 130 when interrupted.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names may have letters that a terminal lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             return _run(argv)

@@ -53,6 +53,14 @@ def test_invalid_arguments_are_rejected(refused, words, message):
     assert message in refused("compose", *words.split(), "--out", "out")
 
 
+def test_names_are_printed_in_any_encoding(tmp_path):
+    (tmp_path / "ü.urdf").write_text('<robot name="r"><link name="ä"/></robot>', encoding="utf-8")
+    process = start("show", tmp_path / "ü.urdf", PYTHONIOENCODING="ascii")
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert r"\xe4" in out
+
+
 @pytest.mark.parametrize("name", ["../x", "", "a/b", ".", "..", ".hidden", "-x", "a b", "n" * 300])
 def test_names_that_are_not_plain_folder_names_are_rejected(refused, robot_urdf, name):
     naming = ("--no-picture", "--out", "out", f"--name={name}")
