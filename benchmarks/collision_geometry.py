@@ -140,7 +140,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", help="names of arms, with commas between them")
+    parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--steps", type=int, default=DEFAULTS[0], help="steps of a block")
     parser.add_argument("--blocks", type=int, default=DEFAULTS[1])
     parser.add_argument("--seed", type=int, default=DEFAULTS[2])

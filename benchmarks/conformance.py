@@ -152,6 +152,7 @@ def main() -> int:
     file = args.out / ROWS
     rows = _read(file)
     if not args.report:
+        _drop_cut_off_row(file)
         library = default_library()
         known = {(row.robot, row.seed) for row in rows}
         todo = [
@@ -241,12 +242,16 @@ def _read(file: Path) -> list[Row]:
     return [Row(**(row | {name: int(row[name]) for name in numbers})) for row in complete]
 
 
+def _drop_cut_off_row(file: Path) -> None:
+    """Remove the last row if the run that wrote it was killed within its line."""
+    content = file.read_bytes() if file.exists() else b""
+    if content and not content.endswith(b"\n"):
+        write_file(file, content[: content.rfind(b"\n") + 1])
+
+
 def _append(file: Path, row: Row) -> None:
-    """Add a row; one that was cut off before is removed."""
     file.parent.mkdir(parents=True, exist_ok=True)
     is_new = not file.exists()
-    if not is_new and not (content := file.read_bytes()).endswith(b"\n"):
-        write_file(file, content[: content.rfind(b"\n") + 1])
     with file.open("a", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
         if is_new:

@@ -103,13 +103,6 @@ def file_of(out: Path, name: str, robots: int, seed: int) -> Path:
     return out / f"{name}-serial{robots}-seed{seed}.json"
 
 
-def run_of(name: str, robots: int, seed: int, args: argparse.Namespace) -> Path:
-    """Return the folder of a run; another agent or number of steps has a folder of its own."""
-    own = "" if args.agent == AGENT else f"-{args.agent}"
-    own += f"-{args.steps}" if args.steps else ""
-    return Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}{own}"
-
-
 def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace) -> None:
     """Train one policy, and write its scores on each split and real arm that has none."""
     variant, path = VARIANTS[name], file_of(args.out, name, robots, seed)
@@ -117,7 +110,9 @@ def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace)
     missing = {test: words for test, words in tests_of(variant).items() if test not in scores}
     if not missing:
         return
-    run = run_of(name, robots, seed, args)
+    own = "" if args.agent == AGENT else f"-{args.agent}"
+    own += f"-{args.steps}" if args.steps else ""
+    run = Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}{own}"
     if not is_trained(run):  # else train would draw the robots again before it finds that out
         morphgen(
             *("train", f"task={variant.task}", *variant.options),

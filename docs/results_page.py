@@ -28,7 +28,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.rl.intervals import Interval, wilson_interval
 from morphgen.rl.runs import read_config
 from morphgen.rl.scores import Score, score_from_json
-from morphgen.rl.study_cells import stored_cell
+from morphgen.rl.study_cells import stored_cell, tuned_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
@@ -47,7 +47,7 @@ SPLITS = (
 )
 FIGURE_SPLITS = SPLITS[:5]
 TUNED_STEPS = (10_000, 30_000)
-TUNED = ("deterministic", *(f"fine-tuned {steps:,}" for steps in TUNED_STEPS))
+TUNED = ("deterministic", *map(tuned_name, TUNED_STEPS))
 """Modes of a run before and after fine-tuning."""
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"

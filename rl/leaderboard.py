@@ -73,7 +73,7 @@ class Row(Record, frozen=True):
 
     @property
     def run(self) -> tuple[object, ...]:
-        """What tells the row from others of the same split."""
+        """Method, mode, seeds and fine-tuning: no two rows of a split share all four."""
         return self.method, self.mode, self.seeds, self.finetuned
 
     @property

@@ -37,6 +37,7 @@ from morphgen.rl.robot_source import (
 )
 from morphgen.rl.runs import CHECKPOINT, RunConfig, require_open, require_same_run
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
+from morphgen.rl.study_cells import tuned_name
 from morphgen.rl.submission import SubmissionRecorder, Training, write_submission
 from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
 from morphgen.tasks.env_specs import GoalConfig, task_configs
@@ -80,7 +81,7 @@ class Cell:
             return {self.agent: (None, 0)}
         modes: dict[str, tuple[Mode | None, int]] = {mode: (mode, 0) for mode in MODES}
         for steps in self.finetune:
-            modes[f"fine-tuned {steps:,}"] = (MODES[0], steps)
+            modes[tuned_name(steps)] = (MODES[0], steps)
         return modes
 
     @property

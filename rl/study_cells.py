@@ -93,11 +93,16 @@ def _malformed(file: Path, error: Exception) -> BenchmarkError:
     )
 
 
+def tuned_name(steps: int) -> str:
+    """Return the name of the mode of a policy after a number of transitions of fine-tuning."""
+    return f"fine-tuned {steps:,}"
+
+
 def acting(name: str) -> tuple[str, int]:
-    """Return how a policy acts, and the transitions of its fine-tuning; see ``Cell.modes``.
+    """Return how a policy acts, and the transitions of its fine-tuning.
 
     Args:
-        name: Name of a mode of a cell, such as ``stochastic`` or ``fine-tuned 10,000``.
+        name: Name of a mode of a cell, such as ``stochastic``, or one of ``tuned_name``.
     """
     match = _FINE_TUNED.fullmatch(name)
     return (MODES[0], int(match[1].replace(",", ""))) if match else (name, 0)

@@ -147,9 +147,13 @@ class Session:
             key: Name of the result.
             make: Computes it; it may show its progress in the status line.
         """
-        result = self.cache.get(key, make)
-        self.set_status("")
-        return result
+
+        def made() -> T:
+            result = make()
+            self.set_status("")
+            return result
+
+        return self.cache.get(key, made)
 
     def call_later(self, seconds: float, work: Work, key: str) -> None:
         """Enqueue work after a delay; calls of the same key until then are merged into one."""

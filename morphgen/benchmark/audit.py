@@ -190,10 +190,10 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
 def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
     """Return which pairs have nearly one reach, shape (n_train, n_test)."""
     train, test = (
-        [np.nan if isinstance(robot, Fault) else robot.shoulder_reach for robot in robots]
+        np.array([np.nan if isinstance(each, Fault) else each.shoulder_reach for each in robots])
         for robots in (survey.train, survey.test)
     )
-    return np.array([[is_same_reach(a, b, near) for b in test] for a in train])
+    return is_same_reach(train[:, None], test[None, :], near)
 
 
 def _repeated(split: Split) -> Iterator[Finding]:

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from morphgen.benchmark.similarity import Features, cosine, tree_distance, workspace_overlap
 
 if TYPE_CHECKING:
@@ -44,16 +47,18 @@ depends on neither, but its unit is the reach, so the reach is compared beside i
 
 def is_near(a: Features, b: Features, near: NearThresholds = NEAR_THRESHOLDS) -> bool:
     """Return whether two robots are near duplicates."""
-    is_alike = cosine(a, b) > near.cosine or (
+    is_alike = cosine(a, b) > near.cosine or bool(
         is_same_reach(a.workspace.reach, b.workspace.reach, near)
         and workspace_overlap(a, b) > near.workspace
     )
     return is_alike and tree_distance(a, b) < near.tree  # the slowest measure comes last
 
 
-def is_same_reach(a: float, b: float, near: NearThresholds = NEAR_THRESHOLDS) -> bool:
-    """Return whether two distances of the tool from the shoulder are nearly one."""
-    return abs(a - b) < near.reach * max(a, b)
+def is_same_reach(
+    a: ArrayLike, b: ArrayLike, near: NearThresholds = NEAR_THRESHOLDS
+) -> NDArray[np.bool_]:
+    """Return whether distances of the tool from the shoulder are nearly equal, elementwise."""
+    return np.abs(np.subtract(a, b)) < near.reach * np.maximum(a, b)
 
 
 class NearReason:

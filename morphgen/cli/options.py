@@ -191,6 +191,24 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
     return load_grammar(find_grammar(name, library.folders), library.folders)
 
 
+def require_other_name(words: dict[str, str], split: str, word: str) -> None:
+    """Require that no other argument names a split of this name; keep the argument.
+
+    Args:
+        words: The argument that names each split so far, by the name of the split; gets this one.
+        split: Name of the split.
+        word: The argument that names it.
+
+    Raises:
+        BenchmarkError: If two splits have one name: results could not be told apart.
+    """
+    if split in words:
+        raise BenchmarkError(
+            f"{word}: split {split!r} is also in {words[split]}; expected splits of different names"
+        )
+    words[split] = word
+
+
 def require_writable(name: str, path: Path | None) -> None:
     """Require, before long work, that the file of an option can be written.
 

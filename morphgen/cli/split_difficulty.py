@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, option, path_option
 from morphgen.cli.progress import bar
-from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,16 +68,13 @@ def _splits(names: Sequence[str]) -> list[Split]:
     """Return the splits; two of one name could not be told apart in the rows."""
     from morphgen.benchmark.split_source import read_split_or_folder
 
-    splits: dict[str, tuple[str, Split]] = {}
+    words: dict[str, str] = {}
+    splits = []
     for name in names:
         split, _ = read_split_or_folder(name)
-        if split.name in splits:
-            raise BenchmarkError(
-                f"{name}: split {split.name!r} is also in {splits[split.name][0]}; expected splits "
-                "of different names"
-            )
-        splits[split.name] = name, split
-    return [split for _, split in splits.values()]
+        opt.require_other_name(words, split.name, name)
+        splits.append(split)
+    return splits
 
 
 def _results(study: Path | None, splits: Sequence[Split]) -> list[BaselineResults]:

@@ -113,15 +113,9 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     finetune = _finetune(args.finetune)
     cells: list[Cell] = []
     words: dict[str, str] = {}
-    """What names each split."""
     for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
         source = robots_to_train([name], args)
-        if source.name in words:
-            raise TaskError(
-                f"{name}: split {source.name!r} is also in {words[source.name]}; expected splits "
-                "of different names"
-            )
-        words[source.name] = name
+        opt.require_other_name(words, source.name, name)
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
         tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))
         eval_config = EvalConfig(num_episodes, sim, tasks=tasks)

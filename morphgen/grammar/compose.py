@@ -194,15 +194,13 @@ def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart
         if node.label in parts:
             raise CompositionError(f"two parts are labelled {node.label!r}")
         part = load_part(library.manifest(node.part), part_values(node))
-        yaw = dict(node.parameters).get(MOUNT_YAW)
-        if yaw is None:
-            yaw = 0.0
-        elif not parts:
+        values = dict(node.parameters)
+        if MOUNT_YAW in values and not parts:
             raise CompositionError(
                 f"{node.label!r} is not attached to a port: it has no {MOUNT_YAW}"
             )
-        else:
-            require_range(yaw, MOUNT_YAW_PARAMETER, f"{node.label}.{MOUNT_YAW}")
+        yaw = values.get(MOUNT_YAW, 0.0)
+        require_range(yaw, MOUNT_YAW_PARAMETER, f"{node.label}.{MOUNT_YAW}")
         parts[node.label] = ScopedPart(node.label, part, yaw)
     return parts
 

@@ -120,7 +120,7 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     parameters: Mapping[str, Parameter] = {}
     """Numbers that shape the part, by name. A xacro gets them as its arguments."""
     citation: str = ""
-    """Where the part comes from."""
+    """Publication or repository of the part's model, as one cites it."""
     notes: str = ""
     """Reasons for the corrections of the source."""
 
