@@ -51,6 +51,7 @@ WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 DEFAULT_WORDS = "arm=ur5 ee=plane"
 """Words of the robot that pages show when none is named."""
 EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
+_VERSION = version("morphgen")  # it takes longer to look up than the rest of a hash
 MAX_ERROR = 1000
 """Longest error that a page shows [characters]."""
 _TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")
@@ -317,7 +318,7 @@ def content_hash(uri: str, files: FileAccess) -> str:
     Raises:
         MorphgenError: If the robot does not exist.
     """
-    lines = [version("morphgen")]
+    lines = [_VERSION]
     if derivation := resolve_derivation(uri, files):
         lines += [str(derivation), *_stamps(_part_files(derivation, files.library))]
     else:
