@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import shutil
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -45,9 +44,7 @@ def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> No
             for name, text in _light_files(robot).items():
                 (partial / name).write_text(text, encoding="utf-8")
         return
-    if not (folder / CARD).is_file():
-        shutil.rmtree(folder, ignore_errors=True)
-    write_bundle(robot, folder, check(robot), picture=picture)
+    write_bundle(robot, folder, check(robot), picture=picture, edits_kept=False)
 
 
 def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:

@@ -194,10 +194,15 @@ def _import(
             name=name,
             repair=not args.as_is,
         )
+    folder = bundle_folder(args.out, robot.name)
+    if description.path.resolve().is_relative_to(folder.resolve()):
+        raise FormatError(
+            f"{description.path}: its bundle would replace {folder}, the folder that it is in; "
+            "choose another --name or --out"
+        )
     part = None
     if args.part:  # refuses before the bundle is replaced
-        urdf = bundle_folder(args.out, robot.name) / URDF
-        part = part_manifest(robot, urdf, args.part, args.parts or _PARTS, licence)
+        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, licence)
     written = write_checked(robot, args)
     if part is None:
         return written

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from morphgen.errors import FormatError
 if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
     from morphgen.grammar.library import Library
+    from morphgen.grammar.syntax import Expression
 
 NUMBER = number("-n", "number of robots", default=10)
 
@@ -40,15 +42,12 @@ NUMBER = number("-n", "number of robots", default=10)
 )
 def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
-    from morphgen.grammar.conditions import require_condition
     from morphgen.grammar.grammar_file import grammar_text
     from morphgen.grammar.robot_set import SetConfig, SetWorker, make_serially, make_set
-    from morphgen.grammar.syntax import parse_condition
     from morphgen.grammar.workers import make_in_processes, make_on_ray
 
     grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
-    for text in args.where:
-        require_condition(parse_condition(text))
+    _conditions(args.where)
     folder = args.out or Path("robots") / grammar.name
     config = SetConfig(
         folder,
@@ -121,7 +120,7 @@ def derive(args: argparse.Namespace) -> int:
     ),
     NUMBER,
     opt.SEED,
-    path_option("--out", "DIR", "output folder (default: SET-mutants)"),
+    path_option("--out", "DIR", "output folder (default: SET-mutants-SEED)"),
     opt.NO_PICTURE,
     *opt.LIBRARY_JSON,
     examples=("mutate robots/chain/chain-000001 -n 20",),
@@ -145,12 +144,18 @@ def mutate(args: argparse.Namespace) -> None:
     records = {record["name"]: record for record in read_index(folder)}
     if name not in records:
         raise FormatError(f"{name!r} is not in the index of {folder}")
-    grammar = grammar_from_text(
-        read_text(folder / GRAMMAR, MAX_TEXT), read_settings(folder)["grammar"]
-    )
-    origin, out = _derivation(args.robot), args.out or folder.parent / f"{folder.name}-mutants"
+    settings = read_settings(folder)
+    grammar = grammar_from_text(read_text(folder / GRAMMAR, MAX_TEXT), settings["grammar"])
+    origin = _derivation(args.robot)
+    out = args.out or folder.parent / f"{folder.name}-mutants-{args.seed}"
     neighbours = mutate(
-        grammar, opt.library_of(args), records[name]["choices"], args.n, seed=args.seed, name=name
+        grammar,
+        opt.library_of(args),
+        records[name]["choices"],
+        args.n,
+        seed=args.seed,
+        name=name,
+        where=_conditions(settings["where"]),
     )
     changes: dict[str, Any] = {}
     for neighbour in track(neighbours, args, "sampling", "robot", args.n):
@@ -164,6 +169,17 @@ def mutate(args: argparse.Namespace) -> None:
         changes,
         lambda: "\n".join(f"{path}: {'; '.join(lines)}" for path, lines in changes.items()),
     )
+
+
+def _conditions(texts: Sequence[str]) -> list[Expression]:
+    """Return the conditions that texts such as ``reach > 0.4`` contain."""
+    from morphgen.grammar.conditions import require_condition
+    from morphgen.grammar.syntax import parse_condition
+
+    conditions = [parse_condition(text) for text in texts]
+    for condition in conditions:
+        require_condition(condition)
+    return conditions
 
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:

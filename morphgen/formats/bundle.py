@@ -36,6 +36,10 @@ PICTURE = "preview.png"
 MESHES = "meshes"
 XACRO = ".xacro"
 
+EXPORTS = ("srdf", "glb", "html", "mp4", "gif")
+"""Formats of ``morphgen export`` whose file is written into the bundle, as ``robot.<format>``."""
+_REPLACED = {CARD, PICTURE, *(f"robot.{name}" for name in EXPORTS)}
+"""Files that a new bundle replaces although no hash shows whether they were edited."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
 
 
@@ -54,17 +58,40 @@ def bundle_folder(parent: Path, name: str) -> Path:
 
 
 def require_replaceable(folder: Path) -> None:
-    """Require that a folder does not exist or is a bundle, so that a bundle may replace it.
+    """Require that a folder does not exist or is an unedited bundle, so that one may replace it.
+
+    The card, the picture and exported files may differ from those that were written.
 
     Raises:
-        FormatError: If it is something else.
+        FormatError: If it is something else, or has a file that was changed or added since.
     """
-    if folder.exists() and not (folder / CARD).is_file():
+    if folder.is_symlink():
+        raise FormatError(f"{folder} is a link; choose another name or folder")
+    if not folder.exists():
+        return
+    if not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is not a bundle (no {CARD}); choose another name")
+    hashes = _card_hashes(folder)
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if name in _REPLACED or (path.is_dir() and not path.is_symlink()):
+            continue
+        digest = file_sha256(path) if path.is_file() else ""
+        if hashes.get(name) != digest:
+            why = "was changed since" if name in hashes else "is not of the bundle"
+            raise FormatError(
+                f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
+                "name or folder"
+            )
 
 
 def write_bundle(
-    robot: Robot, folder: Path, findings: Iterable[Finding] = (), *, picture: bool = True
+    robot: Robot,
+    folder: Path,
+    findings: Iterable[Finding] = (),
+    *,
+    picture: bool = True,
+    edits_kept: bool = True,
 ) -> Path:
     """Write a robot's bundle atomically.
 
@@ -73,15 +100,17 @@ def write_bundle(
         folder: The folder to write; an existing bundle is replaced.
         findings: Findings of the checks, for the card.
         picture: Whether to draw ``preview.png``.
+        edits_kept: Whether to refuse to replace a bundle that was edited.
 
     Returns:
         ``folder``.
 
     Raises:
-        FormatError: If the folder cannot be written, or exists and is not a bundle.
+        FormatError: If the folder cannot be written, or exists and is no unedited bundle.
         MissingDependencyError: If a picture is wanted and nothing can draw it.
     """
-    require_replaceable(folder)
+    if edits_kept:
+        require_replaceable(folder)
     robot = split_colours(robot)
     with replacing_folder(folder) as partial:
         files = write_meshes(robot, partial / MESHES)
@@ -137,6 +166,14 @@ def _read_card(folder: Path) -> dict[str, Any]:
     return card
 
 
+def _card_hashes(folder: Path) -> dict[str, object]:
+    """Return the SHA-256 of every file of a bundle but the card and the picture, by its path."""
+    hashes = _read_card(folder).get("hashes")
+    if not isinstance(hashes, dict):
+        raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
+    return hashes
+
+
 def file_findings(folder: Path) -> tuple[Finding, ...]:
     """Return findings about files of a bundle that are missing or differ from the card's hashes.
 
@@ -144,10 +181,7 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
         FormatError: If the folder has no readable card.
     """
     findings = []
-    hashes = _read_card(folder).get("hashes")
-    if not isinstance(hashes, dict):
-        raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
-    for name, expected in hashes.items():
+    for name, expected in _card_hashes(folder).items():
         path = folder / name
         try:
             is_inside = path.resolve().is_relative_to(folder.resolve())

@@ -216,6 +216,9 @@ def read_settings(folder: Path) -> Record:
         raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
     if not isinstance(settings, dict) or not isinstance(settings.get("grammar"), str):
         raise FormatError(f"{path}: expected the settings of a set, with the name of its grammar")
+    where = settings.get("where")
+    if not isinstance(where, list) or not all(isinstance(text, str) for text in where):
+        raise FormatError(f"{path}: where: expected a list of conditions, not {where!r}")
     return settings
 
 

@@ -122,7 +122,14 @@ def sample_robot(
 
 
 def mutate(
-    grammar: Grammar, library: Library, choices: Choices, n: int, *, seed: int = 0, name: str
+    grammar: Grammar,
+    library: Library,
+    choices: Choices,
+    n: int,
+    *,
+    seed: int = 0,
+    name: str,
+    where: Sequence[Expression] = (),
 ) -> Iterator[Sample]:
     """Draw neighbours of a robot: each has one of its random choices drawn again.
 
@@ -136,6 +143,7 @@ def mutate(
         n: Number of neighbours.
         seed: Seed; neighbour i does not depend on n.
         name: Name of the robot; its neighbours are called ``<name>-m0000`` and so on.
+        where: Conditions in addition to the grammar's own.
 
     Raises:
         GrammarError: If the robot has no random choices.
@@ -149,6 +157,7 @@ def mutate(
         partial(_with_one_redrawn, choices=choices),
         grammar,
         library,
+        (*grammar.wheres, *where),
         n,
         seed,
         f"{name}-m",
@@ -192,6 +201,7 @@ def cross(
         partial(_with_mixed_choices, parents=parents),
         grammar,
         library,
+        grammar.wheres,
         n,
         seed,
         f"{name}-x",
@@ -209,6 +219,7 @@ def _others(
     choosers_of: Callable[[np.random.Generator], Iterator[RecordedChooser]],
     grammar: Grammar,
     library: Library,
+    where: Sequence[Expression],
     n: int,
     seed: int,
     prefix: str,
@@ -221,6 +232,7 @@ def _others(
         choosers_of: Returns endless choosers that draw with a generator.
         grammar: The grammar.
         library: Library of the grammar's parts.
+        where: Conditions of the robots.
         n: Number of robots.
         seed: Seed.
         prefix: Names of the robots without their number.
@@ -234,7 +246,7 @@ def _others(
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
         choosers = islice(choosers_of(rng), MAX_ATTEMPTS)
         result = _first_valid(
-            choosers, grammar, library, grammar.wheres, f"{prefix}{index:04d}", index, origins
+            choosers, grammar, library, where, f"{prefix}{index:04d}", index, origins
         )
         if not isinstance(result, Sample):
             raise SamplingError(

@@ -301,13 +301,36 @@ def test_mutate_writes_neighbours_and_prints_their_changes(run, cubes):
     assert code == 0
     for index, line in enumerate(out.splitlines()):
         folder, what = line.split(": ")
-        assert folder.endswith(f"set-mutants/cubes-000002-m{index:04d}")
+        assert folder.endswith(f"set-mutants-1/cubes-000002-m{index:04d}")
         assert what.startswith("- cubes.size = ")
         assert read_bundle(Path(folder)).dof == 2
     code, again, _ = run(*words, "--json", "--out", "other")
     assert [lines[0] + "; " + lines[1] for lines in json.loads(again).values()] == [
         line.split(": ")[1] for line in out.splitlines()
     ]
+
+
+def test_neighbours_meet_the_conditions_of_the_set(run, tmp_path):
+    words = ("sample", "cubes", "-n", 1, "--light", "--where", "mass > 0.9", "--out", "set")
+    assert run(*words)[0] == 0
+    robot = "set/cubes-000000"
+    code, out, _ = run("mutate", robot, "-n", 8, "--no-picture", "--json")
+    assert code == 0
+    assert all(read_bundle(Path(folder)).mass > 0.9 for folder in json.loads(out))
+
+
+@pytest.mark.parametrize(
+    ("where", "refusal"),
+    [
+        (None, "set/set.json: where: expected a list of conditions, not None"),
+        ([1], "set/set.json: where: expected a list of conditions, not [1]"),
+        (["mas > 1"], "unknown property 'mas'"),
+    ],
+)
+def test_mutate_refuses_settings_with_other_conditions(refused, cubes, where, refusal):
+    settings = json.loads((cubes / "set.json").read_text())
+    (cubes / "set.json").write_text(json.dumps({**settings, "where": where}))
+    assert refusal in refused("mutate", cubes / "cubes-000002", "--no-picture")
 
 
 def test_mutate_rejects_robots_missing_from_the_index(refused, cubes):

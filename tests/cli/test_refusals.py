@@ -14,6 +14,7 @@ from helpers.parts import write_part
 from helpers.robots import arm
 from morphgen import cli
 from morphgen.cli.command import whole_number
+from morphgen.cli.export_formats import FORMATS, FileFormat
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar import library
@@ -194,6 +195,54 @@ def test_folder_that_is_not_a_bundle_is_never_replaced(refused, tmp_path):
     (tmp_path / "out" / "gantry-plane" / "thesis.txt").write_text("years of work")
     words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
     assert "out/gantry-plane exists and is not a bundle" in refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("file", "why"),
+    [
+        ("robot.urdf", "robot.urdf was changed since"),
+        ("robot.xml", "robot.xml was changed since"),
+        ("notes.md", "notes.md is not of the bundle"),
+        ("meshes/own.stl", "meshes/own.stl is not of the bundle"),
+    ],
+)
+def test_a_bundle_that_was_edited_is_never_replaced(refused, run, file, why):
+    words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
+    assert run(*words)[0] == 0
+    edited = Path("out/gantry-plane") / file
+    edited.parent.mkdir(exist_ok=True)
+    with edited.open("a") as stream:
+        stream.write("<!-- years of work -->")
+    assert f"out/gantry-plane is not replaced: {why}; move the folder away" in refused(*words)
+    assert "years of work" in edited.read_text()
+    fitted = ("fit", "base=gantry", "ee=plane", "--no-picture", "--out", "out/gantry-plane")
+    assert f"out/gantry-plane is not replaced: {why}" in refused(*fitted)
+
+
+def test_a_bundle_with_exported_files_is_replaced(run):
+    words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
+    assert run(*words)[0] == 0
+    for name, row in FORMATS.items():
+        if isinstance(row, FileFormat):
+            (Path("out/gantry-plane") / f"robot.{name}").touch()
+    (Path("out/gantry-plane/robot.urdf")).unlink()  # a damaged bundle is mended
+    assert run(*words)[0] == 0
+    assert {path.name for path in Path("out/gantry-plane").iterdir()} == {
+        "robot.urdf",
+        "robot.xml",
+        "card.json",
+    }
+
+
+def test_a_robot_is_never_imported_over_itself(refused, run):
+    words = ("compose", "base=gantry", "ee=plane", "--no-picture")
+    assert run(*words)[0] == 0
+    card = Path("robots/gantry-plane/card.json")
+    before = card.read_bytes()
+    for name in ("robot.urdf", "robot.xml"):
+        refusal = refused("import", card.with_name(name), "--name", "gantry-plane", "--no-picture")
+        assert f"robots/gantry-plane/{name}: its bundle would replace robots/gantry" in refusal
+    assert card.read_bytes() == before
 
 
 def interrupt(*_):
