@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option, whole_number
-from morphgen.cli.progress import track
 from morphgen.errors import FormatError, one_line
 
 if TYPE_CHECKING:
@@ -31,27 +30,33 @@ SEVERITIES = ("error", "warning", "info")
     flag("--strict", "fail on warnings, too"),
     path_option("--fix", "DIR", "make the safe repairs and write bundles to DIR"),
     *opt.ROOT_LIBRARY_JSON,
-    details="The exit code is 1 if there is an error, or a warning with --strict.",
+    details="The exit code is 1 if there is an error, or a warning with --strict; and 2 if a robot "
+    "cannot be read, which does not stop the others.",
     examples=("check my_arm.urdf", "check robots/ --strict", "check my_arm.urdf --fix repaired"),
 )
 def check(args: argparse.Namespace) -> int:
     """Check every robot and print the findings."""
-    library, sources = opt.library_of(args), opt.sources_of(args)
     written: dict[Path, str] = {}
-    results = [
-        (source.label, *_findings(source, library, args, written))
-        for source in track(sources, args, "checking", "robot", len(sources))
-    ]
+    results, refused = opt.for_each_robot(
+        args, "checking", lambda source, library: _findings(source, library, args, written)
+    )
     data = {
         label: {
             "findings": [finding.as_dict() for finding in findings],
             "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
         }
-        for label, findings, repaired in results
+        for label, (findings, repaired) in results.items()
     }
-    opt.print_result(args, data, lambda: "\n".join(_text(*result) for result in results))
+    opt.print_result(
+        args,
+        data | refused,
+        lambda: "\n".join(_text(label, *result) for label, result in results.items()),
+    )
+    if refused:
+        return 2
     failing = SEVERITIES[:2] if args.strict else SEVERITIES[:1]
-    return int(any(each.severity in failing for _, findings, _ in results for each in findings))
+    found = (each for findings, _ in results.values() for each in findings)
+    return int(any(each.severity in failing for each in found))
 
 
 def _findings(
@@ -127,23 +132,25 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
     details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio; they are "
     "compared in joints, limits, mimic joints, damping, gains, mass and tool pose. A robot then "
     "holds its home for 5 s, with its files and in environments of MuJoCo and PyBullet. The exit "
-    "code is 1 if a loader disagrees or a joint drifts more than 0.02 rad or m.",
+    "code is 1 if a loader disagrees or a joint drifts more than 0.02 rad or m; and 2 if a robot "
+    "cannot be read, which does not stop the others.",
     examples=("conform ur5-plane", "conform robots/ --samples 1000"),
 )
 def conform(args: argparse.Namespace) -> int:
     """Print a row per robot and loader, one per simulator, and the pairs that penetrate at home."""
     from morphgen.api.checks import conform_source
 
-    library, sources = opt.library_of(args), opt.sources_of(args)
-    reports = {
-        source.label: conform_source(
+    reports, refused = opt.for_each_robot(
+        args,
+        "loading",
+        lambda source, library: conform_source(
             source, library, args.root, samples=args.samples, seed=args.seed
-        )
-        for source in track(sources, args, "loading", "robot", len(sources))
-    }
+        ),
+    )
     data = [asdict(report) for report in reports.values()]
-    opt.print_result(args, data, lambda: _conformance_text(reports))
-    return int(not all(report.passed for report in reports.values()))
+    refusals = [{"robot": label, **error} for label, error in refused.items()]
+    opt.print_result(args, [*data, *refusals], lambda: _conformance_text(reports))
+    return 2 if refused else int(not all(report.passed for report in reports.values()))
 
 
 def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:

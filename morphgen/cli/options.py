@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from morphgen.model.robot import Robot
     from morphgen.tasks.task import TaskConfig
 
+T = TypeVar("T")
 
 ROBOT_HELP = (
     "a bundle's folder, a URDF, xacro or MJCF, parts such as ur5-plane, or words of morphgen "
@@ -115,8 +117,9 @@ def with_goal(
 
 
 def print_result(args: argparse.Namespace, data: object, text: Callable[[], str]) -> None:
-    """Print data as JSON if ``--json`` is given, else text."""
-    print(json.dumps(data, default=str) if args.json else text())
+    """Print data as JSON if ``--json`` is given, else text unless it is empty."""
+    if shown := json.dumps(data, default=str) if args.json else text():
+        print(shown)
 
 
 def library_of(args: argparse.Namespace) -> Library:
@@ -157,6 +160,42 @@ def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
         (source, read_source(source, library, args.root))
         for source in track(sources, args, "reading", "robot", len(sources))
     ]
+
+
+def for_each_robot(
+    args: argparse.Namespace, verb: str, work: Callable[[RobotSource, Library], T]
+) -> tuple[dict[str, T], dict[str, dict[str, str]]]:
+    """Do something with every robot that the arguments name; a refused one does not stop others.
+
+    Args:
+        args: The arguments.
+        verb: What is done, for the progress, such as ``checking``.
+        work: Called with a robot's source and the library of parts.
+
+    Returns:
+        The results by the label of the source, and the class and message of the errors by the
+        label of those that failed, which are printed. With any of these, the exit code is 2.
+
+    Raises:
+        MorphgenError: As ``sources_of``; or the error of ``work`` if there is one robot only.
+    """
+    from morphgen.cli.progress import track
+
+    library, sources = library_of(args), sources_of(args)
+    results: dict[str, T] = {}
+    refused: dict[str, dict[str, str]] = {}
+    for source in track(sources, args, verb, "robot", len(sources)):
+        try:
+            results[source.label] = work(source, library)
+        except MorphgenError as error:
+            if len(sources) == 1:
+                raise
+            reason = one_line(str(error))
+            if source.label not in reason:
+                reason = f"{source.label}: {reason}"
+            print(f"morphgen: {reason}", file=sys.stderr)
+            refused[source.label] = {"error": type(error).__name__, "message": reason}
+    return results, refused
 
 
 def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:

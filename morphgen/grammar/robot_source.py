@@ -122,7 +122,12 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
     """
     path = source.path
     if path is None:
-        derivation, name = parse_words(source.words, library)
+        try:
+            derivation, name = parse_words(source.words, library)
+        except CompositionError as error:
+            if "=" not in source.label and Path(source.label).exists():
+                raise _no_robot(Path(source.label)) from error
+            raise
         return compose(derivation, library, name)
     if light := light_derivation(path):
         return compose(light, library, path.resolve().name)
@@ -176,10 +181,11 @@ def is_set_folder(folder: Path) -> bool:
 def is_robot_file(text: str) -> bool:
     """Return whether a text names robots on disk rather than parts or a grammar.
 
-    A folder without robots does not hide a grammar or a part of the same name.
+    A folder without robots, or a file without a suffix, does not hide a grammar or a part of the
+    same name.
     """
     path = Path(text)
-    is_description = text.endswith(SUFFIXES) and path.is_file()
+    is_description = path.suffix not in ("", GRAMMAR_SUFFIX) and path.is_file()
     if is_description or (path.is_dir() and holds_robots(path)):
         return True
     if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
@@ -213,11 +219,18 @@ def _file_sources(path: Path) -> list[RobotSource]:
         raise FormatError(f"{path}: no such file or folder")
     robots = [path] if path.is_file() else list(robots_in(path))
     if not robots:
-        raise FormatError(
-            f"{path} holds no robot; expected a bundle, a URDF, a set of morphgen sample, or a "
-            "folder of bundles"
-        )
+        raise _no_robot(path)
     return [RobotSource(str(robot), robot) for robot in robots]
+
+
+def _no_robot(path: Path) -> FormatError:
+    """Return the error for a path that exists and is no robot."""
+    files = sorted(path.iterdir()) if path.is_dir() else ()
+    inside = next((file for file in files if file.name.endswith(SUFFIXES)), None)
+    return FormatError(
+        f"{path} holds no robot; expected a bundle, a URDF, a set of morphgen sample, or a "
+        "folder of bundles" + (f"; did you mean {inside}?" if inside else "")
+    )
 
 
 def _request_source(words: Sequence[str]) -> RobotSource:

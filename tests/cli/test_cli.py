@@ -134,6 +134,42 @@ def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
     assert "axis-not-unit" in run("check", path)[1]
 
 
+@pytest.mark.parametrize("command", ["check", "conform"])
+def test_a_robot_that_cannot_be_read_does_not_stop_others(run, command):
+    Path("broken.urdf").write_text("<robot\n")
+    words = (command, "broken.urdf", "gantry-plane", "gantri-plane")
+    code, out, err = run(*words)
+    assert (code, "gantry-plane" in out) == (2, True)
+    first, second = err.splitlines()
+    assert first.startswith("morphgen: broken.urdf:2:1: ")
+    assert second.startswith("morphgen: robot 'gantri-plane': ")
+    code, out, again = run(*words, "--json")
+    assert (code, again) == (2, err)
+    data = json.loads(out)
+    rows = data if command == "conform" else [{"robot": k, **row} for k, row in data.items()]
+    assert [row["robot"] for row in rows] == ["gantry-plane", "broken.urdf", "gantri-plane"]
+    assert [row.get("error") for row in rows] == [None, "FormatError", "CompositionError"]
+    assert f"morphgen: {rows[1]['message']}" == first
+
+
+def test_a_file_of_any_suffix_is_a_robot(run):
+    assert run("compose", "base=gantry", "ee=plane", "--no-picture")[0] == 0
+    Path("robots/gantry-plane/robot.xml").rename("gantry.mjcf")
+    code, out, _ = run("check", "gantry.mjcf")
+    assert (code, out.splitlines()[0][:13]) == (0, "gantry.mjcf: ")
+
+
+def test_files_and_folders_without_a_robot_are_named(refused, run):
+    Path("plane").mkdir()
+    Path("notes").touch()
+    Path("arms").mkdir()
+    Path("arms/my_arm.urdf").touch()
+    assert run("check", "plane")[0] == 0  # the part
+    assert refused("check", "notes").startswith("morphgen: notes holds no robot; expected a bundle")
+    assert refused("check", "arms").endswith("; did you mean arms/my_arm.urdf?\n")
+
+
+
 def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):
     for name in ("a.urdf", "b.urdf"):
         (tmp_path / name).write_text(urdf_text(replace(valid_robot(), frames=()), str))
