@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -58,6 +59,7 @@ SETTINGS = {
 }
 """Arguments of ``coacd.run_coacd``: its default concavity, and a coarser search than its default,
 which takes a fifth of the time on the UR5. A piece has at most 64 vertices."""
+_LOGGER = logging.getLogger(__name__)
 _CACHE_DIR = "convex-1"
 """Folder in the user's cache; the number rises when the same mesh gets other pieces."""
 _PIECE = "piece-{:02d}.stl"
@@ -98,6 +100,13 @@ def as_convex(
     cache = user_cache_path("morphgen") / _CACHE_DIR / version("coacd")
     folder_of = {mesh: cache / shapes_key([Shape(mesh)]) for mesh in meshes}
     missing = [mesh for mesh in meshes if not folder_of[mesh].is_dir()]
+    if missing:
+        _LOGGER.warning(
+            "cutting %d meshes of robot %r into convex pieces, seconds to minutes for each; the "
+            "pieces are kept",
+            len(missing),
+            robot.name,
+        )
     for done, mesh in enumerate(missing):
         progress(done, len(missing))
         _write_pieces(decompose(mesh), folder_of[mesh])

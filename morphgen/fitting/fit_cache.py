@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,7 +59,7 @@ def fit_and_keep(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> dict[str, StoredFit]:
-    """Fit primitives to links, say so, and keep the fits in the cache; warn if that fails.
+    """Fit primitives to links, say so, and keep the fits in the cache.
 
     Args:
         robot: The robot.
@@ -95,12 +95,21 @@ def fit_and_keep(
     for name, fit in fits.items():
         shapes = robot.link(name).collisions
         key = shapes_key(shapes)
-        path = _path(kind, key)
-        try:
-            write_cache_file(path, fits_text({key: fit.scaled(1 / shapes_scale(shapes))}))
-        except OSError as error:
-            warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=2)
+        keep(_path(kind, key), fits_text({key: fit.scaled(1 / shapes_scale(shapes))}))
     return fits
+
+
+def keep(path: Path, text: str) -> None:
+    """Write a file of the cache; if that fails, say so once for its folder."""
+    try:
+        write_cache_file(path, text)
+    except OSError as error:
+        _warn_of(path.parent, error.strerror)
+
+
+@cache
+def _warn_of(folder: Path, reason: str | None) -> None:
+    _LOGGER.warning("cannot keep fits in %s: %s; they are made again each time", folder, reason)
 
 
 def _path(kind: str, key: str) -> Path:

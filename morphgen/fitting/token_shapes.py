@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import warnings
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +13,8 @@ from platformdirs import user_cache_path
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.composite import fit_composite
+from morphgen.fitting.fit_cache import keep
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import write_cache_file
 from morphgen.formats.fits import (
     ShapeRecord,
     are_primitives,
@@ -32,6 +32,7 @@ from morphgen.model.inertia import union_integrals
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
 
+_LOGGER = logging.getLogger(__name__)
 _CACHE_DIR = "tokens-4"
 """Folder in the user's cache; the number rises when the same shapes get another primitive."""
 DOMINANT_SHARE = 0.95
@@ -86,6 +87,13 @@ def token_shapes(
             else:
                 primitives[link.name] = None  # keeps the order of the links
                 missing.append((link.name, shapes, path))
+    if num_meshes := sum(not are_primitives(shapes) for _, shapes, _ in missing):
+        _LOGGER.warning(
+            "fitting the primitives of tokens to %d links of robot %r, a second or more for each; "
+            "they are kept",
+            num_meshes,
+            robot.name,
+        )
     for done, (name, shapes, path) in enumerate(missing):
         progress(done, len(missing))
         primitives[name] = fit_primitive(shapes)
@@ -138,7 +146,4 @@ def _read_cached(path: Path, scale: float) -> Shape | None:
 
 def _write_cached(path: Path, shape: Shape | None, scale: float) -> None:
     data = None if shape is None else shape_to_data(scale_shape(shape, 1 / scale))
-    try:
-        write_cache_file(path, json.dumps(data))
-    except OSError as error:
-        warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)
+    keep(path, json.dumps(data))
