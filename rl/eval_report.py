@@ -14,7 +14,7 @@ import numpy as np
 from tabulate import tabulate
 
 from morphgen.errors import TaskError, nearest
-from morphgen.formats.files import write_file
+from morphgen.formats.files import require_writable_file, write_file
 from morphgen.rl.scores import Score, scores_to_json
 
 SIDES = {"train": "MT", "test": "ZS"}
@@ -55,14 +55,14 @@ def require_table(path: Path) -> None:
     """Require that a table can be written to a path.
 
     Raises:
-        TaskError: If its suffix is unknown, or its folder is missing.
+        TaskError: If its suffix is unknown.
+        FormatError: If its folder is missing or cannot be written.
     """
     if path.suffix not in SUFFIXES:
         raise TaskError(
             f"{path}: no name of a table ends in {path.suffix!r}{nearest(path.suffix, SUFFIXES)}"
         )
-    if not path.parent.is_dir():
-        raise TaskError(f"{path}: there is no folder {path.parent}")
+    require_writable_file(path)
 
 
 def write_scores(path: Path, scores_by_mode: Scores) -> None:

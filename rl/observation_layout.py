@@ -129,7 +129,10 @@ def require_layout(stored: Layout, observed: Layout, what: str) -> None:
         f"{name} {theirs[name]}, here {ours[name]}" for name in ours if theirs[name] != ours[name]
     ]
     if wrong:
-        raise TaskError(f"{what} is for other observations: {'; '.join(wrong)}")
+        raise TaskError(
+            f"{what} is for other observations: {'; '.join(wrong)}; these depend on the task, its "
+            "goals and obstacles, and the observation channels"
+        )
 
 
 def last_link(observation: Observation) -> int:

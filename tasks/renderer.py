@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FormatError
-from morphgen.formats.files import replacing_file
+from morphgen.formats.files import replacing_file, require_writable_file
 from morphgen.formats.picture import gl_context
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.batch import TaskBatch
@@ -214,12 +214,11 @@ def require_video_path(path: Path) -> None:
     """Require that a video can be written to a path, before anything is rendered.
 
     Raises:
-        FormatError: If the suffix is not one of ``SUFFIXES``, or the folder does not exist.
+        FormatError: If the suffix is not one of ``SUFFIXES``, or as ``require_writable_file``.
     """
     if path.suffix not in SUFFIXES:
         raise FormatError(f"{path}: the name of a video ends in {' or '.join(SUFFIXES)}")
-    if not path.parent.is_dir():
-        raise FormatError(f"cannot write {path}: there is no folder {path.parent}")
+    require_writable_file(path)
 
 
 def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:

@@ -76,6 +76,7 @@ def plan_submission(
         TaskError: If the robots are not those of a split, or the test side is left out.
         BenchmarkError: If the evaluation does not follow the rules, or the name is invalid.
     """
+    from morphgen.formats.files import require_writable_file
     from morphgen.rl.robot_source import split_of
     from morphgen.rl.submission import SubmissionRecorder
     from morphgen.rl.submission_checks import require_rules
@@ -87,10 +88,7 @@ def plan_submission(
         raise TaskError(f"--submission: {source.name} is no split; name one with --split")
     if args.on == "train":
         raise TaskError("--submission: the test robots are needed; leave --on train out")
-    if not args.submission.parent.is_dir():
-        raise TaskError(f"{args.submission}: there is no folder {args.submission.parent}")
-    if args.submission.is_dir():
-        raise TaskError(f"{args.submission}: is a folder; expected the name of a file")
+    require_writable_file(args.submission, "--submission")
     split = split_of(source)
     rules = rules_of(args.words)
     goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)

@@ -248,21 +248,6 @@ def require_other_name(words: dict[str, str], split: str, word: str) -> None:
     words[split] = word
 
 
-def require_writable(name: str, path: Path | None) -> None:
-    """Require, before long work, that the file of an option can be written.
-
-    Args:
-        name: Name of the option.
-        path: The file; None if the option is not given.
-
-    Raises:
-        BenchmarkError: If it is a folder, or its folder does not exist.
-    """
-    if path is not None and (path.is_dir() or not path.parent.is_dir()):
-        why = "it is a folder" if path.is_dir() else f"there is no folder {path.parent}"
-        raise BenchmarkError(f"{name} {path}: {why}")
-
-
 def reject_idle(options: dict[str, Any], reason: str) -> None:
     """Raise if options are given that have no effect.
 

@@ -70,6 +70,8 @@ def similarity(args: argparse.Namespace) -> None:
 
 def _require_writable(args: argparse.Namespace) -> None:
     """Refuse files that cannot be written, before the long work."""
+    from morphgen.formats.files import require_writable_file
+
     for option_name, path in (
         ("--heatmap", args.heatmap),
         ("--map", args.map),
@@ -77,7 +79,8 @@ def _require_writable(args: argparse.Namespace) -> None:
     ):
         if path is not None and option_name != "--csv" and path.suffix.lower() != ".png":
             raise BenchmarkError(f"{option_name} {path}: expected a name that ends in .png")
-        opt.require_writable(option_name, path)
+        if path is not None:
+            require_writable_file(path, option_name)
     given = [path for path in (args.heatmap, args.map, args.csv) if path is not None]
     for path in given:
         if sum(other.resolve() == path.resolve() for other in given) > 1:

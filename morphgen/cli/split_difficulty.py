@@ -46,9 +46,10 @@ def difficulty(args: argparse.Namespace) -> None:
     """Measure the robots of splits, print a table per split and write the file."""
     from morphgen.benchmark.difficulty import split_difficulty
     from morphgen.benchmark.difficulty_table import difficulty_csv
-    from morphgen.formats.files import write_file
+    from morphgen.formats.files import require_writable_file, write_file
 
-    opt.require_writable("--csv", args.csv)
+    if args.csv is not None:
+        require_writable_file(args.csv, "--csv")
     splits = _splits(args.splits)
     results = _results(args.study, splits)
     library = opt.library_of(args)

@@ -78,6 +78,7 @@ def release(args: argparse.Namespace) -> None:
     from morphgen.benchmark.private_test import make_secret
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder_files import BuildSettings
+    from morphgen.formats.files import require_writable_folder
     from morphgen.tasks.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
     from morphgen.tasks.split_release import ReleaseRequest, release_split
 
@@ -85,6 +86,7 @@ def release(args: argparse.Namespace) -> None:
         raise BenchmarkError(
             "--private-test and --secret-file: a private test side needs both; give both or none"
         )
+    require_writable_folder(args.out)
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
     extra: dict[str, bytes] = {}

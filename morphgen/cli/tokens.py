@@ -44,7 +44,7 @@ def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
     from morphgen.benchmark.tokens import tokens, tokens_npz
     from morphgen.fitting.token_shapes import token_shapes
-    from morphgen.formats.files import write_file
+    from morphgen.formats.files import require_writable_file, write_file
 
     if not args.words:
         if not args.layout or args.out or args.max_links is not None:
@@ -53,6 +53,8 @@ def tokens(args: argparse.Namespace) -> None:
         return
     if args.out and args.out.suffix != ".npz":
         raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
+    if args.out:
+        require_writable_file(args.out, "--out")
     robots, folders = [robot for _, robot in opt.read_robots(args)], opt.library_of(args).folders
     if args.out and len(robots) > 1:
         raise BenchmarkError(f"--out {args.out}: {len(robots)} robots are named; expected one")

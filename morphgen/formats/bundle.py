@@ -17,7 +17,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
-from morphgen.formats.files import file_sha256, replacing_folder
+from morphgen.formats.files import file_sha256, replacing_folder, require_writable_folder
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
@@ -63,11 +63,13 @@ def require_replaceable(folder: Path) -> None:
     The card, the picture and exported files may differ from those that were written.
 
     Raises:
-        FormatError: If it is something else, or has a file that was changed or added since.
+        FormatError: If it is something else, has a file that was changed or added since, or cannot
+            be created.
     """
     if folder.is_symlink():
         raise FormatError(f"{folder} is a link; choose another name or folder")
     if not folder.exists():
+        require_writable_folder(folder.parent)
         return
     if not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is not a bundle (no {CARD}); choose another name")

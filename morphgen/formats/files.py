@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -25,6 +26,40 @@ def file_sha256(path: Path) -> str:
     """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def require_writable_file(path: Path, name: str = "") -> None:
+    """Require, before long work, that a file can be written.
+
+    Args:
+        path: The file.
+        name: Name of the option that it is the value of, for the message.
+
+    Raises:
+        FormatError: If it is a folder, or its folder does not exist or cannot be written.
+    """
+    if path.is_dir():
+        why = "it is a folder"
+    elif not path.parent.is_dir():
+        why = f"there is no folder {path.parent}"
+    elif not os.access(path.parent, os.W_OK):
+        why = f"folder {path.parent} cannot be written"
+    else:
+        return
+    raise FormatError(f"{name} {path}: {why}".lstrip())
+
+
+def require_writable_folder(folder: Path) -> None:
+    """Require, before long work, that a folder can be written, or created with its parents.
+
+    Raises:
+        FormatError: If it cannot.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise FormatError(f"cannot write to {folder}: {existing} is a file")
+    if not os.access(existing, os.W_OK):
+        raise FormatError(f"cannot write to {folder}: {existing} cannot be written")
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

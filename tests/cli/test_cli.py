@@ -1,6 +1,7 @@
 """Output and files of the basic commands; repeated commands write identical bytes."""
 
 import json
+import os
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -159,6 +160,24 @@ def test_a_file_of_any_suffix_is_a_robot(run):
     assert (code, out.splitlines()[0][:13]) == (0, "gantry.mjcf: ")
 
 
+def test_places_that_cannot_be_written_are_refused_before_the_work(refused, monkeypatch):
+    Path("file").touch()
+    Path("folder.csv").mkdir()
+    Path("folder.npz").mkdir()
+    for words, why in (
+        ("fit plane --out file/made", "cannot write to file: file is a file"),
+        ("tokens plane --out folder.npz", "--out folder.npz: it is a folder"),
+        ("eval ik --split interpolation/arm3/reach --out folder.csv", "folder.csv: it is a folder"),
+        ("split release interpolation/arm3/reach --out file", "cannot write to file: file is a f"),
+    ):
+        assert why in refused(*words.split())
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
+    assert "--csv a.csv: folder . cannot be written" in refused(
+        "similarity", "plane", "--csv", "a.csv"
+    )
+    assert "cannot write to out: " in refused("fit", "plane", "--out", "out/made")
+
+
 def test_files_and_folders_without_a_robot_are_named(refused, run):
     Path("plane").mkdir()
     Path("notes").touch()
@@ -167,7 +186,6 @@ def test_files_and_folders_without_a_robot_are_named(refused, run):
     assert run("check", "plane")[0] == 0  # the part
     assert refused("check", "notes").startswith("morphgen: notes holds no robot; expected a bundle")
     assert refused("check", "arms").endswith("; did you mean arms/my_arm.urdf?\n")
-
 
 
 def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):

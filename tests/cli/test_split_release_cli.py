@@ -198,7 +198,7 @@ def test_submission_options_are_refused_where_they_do_nothing(refused, small):
     assert "there is no folder none" in refused(*words)
     words = ("eval", "zero", "--split", small, "--submission")
     Path("folder").mkdir()
-    assert "folder: is a folder" in refused(*words, "folder")
+    assert "--submission folder: it is a folder" in refused(*words, "folder")
     for name, why in (("", "length >= 1"), ("a\nb", "printable"), ("a" * 201, "length <= 200")):
         assert why in refused(*words, "a.json", "--method", name)
 
