@@ -42,7 +42,17 @@ def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
 
 
 def failure(name: str, error: Exception) -> Entry:
-    """Return the result of an examination that raised an error."""
+    """Return the result of an examination that raised an error.
+
+    Raises:
+        KeyboardInterrupt: If a package made the error of a Ctrl-C, as some do while they are
+            imported.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause
+        cause = cause.__cause__ or cause.__context__
     text = missing_extra(error)
     if text is not None:
         return Entry(name, "absent", text)

@@ -245,3 +245,14 @@ def test_without_its_robot_the_self_test_stops(monkeypatch):
     monkeypatch.setattr(reference, "reference_robot", lambda library: broken())
     (entry,) = self_test.entries()
     assert (entry.name, entry.status) == ("compose", "error")
+
+
+def test_an_error_that_a_package_made_of_ctrl_c_ends_the_diagnosis():
+    def examine():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as interrupt:
+            raise ImportError("cannot load the library") from interrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        attempt("package", examine)
