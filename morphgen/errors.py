@@ -81,7 +81,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     choices = sorted(valid)
     if len(name) > _MAX_COMPARED:
         return f"; {len(choices)} are valid"
-    close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    close = [choice for choice in choices if choice.lower() == name.lower()]
+    close = close or difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
     if len(choices) > _MAX_LISTED:
         listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))

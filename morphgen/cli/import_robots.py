@@ -152,13 +152,20 @@ def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict
     """Return the names of the bundles: those of the descriptions, without their suffixes.
 
     Raises:
-        FormatError: If several descriptions would have one name.
+        FormatError: If several descriptions would have one name, or one has no valid name.
     """
+    from morphgen.formats.bundle import bundle_folder
+
     names = {
         file: re.sub(r"\W", "_", description.path.stem, flags=re.ASCII)
         for file, description in found.items()
         if not isinstance(description, MorphgenError)
     }
+    for file, name in names.items():
+        try:
+            bundle_folder(Path(), name)
+        except FormatError as error:
+            raise FormatError(f"{file}: {error}; import it alone, with --name") from error
     for name, count in Counter(names.values()).items():
         if count > 1:
             files = [file for file, own in names.items() if own == name]

@@ -18,6 +18,7 @@ from morphgen.errors import FormatError
 if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
     from morphgen.grammar.library import Library
+    from morphgen.grammar.robot_source import RobotSource
     from morphgen.grammar.syntax import Expression
 
 NUMBER = number("-n", "number of robots", default=10)
@@ -80,31 +81,48 @@ def sample(args: argparse.Namespace) -> None:
 @command(
     "derive",
     "print, replay or compare the derivation of a robot",
-    option("robot", type=Path, metavar="ROBOT", help="folder of a bundle or of a light set"),
-    flag("--replay", "build the URDF anew; the exit code is 1 unless every byte is the same"),
-    path_option(
-        "--diff", "OTHER", "compare with another robot's; the exit code is 1 if they differ"
+    option(
+        "words",
+        nargs="+",
+        metavar="ROBOT",
+        help="folder of a bundle or of a robot of a light set, or words of morphgen compose",
+    ),
+    flag(
+        "--replay",
+        "build the URDF of a folder anew; the exit code is 1 unless every byte is the same",
+    ),
+    option(
+        "--diff",
+        metavar="OTHER",
+        help="compare with another robot's; the exit code is 1 if they differ",
     ),
     *opt.LIBRARY_JSON,
     details="The derivation lists the parts of a robot, its grammar's choices and all parameters.",
-    examples=("derive robots/chain/chain-000001 --replay",),
+    examples=("derive robots/chain/chain-000001 --replay", "derive ur5-plane --diff ur10-plane"),
 )
 def derive(args: argparse.Namespace) -> int:
     """Print, replay or compare a derivation."""
     from morphgen.formats.bundle import URDF
     from morphgen.grammar.derivation import difference, outline
+    from morphgen.grammar.robot_source import find_robot, find_robots
 
-    derivation = _derivation(args.robot)
+    library = opt.library_of(args)
+    source, *others = find_robots(args.words, library)
+    if others:
+        raise FormatError(f"{source.label} and {others[0].label}: expected one robot")
+    derivation = _derivation(source, library)
     if args.diff is not None:
-        lines = difference(derivation, _derivation(args.diff))
+        lines = difference(derivation, _derivation(find_robot(args.diff), library))
         opt.print_result(args, lines, lambda: "\n".join(lines) or "the same")
         return int(bool(lines))
     if not args.replay:
         opt.print_result(args, str(derivation), lambda: outline(derivation))
         return 0
-    path = args.robot / URDF
+    if source.path is None:
+        raise FormatError(f"--replay: {source.label} has no URDF yet; expected a robot's folder")
+    path = source.path / URDF
     with status(args, "composing"):
-        text = _replayed_urdf(args.robot, derivation, opt.library_of(args))
+        text = _replayed_urdf(source.path, derivation, library)
     same = text == path.read_text(encoding="utf-8")
     opt.print_result(
         args, {"same": same}, lambda: f"{path}: {'the same bytes' if same else 'other bytes'}"
@@ -146,7 +164,7 @@ def mutate(args: argparse.Namespace) -> None:
         raise FormatError(f"{name!r} is not in the index of {folder}")
     settings = read_settings(folder)
     grammar = grammar_from_text(read_text(folder / GRAMMAR, MAX_TEXT), settings["grammar"])
-    origin = _derivation(args.robot)
+    origin = _stored_derivation(args.robot)
     out = args.out or folder.parent / f"{folder.name}-mutants-{args.seed}"
     neighbours = mutate(
         grammar,
@@ -219,7 +237,15 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
         return (bundle / URDF).read_text(encoding="utf-8")
 
 
-def _derivation(folder: Path) -> Derivation:
+def _derivation(source: RobotSource, library: Library) -> Derivation:
+    from morphgen.grammar.request import parse_words
+
+    if source.path is None:
+        return parse_words(source.words, library)[0]
+    return _stored_derivation(source.path)
+
+
+def _stored_derivation(folder: Path) -> Derivation:
     from morphgen.formats.bundle import CARD
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import parse_derivation

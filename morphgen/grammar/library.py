@@ -33,7 +33,7 @@ class Library:
         for folder in self.folders:
             if not folder.is_dir():
                 raise PartError(f"library folder {folder} does not exist")
-            for path in sorted(folder.rglob("*.yaml")):
+            for path in sorted([*folder.rglob("*.yaml"), *folder.rglob("*.yml")]):
                 if paths.get(path.stem, path) != path:
                     raise PartError(f"part {path.stem!r} is in {paths[path.stem]} and in {path}")
                 paths[path.stem] = path

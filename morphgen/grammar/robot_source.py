@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TypeAlias, TypeGuard, cast
 from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import CompositionError, FormatError, nearest
-from morphgen.formats.bundle import CARD, read_robot
+from morphgen.formats.bundle import CARD, XACRO, read_robot
 from morphgen.formats.data_files import read_text
 from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
@@ -268,7 +268,13 @@ def import_robot(
     Raises:
         FormatError: If a file cannot be read, or names a link that the description does not have.
     """
-    robot = read_description(path, args, default_finder(root=root), root_link=root_link)
+    robot = read_description(
+        path,
+        args,
+        default_finder(root=root),
+        root_link=root_link,
+        written_frames=tool is None and path.suffix != XACRO,  # a tool is named by its link
+    )
     if srdf is not None:
         robot = with_disabled_pairs(robot, read_srdf(srdf), str(srdf))
     for option, link in (("root link", root_link), ("tool", tool)):
@@ -300,12 +306,18 @@ def _has_tool_link(robot: Robot) -> bool:
 def _with_tool(robot: Robot, link: str) -> Robot:
     """Return the robot with the frame of a link as its frame ``tool``.
 
-    A link ``tool`` becomes ``tool_link``: a bundle's URDF has a link for the frame itself.
+    A link ``tool`` becomes ``tool_link``, or the like: a bundle's URDF has a link for the frame
+    itself, and a joint ``tool_joint``.
     """
-    links = {TOOL: f"{TOOL}_link"} if TOOL in robot.link_index else {}
-    joint = f"{TOOL}_joint"
-    robot = rename(
-        robot, links, {joint: f"{TOOL}_link_joint"} if joint in robot.joint_index else {}
-    )
+    links = {TOOL: _free(f"{TOOL}_link", robot.link_index)} if TOOL in robot.link_index else {}
+    joint, new_joint = f"{TOOL}_joint", _free(f"{TOOL}_link_joint", robot.joint_index)
+    robot = rename(robot, links, {joint: new_joint} if joint in robot.joint_index else {})
     others = (frame for frame in robot.frames if frame.name != TOOL)
     return replace(robot, frames=(*others, Frame(TOOL, links.get(link, link))))
+
+
+def _free(name: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the given one, or with underscores appended."""
+    while name in taken:
+        name += "_"
+    return name

@@ -122,7 +122,10 @@ def test_all_where_conditions_hold(run):
         ("sample cubes --library nowhere", "nowhere does not exist"),
         ("grammar check cubse", "unknown grammar 'cubse'"),
         ("grammar count nowhere.grammar", "nowhere.grammar: no such file"),
-        ("derive nowhere", "nowhere: no such file or folder"),
+        ("derive nowhere", "robot 'nowhere': there is no such bundle or URDF, and 'nowhere' is"),
+        ("derive ./nowhere", "nowhere: no such file or folder"),
+        ("derive ur5-plane ur10-plane", "ur5-plane and ur10-plane: expected one robot"),
+        ("derive ur5-plane --replay", "--replay: ur5-plane has no URDF yet; expected a robot's"),
         ("mutate nowhere/robot", "nowhere/robot: no such file or folder"),
         ("mutate .", "is not in a set made by morphgen sample (no "),
         ("compose chain beads=9", "beads=9: expected 2 to 7"),
@@ -259,6 +262,13 @@ def test_derive_prints_one_line_per_part(run, cubes):
     assert (code, out.count("\n"), out.startswith("cubes=cubes(size=")) == (0, 1, True)
     text = json.loads(run("derive", cubes / "cubes-000001", "--json")[1])
     assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
+
+
+def test_derive_takes_words(run, cubes):
+    code, out, _ = run("derive", "arm=ur5", "ee=plane", "--diff", "ur10-plane")
+    assert (code, out) == (1, "- arm = ur5 on base:top\n+ arm = ur10 on base:top\n")
+    assert run("derive", "ur5-plane", "--diff", "arm=ur5 ee=plane")[:2] == (0, "the same\n")
+    assert run("derive", "cubes", "--diff", cubes / "cubes-000001")[0] == 1
 
 
 @pytest.mark.parametrize("geometry", ["primitive", "sphere"])

@@ -23,6 +23,41 @@ ARM = f"""<worldbody>
 BALL = '<worldbody><body><joint type="ball"/><geom size="0.1"/></body></worldbody>'
 
 
+def test_the_urdf_of_a_bundle_is_imported_with_its_frames(run, tmp_path):
+    assert run("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "a")[0] == 0
+    for name, before in (("b", "a/gantry-plane"), ("c", "b/gantry-plane")):
+        words = ("import", f"{before}/robot.urdf", "--no-picture", "--out", name)
+        assert run(*words)[0] == 0
+    composed, again = (morphgen.read(tmp_path / name / "gantry-plane") for name in "ac")
+    assert [frame.name for frame in again.frames] == ["tool"]
+    assert [link.name for link in again.links] == [link.name for link in composed.links]
+
+
+def test_a_tool_link_is_renamed_even_if_its_new_name_is_taken(run, tmp_path):
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "tool_link", "tool"))
+    joints = "".join(
+        f'<joint name="{name}" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/></joint>'
+        for name, parent, child in (
+            ("tool_link_joint", "base", "tool_link"),
+            ("tool_joint", "tool_link", "tool"),
+        )
+    )
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    assert run("import", "arm.urdf", "--no-picture")[0] == 0
+    robot = morphgen.read(tmp_path / "robots" / "arm")
+    assert [link.name for link in robot.links] == ["base", "tool_link", "tool_link_"]
+    assert [(frame.name, frame.link) for frame in robot.frames] == [("tool", "tool_link_")]
+
+
+def test_file_names_that_give_no_name_of_a_bundle_are_refused(refused, tmp_path):
+    for name in ("机器人.urdf", "b.urdf"):
+        (tmp_path / name).write_text('<robot name="a"><link name="base"/></robot>')
+    refusal = refused("import", "机器人.urdf", "b.urdf", "--no-picture")
+    assert "机器人.urdf: name '___': use letters" in refusal
+    assert refusal.endswith("import it alone, with --name\n")
+
+
 def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
     write(tmp_path, ARM, "my_arm.xml")
     words = ("import", "my_arm.xml", "--name", "my_arm", "--part", "arm", "--licence", "MIT")

@@ -127,6 +127,16 @@ def test_a_user_folder_adds_parts(tmp_path):
     assert "pincer" not in default_library().names()
 
 
+def test_parts_may_end_in_yml(tmp_path):
+    write_part(tmp_path).rename(tmp_path / "pincer.yml")
+    assert default_library([tmp_path]).manifest("pincer").kind == "ee"
+
+
+def test_a_name_in_other_case_is_suggested():
+    with pytest.raises(PartError, match="unknown arm 'UR5'; did you mean 'ur5'"):
+        default_library().manifest("UR5", "arm")
+
+
 def test_the_environment_variable_lists_folders_like_path(tmp_path, monkeypatch):
     write_part(tmp_path / "a", name="pincer_a")
     write_part(tmp_path / "b", name="pincer_b")
