@@ -18,7 +18,7 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
 from morphgen.rl.intervals import mean_interval
-from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of
+from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
 from morphgen.rl.scores import Score
@@ -165,6 +165,23 @@ def evaluate_checkpoints(
         return scores
     _require_same_interface(paths, [run for run, _ in trained])
     return _evaluate_together(trained, source, config, mode, device, progress, record)
+
+
+def require_trained_tasks(run: RunConfig, source: RobotSource, name: str) -> None:
+    """Require that a policy was trained on all tasks of robots.
+
+    Args:
+        run: Config of its training.
+        source: The robots.
+        name: Name of the policy, for the message.
+
+    Raises:
+        TaskError: If it was not.
+    """
+    trained = tasks_of(run.source)
+    for task in tasks_of(source):
+        if task not in trained:
+            raise TaskError(f"policy {name} was trained on {' and '.join(trained)}, not on {task}")
 
 
 def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:

@@ -6,11 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from morphgen.errors import TaskError
 from morphgen.rl.baselines import ZERO, baselines_for
-from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints
+from morphgen.rl.evaluation import (
+    EvalConfig,
+    evaluate_baseline,
+    evaluate_checkpoints,
+    require_trained_tasks,
+)
 from morphgen.rl.intervals import Interval, wilson_interval
-from morphgen.rl.robot_source import RobotSource, tasks_of
+from morphgen.rl.robot_source import RobotSource
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.scores import Score
 from morphgen.rl.shipped_policies import name_of
@@ -59,9 +63,7 @@ def zero_shot(
         MorphgenError: If the robot or simulator cannot be built.
     """
     task, name = str(source.task), name_of(policy)
-    trained = tasks_of(read_checkpoint(policy)[0].source)
-    if task not in trained:
-        raise TaskError(f"policy {name} was trained on {' and '.join(trained)}, not on {task}")
+    require_trained_tasks(read_checkpoint(policy)[0], source, name)
     (score,) = evaluate_checkpoints(
         [policy],
         source,

@@ -21,9 +21,6 @@ class SharedResults:
         self._results: OrderedDict[str, object] = OrderedDict()
         self._lock = threading.Lock()
 
-    def __contains__(self, key: str) -> bool:
-        return key in self._results
-
     def get(self, key: str, make: Callable[[], T]) -> T:
         """Return the result of a key.
 

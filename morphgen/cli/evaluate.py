@@ -153,6 +153,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         evaluate_checkpoints,
         evaluate_run,
         no_record,
+        require_trained_tasks,
     )
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint, read_config
@@ -176,6 +177,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         run = read_config(path)
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
     sources = _sources(args) if args.words else [run.source]
+    for source in sources:
+        require_trained_tasks(run, source, args.checkpoint)
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
     sides = _sides(args, has_test=bool(run.source.split))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -186,16 +187,16 @@ def _next_command(folder: Path, config: RunConfig) -> str:
     # Only the script that registered a task can play it.
     program = "morphgen"
     if source.task is not None and not TASKS.is_installed(source.task):
-        program = f"python {sys.argv[0]}"
+        program = f"python {shlex.quote(sys.argv[0])}"
     if source.grammars:
-        return f"score it: {program} eval {folder} --split SPLIT"
+        return f"score it: {program} eval {shlex.quote(str(folder))} --split SPLIT"
     if source.task is not None:
         words = [source.task, source.name, *["--obstacles"] * source.obstacles]
         words += ["--policy", str(folder), "--sim", config.sim]
         for library in source.library:
             words += ["--library", str(library)]
-        return f"watch it: {program} play {' '.join(words)} --out episode.mp4"
-    return f"score it: {program} eval {folder}"
+        return f"watch it: {program} play {shlex.join(words)} --out episode.mp4"
+    return f"score it: {program} eval {shlex.quote(str(folder))}"
 
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:

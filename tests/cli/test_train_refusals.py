@@ -65,6 +65,10 @@ pytestmark = pytest.mark.usefixtures("own_cache")
             "is one robot and not a split: it has no test robots",
         ),
         (("eval", "ik", "--out", "none/scores.csv"), "there is no folder none"),
+        (
+            ("eval", "zero-shot", "--split", "interpolation/arm3/push"),
+            "policy zero-shot was trained on reach, not on push",
+        ),
         (("eval", "nothing", "--goal-seed", "1"), "--goal-seed goes with --split"),
         (("finetune", "nothing", "--obstacles"), "--obstacles goes with --split"),
         (("eval", "scripted", "--split", "planar-cube", "task=reach"), "no robot is there to push"),
