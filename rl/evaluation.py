@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -167,19 +167,19 @@ def evaluate_checkpoints(
     return _evaluate_together(trained, source, config, mode, device, progress, record)
 
 
-def require_trained_tasks(run: RunConfig, source: RobotSource, name: str) -> None:
+def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: str) -> None:
     """Require that a policy was trained on all tasks of robots.
 
     Args:
         run: Config of its training.
-        source: The robots.
+        sources: The robots.
         name: Name of the policy, for the message.
 
     Raises:
         TaskError: If it was not.
     """
     trained = tasks_of(run.source)
-    for task in tasks_of(source):
+    for task in (task for source in sources for task in tasks_of(source)):
         if task not in trained:
             raise TaskError(f"policy {name} was trained on {' and '.join(trained)}, not on {task}")
 

@@ -63,7 +63,7 @@ def zero_shot(
         MorphgenError: If the robot or simulator cannot be built.
     """
     task, name = str(source.task), name_of(policy)
-    require_trained_tasks(read_checkpoint(policy)[0], source, name)
+    require_trained_tasks(read_checkpoint(policy)[0], [source], name)
     (score,) = evaluate_checkpoints(
         [policy],
         source,

@@ -177,8 +177,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         run = read_config(path)
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
     sources = _sources(args) if args.words else [run.source]
-    for source in sources:
-        require_trained_tasks(run, source, args.checkpoint)
+    require_trained_tasks(run, sources, args.checkpoint)
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
     sides = _sides(args, has_test=bool(run.source.split))
