@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from platformdirs import user_cache_path
 
 from morphgen.errors import FitError, FormatError
-from morphgen.formats.files import write_cache_file
-from morphgen.formats.fits import fits_text, read_fits, shapes_key, shapes_scale
+from morphgen.formats.fits import fits_text, keep_fit, read_fits, shapes_key, shapes_scale
 from morphgen.model.geometry import StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
 from morphgen.processes import Progress, no_progress
@@ -95,21 +93,8 @@ def fit_and_keep(
     for name, fit in fits.items():
         shapes = robot.link(name).collisions
         key = shapes_key(shapes)
-        keep(_path(kind, key), fits_text({key: fit.scaled(1 / shapes_scale(shapes))}))
+        keep_fit(_path(kind, key), fits_text({key: fit.scaled(1 / shapes_scale(shapes))}))
     return fits
-
-
-def keep(path: Path, text: str) -> None:
-    """Write a file of the cache; if that fails, say so once for its folder."""
-    try:
-        write_cache_file(path, text)
-    except OSError as error:
-        _warn_of(path.parent, error.strerror)
-
-
-@cache
-def _warn_of(folder: Path, reason: str | None) -> None:
-    _LOGGER.warning("cannot keep fits in %s: %s; they are made again each time", folder, reason)
 
 
 def _path(kind: str, key: str) -> Path:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +21,7 @@ from msgspec import Meta
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import file_sha256
+from morphgen.formats.files import file_sha256, write_cache_file
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.rounding import format_number
@@ -39,6 +40,7 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.robot import Link, Robot
 
+_LOGGER = logging.getLogger(__name__)
 SUFFIX = ".primitives.json"
 """Suffix of the file of fits beside a part's manifest."""
 FITS = "primitives.json"
@@ -287,3 +289,16 @@ def _digest(path: Path) -> str:
 def _digest_of(path: Path, stamp: tuple[int, int]) -> str:
     del stamp
     return file_sha256(path)
+
+
+def keep_fit(path: Path, text: str) -> None:
+    """Write a file of the user's cache of fits; if that fails, say so once for its folder."""
+    try:
+        write_cache_file(path, text)
+    except OSError as error:
+        _warn_of(path.parent, error.strerror)
+
+
+@cache
+def _warn_of(folder: Path, reason: str | None) -> None:
+    _LOGGER.warning("cannot keep fits in %s: %s; they are made again each time", folder, reason)

@@ -125,7 +125,7 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
         try:
             derivation, name = parse_words(source.words, library)
         except CompositionError as error:
-            if "=" not in source.label and Path(source.label).exists():
+            if source.words and "=" not in source.label and Path(source.label).exists():
                 raise _no_robot(Path(source.label)) from error
             raise
         return compose(derivation, library, name)

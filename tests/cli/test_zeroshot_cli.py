@@ -35,7 +35,11 @@ def test_shipped_policies_are_small_and_act_on_any_robot(name):
             ["zero-shot-pose", "ik", "jacobian", "random"],
             marks=pytest.mark.slow,
         ),
-        ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
+        pytest.param(
+            "--goal pose --obstacles",
+            ["zero-shot-pose-obstacles", "ik", "jacobian", "random"],
+            marks=pytest.mark.slow,
+        ),
         ("--task push", ["zero-shot-push", "scripted", "random"]),
     ],
 )
