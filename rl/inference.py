@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 
+from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import policy_from
 from morphgen.rl.observation_layout import (
@@ -22,6 +23,7 @@ from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.runs import policy_interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.device import require_device
 from morphgen.tasks.make import BatchOptions
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.task import TaskConfig
@@ -135,8 +137,12 @@ def load_policy(
         device: Device of the network.
 
     Raises:
-        TaskError: If the checkpoint is missing, damaged or of another version.
+        TaskError: If the checkpoint is missing, damaged or of another version, or the mode or
+            device is unknown.
     """
+    if mode not in MODES:
+        raise TaskError(f"unknown mode {mode!r}{nearest(str(mode), MODES)}")
+    require_device(device)
     run, learner = read_checkpoint(checkpoint_path(path))
     return Policy(learner, mode, seed, device, run.evaluation_tasks)
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
-from pathlib import Path
+from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
 
+from morphgen.arguments import truth, whole_number
 from morphgen.benchmark.split import Member, compose_member
 from morphgen.errors import TaskError
 from morphgen.fitting.replace_collision import as_primitives
-from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
@@ -35,8 +36,22 @@ class GoalConfig:
 
     seed: int = 0
     """Seed of all goals, the same in training and evaluation."""
-    tasks: tuple[TaskConfig, ...] = ()
+    tasks: Sequence[TaskConfig] = ()
     """Constants of tasks, at most one config of a type; other tasks have their defaults."""
+
+    def __post_init__(self) -> None:
+        """Check the types.
+
+        Raises:
+            TaskError: If the seed is no whole number, 0 or more, or a config is none of a task.
+        """
+        if not isinstance(self.tasks, Sequence):
+            raise TaskError(f"configs {self.tasks!r}: expected a list")
+        object.__setattr__(self, "tasks", tuple(self.tasks))
+        object.__setattr__(self, "seed", whole_number("goal seed", self.seed, TaskError, 0))
+        for config in self.tasks:
+            if getattr(config, "task", None) not in TASKS:
+                raise TaskError(f"config {config!r}: expected one of a task, such as ReachConfig()")
 
     def task_config(self, task: str) -> TaskConfig:
         """Return the constants of a task.
@@ -96,7 +111,7 @@ def default_configs() -> tuple[TaskConfig, ...]:
 def load_robot(
     source: RobotLike,
     geometry: Literal["primitive", "mesh"] = "primitive",
-    library: Iterable[Path] = (),
+    library: LibraryFolders = (),
 ) -> Robot:
     """Return the robot that a user names, with fitted primitives as its collision shapes.
 
@@ -133,7 +148,7 @@ def member_spec(
     library: Library,
     config: GoalConfig | None = None,
     *,
-    cache: Path | None = None,
+    cache: str | PathLike[str] | None = None,
     shipped: GoalSet | None = None,
 ) -> EnvSpec:
     """Return the specification of a split's member; see ``env_spec``."""
@@ -149,7 +164,7 @@ def env_spec(
     config: GoalConfig | None = None,
     *,
     obstacles: bool = False,
-    cache: Path | None = None,
+    cache: str | PathLike[str] | None = None,
     shipped: GoalSet | None = None,
     anew: bool = False,
 ) -> EnvSpec:
@@ -169,6 +184,7 @@ def env_spec(
         MorphgenError: As ``goal_set``.
     """
     config = config or GoalConfig()
+    obstacles = truth("obstacles", obstacles, TaskError)
     kind, constants, ground = TASKS[task], config.task_config(task), ground_under(robot)
     if shipped is not None and not isinstance(shipped, kind.goal_set_type):
         raise TaskError(f"robot {robot.name!r}: the shipped goal set is not for task {task}")

@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.split import Member, Side, Split, sided_members
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, no_progress, parallel_map
 from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.goal_sets import arrays_of
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.split_goals import (
     GoalResult,
     SplitGoals,
@@ -45,6 +46,7 @@ SidedReason = tuple[Side, str, str]
 """Side and name of a robot, and the reason of its finding."""
 
 _FIXES = {
+    "task-unknown": "correct the task, or install the package that has it",
     "goals-missing": "leave the robot out, or build again: morphgen split build --goals",
     "goals-unknown": "build the goal sets again",
     "goals-body": "build the goal sets again",
@@ -134,6 +136,8 @@ def audit_goals(
 def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] | None) -> Audit:
     """Return an audit with findings about goals added, those that the split accepts as accepted.
 
+    A task that is unknown here is found, too: error ``task-unknown``.
+
     Args:
         audit: Audit of the robots.
         split: The audited split.
@@ -141,6 +145,16 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
             goal findings do not count as unused.
     """
     codes = CODES if findings is None else {finding.code for finding in findings}
+    unknown = [
+        _finding(
+            "task-unknown",
+            side,
+            member.name,
+            f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}",
+        )
+        for side, member in sided_members(split)
+        if member.task not in TASKS
+    ]
     used_acceptances = {f"accepted {code}" for code in codes}
     remaining = [
         finding
@@ -148,7 +162,7 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
         if not (finding.code == "accepted-unused" and finding.where in used_acceptances)
     ]
     accepted = list(audit.accepted)
-    for finding in findings or ():
+    for finding in (*unknown, *(findings or ())):
         if finding.code in split.accepted:
             accepted.append((finding, split.accepted[finding.code]))
         else:

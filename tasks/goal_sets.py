@@ -11,6 +11,7 @@ import json
 import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,7 +41,7 @@ def goal_set(
     obstacles: bool,
     seed: int,
     ground: float = 0.0,
-    cache: Path | None = None,
+    cache: str | PathLike[str] | None = None,
     shipped: GoalSet | None = None,
     anew: bool = False,
 ) -> GoalSet:
@@ -93,7 +94,7 @@ def goal_set(
     kind: type[GoalSet] = task.goal_set_type
     if (content := packaged_set(key)) is not None:
         return replace(set_from_npz(content, kind), robot=robot.name)
-    folder = user_cache_path("morphgen") / task.cache_folder if cache is None else cache
+    folder = user_cache_path("morphgen") / task.cache_folder if cache is None else Path(cache)
     return _cached(kind, folder / f"{key}.npz", robot.name, sample)
 
 

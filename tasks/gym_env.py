@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
+from os import PathLike
 from typing import Any, cast
 
 import gymnasium as gym
@@ -12,7 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.arguments import whole_number
 from morphgen.errors import TaskError, nearest
+from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
@@ -83,8 +84,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         contacts: Contacts | None = None,
         config: TaskConfig | None = None,
         goal_seed: int = 0,
-        cache: Path | None = None,
-        library: Iterable[Path] = (),
+        cache: str | PathLike[str] | None = None,
+        library: LibraryFolders = (),
         max_links: int | None = None,
         progress: Progress = no_progress,
         render_mode: str | None = None,
@@ -132,7 +133,11 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
                 f"{config_type.__name__}"
             )
         self.task = task
-        self.render_mode, self._size = render_mode, size
+        try:
+            width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
+        except (TypeError, ValueError) as error:
+            raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
+        self.render_mode, self._size = render_mode, (width, height)
         self._renderer: Renderer | None = None
         self.batch = make_batch(
             self.task,

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 
 import torch
 
+from morphgen.arguments import whole_number
 from morphgen.benchmark.split import Side, Split
 from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import TaskError, nearest
-from morphgen.grammar.library import default_library
-from morphgen.grammar.robot_source import RobotLike, is_one_robot
+from morphgen.grammar.library import LibraryFolders, default_library, library_folders
+from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
@@ -58,8 +60,8 @@ def make_batch(
     obstacles: bool | Sequence[bool] = False,
     goal_seed: int = 0,
     configs: Sequence[TaskConfig] = (),
-    cache: Path | None = None,
-    library: Iterable[Path] = (),
+    cache: str | PathLike[str] | None = None,
+    library: LibraryFolders = (),
     progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
@@ -88,11 +90,12 @@ def make_batch(
     """
     if is_one_robot(robots):
         raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
-    _require_env_for_each(num_envs, len(robots))
-    folders = tuple(library)
+    robots = robot_list(robots)
+    num_envs = _env_for_each(num_envs, len(robots))
+    folders = library_folders(library)
     tasks: list[str] = _one_for_each("task", task, robots)
     with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
-    config = GoalConfig(goal_seed, tuple(configs))
+    config = GoalConfig(goal_seed, configs)
     loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
     specs: list[EnvSpec] = []
     for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
@@ -111,8 +114,8 @@ def make_split_batch(
     goal_seed: int = 0,
     configs: Sequence[TaskConfig] = (),
     goals: Path | None = None,
-    cache: Path | None = None,
-    library: Iterable[Path] = (),
+    cache: str | PathLike[str] | None = None,
+    library: LibraryFolders = (),
     progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
@@ -135,10 +138,15 @@ def make_split_batch(
         MorphgenError: As ``make_batch``; or if a robot differs from the one that the split was
             made with, or a shipped goal set is not the one that would be sampled.
     """
-    folders = tuple(library)
-    parts, config = default_library(folders), GoalConfig(goal_seed, tuple(configs))
+    folders = library_folders(library)
+    parts, config = default_library(folders), GoalConfig(goal_seed, configs)
+    if not isinstance(split, Split):
+        raise TaskError(
+            f"split {split!r}: expected a Split, as read_split returns it, or the definition of a "
+            "LoadedSplit"
+        )
     members = split.side(side)
-    _require_env_for_each(num_envs, len(members))
+    num_envs = _env_for_each(num_envs, len(members))
     sets = read_goals(goals, side) if goals is not None else None
     specs: list[EnvSpec] = []
     for member in members:
@@ -164,7 +172,7 @@ def batch_from_specs(
     layouts: LayoutSide = "train",
     device: str = "cpu",
     geometry: CollisionGeometry = "primitive",
-    library: Iterable[Path] = (),
+    library: LibraryFolders = (),
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
 
@@ -194,6 +202,12 @@ def batch_from_specs(
         SimulationError: If the simulator cannot hold a scene.
         MissingDependencyError: If the simulator is not installed.
     """
+    if observe is not None and not isinstance(observe, ObservationConfig):
+        raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
+    workers, seed = (
+        whole_number(name, value, TaskError)
+        for name, value in (("workers", workers), ("seed", seed))
+    )
     if num_envs < 1 or workers < 1 or not specs:
         raise TaskError(
             f"{num_envs} environments of {len(specs)} robots with {workers} workers: at least "
@@ -211,7 +225,7 @@ def batch_from_specs(
             "expected 1"
         )
     _require_contacts(simulator, specs, geometry)
-    folders = default_library(tuple(library)).folders
+    folders = default_library(library).folders
     robots = [spec.robot for spec in specs]
     if max_links is None:
         max_links = default_max_links(len(robot.links) for robot in robots)
@@ -258,12 +272,14 @@ def _require_contacts(
             )
 
 
-def _require_env_for_each(num_envs: int, num_robots: int) -> None:
-    """Require an environment for every robot: a robot without one would silently be missing."""
+def _env_for_each(num_envs: int, num_robots: int) -> int:
+    """Return a number of environments: a robot without one would silently be missing."""
+    num_envs = whole_number("number of environments", num_envs, TaskError)
     if num_envs < num_robots:
         raise TaskError(
             f"{num_envs} environments for {num_robots} robots: expected at least one each"
         )
+    return num_envs
 
 
 def _one_for_each(name: str, value: T | Sequence[T], robots: Sequence[object]) -> list[T]:

@@ -55,8 +55,10 @@ class Registry(Generic[T]):
         own table and entry points. Use an entry point where several processes are needed.
 
         Raises:
-            TaskError: If another object has this name.
+            TaskError: If another object has this name, or it is no such object, or a class.
         """
+        if isinstance(item, type) or not isinstance(getattr(item, "name", None), str):
+            raise TaskError(f"{self.kind} {item!r}: expected an instance with a name")
         if item.name in self and self._loaded.get(item.name) is not item:
             raise TaskError(f"{self.kind} {item.name!r}: the name is taken; choose another")
         self._loaded[item.name] = item

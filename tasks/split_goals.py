@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, Side, Split, sided_members
+from morphgen.benchmark.split import Member, Side, Split, require_side, sided_members
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums
 from morphgen.benchmark.split_folder_files import sums_text
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
@@ -278,8 +278,10 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
         side: ``train`` or ``test``; a name may be on both, at different tasks.
 
     Raises:
-        BenchmarkError: If it was built without goals, or a file is broken; the message names it.
+        BenchmarkError: If it was built without goals, or a file is broken; the message names it. If
+            there is no such side.
     """
+    require_side(side)
     sets = read_split_goals(folder).sets
     return {
         name: result.goals

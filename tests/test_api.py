@@ -228,7 +228,70 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.split(hold_out="arm=lwr", max_links=None), "max_links None: expected"),
         (lambda: morphgen.check(3), "3 is no robot; expected a Robot, a path, or a name"),
         (lambda: morphgen.conform("no/such/folder"), "no/such/folder: no such file or folder"),
-        (lambda: morphgen.conform("prims", samples=0), "0 samples, seed 0: expected 1 sample"),
+        (
+            lambda: morphgen.conform("prims", samples=0),
+            "samples 0: expected a whole number, 1 or more",
+        ),
+        (lambda: morphgen.conform("prims", samples=1.5), "samples 1.5: expected a whole number"),
+        (lambda: morphgen.conform("prims", seed=None), "seed None: expected a whole number, 0"),
+        (lambda: morphgen.compose(Path("ur5")), "PosixPath.*: expected words, such as ur5-plane"),
+        (lambda: morphgen.compose("prims", library=None), "library None: expected a folder, or"),
+        (lambda: morphgen.compose("chain beads=5.5"), "valid: a whole number of repetitions, bead"),
+        (lambda: morphgen.sample(".", 1), "unknown grammar '.'"),
+        (lambda: morphgen.similarity(["prims", "prims"], []), "no measure is named; valid: cos"),
+        (lambda: morphgen.tokens("arm3-stick", max_links=23.5), "max_links 23.5: expected a whole"),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", seed=1.5),
+            "split: seed 1.5: expected a whole number",
+        ),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", seed=True),
+            "split: seed True: expected a whole number",
+        ),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", test="1"),
+            "split: test '1': expected a whole number",
+        ),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", obstacles="no"),
+            "split: obstacles 'no': expected True or False",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", obstacles="no"),
+            "obstacles 'no': expected True or False",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", goal_seed=1.5),
+            "goal seed 1.5: expected a whole number, 0",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", size=64),
+            "size 64: expected width and height",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", size=(0, 9)),
+            "size 0: expected a whole number, 1 or more",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", observe="ik"),
+            "observe 'ik': expected an Observation",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", num_envs="2"),
+            "number of environments '2': expected a",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", num_envs=1, seed=None),
+            "seed None: expected a whole numb",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", num_envs=1, configs=3),
+            "configs 3: expected a list",
+        ),
+        (
+            lambda: morphgen.make_env("reach", "prims", num_envs=1, configs=[3]),
+            "config 3: expected one of a",
+        ),
         (lambda: morphgen.fit("arm3-stick", max_primitives=0), "0 primitives: expected 1 to 32"),
         (lambda: morphgen.fit("none.stl"), "none.stl"),
         (lambda: morphgen.tokens("arm3-stick", max_links=2), "more than max_links 2"),

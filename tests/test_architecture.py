@@ -22,6 +22,7 @@ FOLDERS = [
 """Folders of modules; a source distribution has ``tasks`` only as ``morphgen/tasks``."""
 PACKAGES = (
     "errors",
+    "arguments",
     "extras",
     "typing",
     "processes",

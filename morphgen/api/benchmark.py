@@ -6,13 +6,13 @@ from collections.abc import Iterable, Sequence
 
 from numpy.typing import ArrayLike
 
-from morphgen.api.library import LibraryFolders, open_library
 from morphgen.benchmark import tokens as encoding
 from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
 from morphgen.benchmark.token_layout import default_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot, robot_list
 from morphgen.typing import Array
 
@@ -49,7 +49,7 @@ def tokens(
         MorphgenError: If the robot cannot be composed or read.
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
-    parts = open_library(library)
+    parts = default_library(library)
     loaded = resolve_robot(robot, parts)
     size = default_max_links([len(loaded.links)]) if max_links is None else max_links
     return encoding.tokens(loaded, token_shapes(loaded, parts.folders), q, max_links=size)
@@ -89,10 +89,12 @@ def similarity(
         MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
         MorphgenError: If a robot cannot be composed or read.
     """
-    names = [measures] if isinstance(measures, str) else measures
+    names = [measures] if isinstance(measures, str) else list(measures)
+    if not names:
+        raise BenchmarkError(f"no measure is named; valid: {', '.join(MEASURES)}")
     for name in names:
         get_measure(name)
-    parts = open_library(library)
+    parts = default_library(library)
     loaded = [resolve_robot(robot, parts) for robot in robot_list(robots)]
     if len(loaded) < 2:
         raise BenchmarkError(f"{len(loaded)} robots to compare; expected a list of two or more")

@@ -8,13 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.api.library import LibraryFolders, open_library
+from morphgen.arguments import whole_number
 from morphgen.checks.conformance import ConformanceReport, conformance
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
+from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.urdf import UnsoundError
-from morphgen.grammar.library import Library
+from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import (
     RobotLike,
     RobotSource,
@@ -52,7 +53,7 @@ def check(
     """
     if isinstance(robot, Robot):
         return checks.check(robot, tool_required=tool_required)
-    return check_source(find_robot(robot), open_library(library), tool_required=tool_required)
+    return check_source(find_robot(robot), default_library(library), tool_required=tool_required)
 
 
 def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple[Finding, ...]]:
@@ -68,7 +69,7 @@ def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple
     Raises:
         MorphgenError: If the robot cannot be composed or read.
     """
-    return checks.fix(resolve_robot(robot, open_library(library)))
+    return checks.fix(resolve_robot(robot, default_library(library)))
 
 
 def check_source(
@@ -136,9 +137,11 @@ def conform(
             that of a folder.
         MorphgenError: If the robot cannot be composed or read.
     """
+    samples = whole_number("samples", samples, FormatError, 1)
+    seed = whole_number("seed", seed, FormatError, 0)
     if isinstance(robot, Robot):
         return _conform_robot(robot, samples, seed)
-    return conform_source(find_robot(robot), open_library(library), samples=samples, seed=seed)
+    return conform_source(find_robot(robot), default_library(library), samples=samples, seed=seed)
 
 
 def conform_source(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.api.library import LibraryFolders, library_folders
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
+from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import is_one_robot, robot_list
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class SharedOptions(TypedDict, total=False):
     contacts: Contacts | None
     layouts: LayoutSide
     goal_seed: int
-    cache: Path | None
+    cache: str | PathLike[str] | None
     library: LibraryFolders
     max_links: int | None
     progress: Progress
@@ -116,7 +116,6 @@ def make_env(
         if name not in valid:
             kind = "one environment" if num_envs is None else "vector environments"
             raise TaskError(f"{kind}: unknown option {name!r}{nearest(name, valid)}")
-    options["library"] = library_folders(options.get("library", ()))
     if num_envs is None:
         from morphgen.tasks.gym_env import TaskEnv
 

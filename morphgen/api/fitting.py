@@ -6,8 +6,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.api.library import LibraryFolders, open_library
 from morphgen.extras import explain_missing_extras
+from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Link, Robot
@@ -71,7 +71,7 @@ def fit(
     from morphgen.fitting.link_fit import FitOptions
 
     options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover, search)
-    parts = open_library(library)
+    parts = default_library(library)
     target = _mesh_robot(robot) or resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
 
-from morphgen.api.library import LibraryFolders, open_library
+from morphgen.arguments import whole_number
 from morphgen.checks import check
 from morphgen.errors import CompositionError, nearest
 from morphgen.extras import explain_missing_extras
@@ -16,6 +15,7 @@ from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
+from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.grammar.sampling import SamplingError, sample_robots
@@ -60,10 +60,12 @@ def compose(
     """
     if geometry not in GEOMETRIES:
         raise CompositionError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
-    parts = open_library(library)
+    if not isinstance(request, str):
+        raise CompositionError(f"{request!r}: expected words, such as ur5-plane")
+    parts = default_library(library)
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
     derivation, default_name = parse_words(request_words, parts)
-    robot = compose_derivation(derivation, parts, name or default_name)
+    robot = compose_derivation(derivation, parts, str(name or default_name))
     return with_geometry(robot, geometry, parts.folders)
 
 
@@ -95,14 +97,13 @@ def sample(
         SamplingError: If ``n`` or ``seed`` is negative or no integer; while iterating, if no robot
             meets the conditions in 500 draws.
     """
-    parts = open_library(library)
+    parts = default_library(library)
     loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:
         require_condition(condition)
-    for name, value in (("n", n), ("seed", seed)):
-        if not isinstance(value, Integral) or value < 0:
-            raise SamplingError(f"sample: {name} {value!r}: expected a whole number, 0 or more")
+    n = whole_number("sample: n", n, SamplingError, 0)
+    seed = whole_number("sample: seed", seed, SamplingError, 0)
     samples = sample_robots(loaded, parts, n, seed=seed, where=conditions)
     return (sample.robot for sample in samples)
 
@@ -153,6 +154,6 @@ def write(
         FormatError: If the folder cannot be written, or contains something else of that name.
         MorphgenError: If the robot cannot be composed or read.
     """
-    robot = resolve_robot(robot, open_library(library))
+    robot = resolve_robot(robot, default_library(library))
     target = bundle_folder(Path(folder), robot.name)  # names of strangers may be paths
     return write_bundle(robot, target, check(robot), picture=picture)

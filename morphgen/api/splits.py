@@ -8,8 +8,8 @@ from numbers import Integral
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.api.library import LibraryFolders, open_library
 from morphgen.api.loaded_split import LoadedSplit
+from morphgen.arguments import truth, whole_number
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
 from morphgen.benchmark.split import HOLD_OUT, Regime
@@ -19,6 +19,7 @@ from morphgen.benchmark.statistics import statistics
 from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.extras import explain_missing_extras
+from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def split(
             invalid, or too few robots meet it.
         MorphgenError: If a part or a grammar is unknown, or parts do not fit.
     """
-    parts = open_library(library)
+    parts = default_library(library)
     if not choice and train is None:
         if not str(name):
             raise BenchmarkError("no split is named; expected a name, or hold_out or regime")
@@ -177,10 +178,12 @@ def _parse(
     if train is None:
         train = () if regime == "composition" else DEFAULT_TRAIN
     sizes = tuple(train) if isinstance(train, Iterable) else (train,)
-    for what, value in (("max_links", max_links), *(("train", size) for size in sizes)):
-        if not isinstance(value, Integral):
-            raise BenchmarkError(f"split: {what} {value!r}: expected a whole number")
-    sizes, max_links = tuple(map(int, sizes)), int(max_links)
+    sizes = tuple(whole_number("split: train", size, BenchmarkError) for size in sizes)
+    test, seed, max_links = (
+        whole_number(f"split: {what}", value, BenchmarkError)
+        for what, value in (("test", test), ("seed", seed), ("max_links", max_links))
+    )
+    obstacles = truth("split: obstacles", obstacles, BenchmarkError)
     name = name or default_name(rules, tasks, obstacles, seed)
     return rules, SplitRequest(name, sizes, test, tasks, obstacles, seed, max_links)
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.token_layout import LARGEST_MAX_LINKS, MAX_LINKS
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
@@ -60,6 +60,16 @@ class Member:
         return {"body" if key == "robot_hash" else key: data[key] for key in data}
 
 
+def require_side(side: str) -> None:
+    """Require a side of a split.
+
+    Raises:
+        BenchmarkError: If it is none.
+    """
+    if side not in SIDES:
+        raise BenchmarkError(f"unknown side {side!r}{nearest(str(side), SIDES)}")
+
+
 @dataclass(frozen=True)
 class Split:
     """Train and test robots, with the history of the split."""
@@ -98,7 +108,12 @@ class Split:
         return max_links
 
     def side(self, side: Side) -> tuple[Member, ...]:
-        """Return the members of a side."""
+        """Return the members of a side.
+
+        Raises:
+            BenchmarkError: If there is no such side.
+        """
+        require_side(side)
         return self.train if side == "train" else self.test
 
     def as_dict(self) -> dict[str, object]:

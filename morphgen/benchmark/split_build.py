@@ -84,7 +84,7 @@ def build_split(
     """
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
-    with _writing(split_folder):
+    with _writing(split_folder), _removed_if_empty(split_folder):
         _prepare(split_folder, split, settings)
         with locked_folder(split_folder):
             (split_folder / SUMS_FILE).unlink(missing_ok=True)
@@ -188,6 +188,19 @@ def _finish(
     for robot_hash, robot in robots.items():
         sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}
     write_atomic(split_folder / SUMS_FILE, sums_text(sums))
+
+
+@contextmanager
+def _removed_if_empty(split_folder: Path) -> Iterator[None]:
+    """If a new folder gets no robot, delete it: it would block a build of the corrected split."""
+    is_new = not split_folder.exists()
+    try:
+        yield
+    except BaseException:
+        robots = split_folder / ROBOTS_DIR
+        if is_new and not any(path.name[0] != "." for path in robots.glob("*")):
+            shutil.rmtree(split_folder, ignore_errors=True)
+        raise
 
 
 @contextmanager

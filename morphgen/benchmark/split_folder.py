@@ -131,7 +131,9 @@ def require_split_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise BenchmarkError(f"{folder}: no such folder")
     if not (folder / BUILD_FILE).is_file():
-        inside = sorted(path.parent for path in folder.glob(f"**/{BUILD_FILE}"))
+        # A build is at most three folders deep; a search of all would take long in a large folder.
+        depths = ("*", "*/*", "*/*/*")
+        inside = sorted(path.parent for n in depths for path in folder.glob(f"{n}/{BUILD_FILE}"))
         hint = f"; did you mean {inside[0]}?" if inside else "; morphgen split build makes one"
         raise BenchmarkError(f"{folder} is no built split: it has no {BUILD_FILE}{hint}")
     if not (folder / SUMS_FILE).is_file():

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.arguments import whole_number
 from morphgen.errors import BenchmarkError
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Pose, Primitive, Sphere
@@ -91,6 +92,7 @@ def require_max_links(n_links: int, what: str, max_links: int) -> None:
     Raises:
         BenchmarkError: If one of the two is violated; ``what`` names the robot in the message.
     """
+    max_links = whole_number("max_links", max_links, BenchmarkError)
     if not 2 <= max_links <= LARGEST_MAX_LINKS:
         raise BenchmarkError(
             f"max_links {max_links}: expected 2 to {LARGEST_MAX_LINKS}, such as {MAX_LINKS}"

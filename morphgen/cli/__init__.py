@@ -95,7 +95,9 @@ def _run(argv: Sequence[str] | None) -> int:
 @contextmanager
 def _record_ctrl_c() -> Iterator[list[int]]:
     """Raise ``KeyboardInterrupt`` on Ctrl-C as always, and append to the yielded list."""
-    interrupts: list[int] = []
+    from morphgen.cli.progress import interrupts
+
+    interrupts.clear()
 
     def record(number: int, frame: FrameType | None) -> None:
         interrupts.append(number)

@@ -29,6 +29,18 @@ TRAINING_LINES = 20
 """Number of lines about a training where there is no terminal."""
 
 
+interrupts: list[int] = []
+"""Signals of Ctrl-C since the command began. An extension module that is being imported may lose
+the error that Ctrl-C raises; then the next progress raises it again."""
+
+
+def raise_if_interrupted() -> None:
+    """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed, once."""
+    if interrupts:
+        interrupts.clear()
+        raise KeyboardInterrupt
+
+
 class Bar:
     """A bar of tqdm that is set to the number of finished items."""
 
@@ -37,6 +49,7 @@ class Bar:
 
     def __call__(self, done: float, total: int | None = None) -> None:
         """Show the number of finished items, and of all items if it was unknown."""
+        raise_if_interrupted()
         if total is not None:
             self._shown.total = total
         self._shown.update(done - self._shown.n)
@@ -114,6 +127,7 @@ def track(
     """Yield the items, and show in a bar how many of them are finished."""
     with bar(args, title, unit, total) as shown:
         for item in items:
+            raise_if_interrupted()
             yield item
             shown.add()
 
@@ -129,6 +143,7 @@ def print_line(line: str) -> None:
 @contextmanager
 def status(args: argparse.Namespace, text: str) -> Iterator[None]:
     """Show on a terminal what the command does and for how long, until the work is done."""
+    raise_if_interrupted()
     with bar(args, text, layout="{desc} [{elapsed}]"):
         yield
 
@@ -157,6 +172,7 @@ class TrainingProgress:
 
     def goal_sets(self, done: int, total: int) -> None:
         """Show how many of the robots have their goal set."""
+        raise_if_interrupted()
         if not sys.stderr.isatty():
             now = time.monotonic()
             if self._last_line is None:
@@ -177,6 +193,7 @@ class TrainingProgress:
         """Begin with a subrun; return the function that shows its metrics."""
         from tqdm import tqdm
 
+        raise_if_interrupted()
         self.close()
         name = subrun.config.source.member or subrun.config.source.name
         if not sys.stderr.isatty():
@@ -194,6 +211,7 @@ class TrainingProgress:
 
     def evaluation(self, name: str) -> Progress:
         """Begin with an evaluation; return the function that shows how many episodes ended."""
+        raise_if_interrupted()
         self.close()
         if not sys.stderr.isatty():
             return _print_each_minute(name)

@@ -77,10 +77,9 @@ def _require_writable(args: argparse.Namespace) -> None:
         ("--map", args.map),
         ("--csv", args.csv),
     ):
-        if path is not None and option_name != "--csv" and path.suffix.lower() != ".png":
-            raise BenchmarkError(f"{option_name} {path}: expected a name that ends in .png")
+        suffix = ".csv" if option_name == "--csv" else ".png"
         if path is not None:
-            require_writable_file(path, option_name)
+            require_writable_file(path, option_name, suffix)
     given = [path for path in (args.heatmap, args.map, args.csv) if path is not None]
     for path in given:
         if sum(other.resolve() == path.resolve() for other in given) > 1:

@@ -49,7 +49,7 @@ def difficulty(args: argparse.Namespace) -> None:
     from morphgen.formats.files import require_writable_file, write_file
 
     if args.csv is not None:
-        require_writable_file(args.csv, "--csv")
+        require_writable_file(args.csv, "--csv", ".csv")
     splits = _splits(args.splits)
     results = _results(args.study, splits)
     library = opt.library_of(args)

@@ -51,10 +51,8 @@ def tokens(args: argparse.Namespace) -> None:
             raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
         opt.print_result(args, _layout_data(), _layout_text)
         return
-    if args.out and args.out.suffix != ".npz":
-        raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
     if args.out:
-        require_writable_file(args.out, "--out")
+        require_writable_file(args.out, "--out", ".npz")
     robots, folders = [robot for _, robot in opt.read_robots(args)], opt.library_of(args).folders
     if args.out and len(robots) > 1:
         raise BenchmarkError(f"--out {args.out}: {len(robots)} robots are named; expected one")

@@ -28,17 +28,21 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def require_writable_file(path: Path, name: str = "") -> None:
+def require_writable_file(path: Path, name: str = "", suffix: str = "") -> None:
     """Require, before long work, that a file can be written.
 
     Args:
         path: The file.
         name: Name of the option that it is the value of, for the message.
+        suffix: Suffix that it must have, so that a file of another kind is never replaced.
 
     Raises:
-        FormatError: If it is a folder, or its folder does not exist or cannot be written.
+        FormatError: If it is a folder, has another suffix, or its folder does not exist or cannot
+            be written.
     """
-    if path.is_dir():
+    if path.suffix.lower() != suffix and suffix:
+        why = f"expected a name that ends in {suffix}"
+    elif path.is_dir():
         why = "it is a folder"
     elif not path.parent.is_dir():
         why = f"there is no folder {path.parent}"

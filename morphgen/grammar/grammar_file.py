@@ -83,7 +83,8 @@ def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
     if name.endswith(SUFFIX) or "/" in name:
         path = Path(name)
         if not path.is_file():
-            raise GrammarError(f"{path}: no such file")
+            what = "a folder, not a grammar" if path.is_dir() else "no such file"
+            raise GrammarError(f"{path}: {what}")
         return path
     users = [folder for folder in folders if not _shipped().is_relative_to(folder)]
     paths = [path for folder in (*users, _shipped()) for path in sorted(folder.rglob(f"*{SUFFIX}"))]

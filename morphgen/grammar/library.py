@@ -6,7 +6,9 @@ import os
 from collections.abc import Iterable
 from functools import cached_property, lru_cache
 from importlib.resources import files
+from os import PathLike
 from pathlib import Path
+from typing import TypeAlias
 
 from morphgen.errors import PartError, nearest
 from morphgen.formats.resolve import file_stamp
@@ -14,6 +16,10 @@ from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manif
 
 LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"
 """Environment variable with folders of a user's own parts, separated as in ``PATH``."""
+
+
+LibraryFolders: TypeAlias = str | PathLike[str] | Iterable[str | PathLike[str]]
+"""A folder of a user's own parts and grammars, or several."""
 
 
 class Library:
@@ -32,7 +38,8 @@ class Library:
         paths: dict[str, Path] = {}
         for folder in self.folders:
             if not folder.is_dir():
-                raise PartError(f"library folder {folder} does not exist")
+                why = "is a file" if folder.exists() else "does not exist"
+                raise PartError(f"library folder {folder} {why}")
             for path in sorted([*folder.rglob("*.yaml"), *folder.rglob("*.yml")]):
                 if paths.get(path.stem, path) != path:
                     raise PartError(f"part {path.stem!r} is in {paths[path.stem]} and in {path}")
@@ -72,15 +79,28 @@ class Library:
         )
 
 
-def default_library(extra: Iterable[Path] = ()) -> Library:
+def default_library(extra: LibraryFolders = ()) -> Library:
     """Return the library of morphgen's parts and those of users.
 
     Args:
         extra: Folders of a user's own parts, in addition to those of ``MORPHGEN_LIBRARY``.
     """
     entries = os.environ.get(LIBRARY_VARIABLE, "").split(os.pathsep)
-    users = (path.absolute() for path in (*(Path(entry) for entry in entries if entry), *extra))
-    return Library(dict.fromkeys((*shipped_folders(), *users)))
+    users = (*(Path(entry) for entry in entries if entry), *library_folders(extra))
+    return Library(dict.fromkeys((*shipped_folders(), *(path.absolute() for path in users))))
+
+
+def library_folders(folders: LibraryFolders) -> tuple[Path, ...]:
+    """Return the folders of an argument ``library``.
+
+    Raises:
+        PartError: If it is neither a folder nor several.
+    """
+    several = [folders] if isinstance(folders, str | PathLike) else folders
+    try:
+        return tuple(map(Path, several))
+    except TypeError as error:
+        raise PartError(f"library {folders!r}: expected a folder, or several") from error
 
 
 def shipped_folders() -> tuple[Path, ...]:

@@ -99,6 +99,8 @@ def _pin_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
         alternatives = tuple(a for a in production.alternatives if a.items[0].name == value)
         if not alternatives:
             valid = [alternative.items[0].name for alternative in production.alternatives]
+            if any(item.repetition for a in production.alternatives for item in a.items):
+                valid.append("a whole number of repetitions")
             raise GrammarError(f"{symbol}={value}: no such alternative{nearest(value, valid)}")
         pinned = replace(production, alternatives=alternatives)
     return _with_productions(grammar, lambda p: pinned if p.symbol == symbol else p)

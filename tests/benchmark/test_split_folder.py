@@ -4,6 +4,7 @@ import hashlib
 import json
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -333,6 +334,14 @@ def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, example_spl
     assert len(load_split_folder(report.folder)) == 4
 
 
+def test_a_refused_build_leaves_nothing_that_blocks_the_next(tmp_path, example_split):
+    wrong = replace(example_split, test=(replace(example_split.test[0], robot_hash="0" * 32),))
+    with pytest.raises(BenchmarkError):
+        build_split(replace(wrong, train=wrong.test), tmp_path, LIBRARY)
+    assert not (tmp_path / "mine" / "some").exists()
+    assert build_split(example_split, tmp_path, LIBRARY).num_written == 4
+
+
 def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, example_split, monkeypatch):
     written = Path.write_text
 
@@ -344,6 +353,6 @@ def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, example_sp
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(FormatError, match=r"cannot write .*No space left on device"):
         build_split(example_split, tmp_path, LIBRARY)
-    assert list((tmp_path / "mine" / "some" / "robots").iterdir()) == []
+    assert not (tmp_path / "mine" / "some").exists()
     monkeypatch.undo()
     assert build_split(example_split, tmp_path, LIBRARY).num_written == 4

@@ -80,3 +80,23 @@ def test_goal_sets_are_counted_until_all_are_ready(terminal, monkeypatch, capsys
         assert display._goal_bar is None
     lines = [line for line in capsys.readouterr().err.splitlines() if "goal sets: 3 of 10" in line]
     assert (bar is None, len(lines)) == ((False, 0) if terminal else (True, 1))
+
+
+def test_a_ctrl_c_that_an_import_lost_ends_the_next_progress(capsys):
+    nothing = SimpleNamespace()
+
+    def shown():
+        with closing(TrainingProgress()) as display:
+            yield lambda: display.goal_sets(1, 2)
+            yield lambda: display.evaluation("test")
+            yield lambda: display(SimpleNamespace(config=small_config()))
+        with progress.bar(nothing, "reading") as bar:
+            yield lambda: bar(1)
+        yield lambda: list(progress.track([1], nothing, "reading", "robot", 1))
+        yield lambda: progress.status(nothing, "reading").__enter__()
+
+    for show in shown():
+        progress.interrupts.append(2)
+        with pytest.raises(KeyboardInterrupt):
+            show()
+        assert progress.interrupts == []

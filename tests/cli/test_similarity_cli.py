@@ -199,7 +199,8 @@ def test_paths_that_are_not_robots_are_rejected(paths, reason, refused, bundles,
         (("--heatmap", "a.jpg"), "--heatmap a.jpg: expected a name that ends in .png"),
         (("--map", "a"), "--map a: expected a name that ends in .png"),
         (("--map", "no/a.png"), "--map no/a.png: there is no folder no"),
-        (("--csv", "robots"), "--csv robots: it is a folder"),
+        (("--csv", "robots"), "--csv robots: expected a name that ends in .csv"),
+        (("--csv", "a.png"), "--csv a.png: expected a name that ends in .csv"),
     ],
 )
 def test_unwritable_output_is_rejected_before_computing(arguments, reason, refused, bundles):

@@ -102,8 +102,10 @@ def test_bad_input_is_refused(refused, small):
     assert "'mine/small' is also in small.yaml" in refused(*WORDS, small, small)
     err = refused(*WORDS, small, "--csv", "none/a.csv")
     assert "--csv none/a.csv: there is no folder none" in err
-    Path("folder").mkdir()
-    assert "--csv folder: it is a folder" in refused(*WORDS, small, "--csv", "folder")
+    Path("folder.csv").mkdir()
+    assert "--csv folder.csv: it is a folder" in refused(*WORDS, small, "--csv", "folder.csv")
+    refusal = refused(*WORDS, small, "--csv", small)  # which would replace the split
+    assert "--csv small.yaml: expected a name that ends in .csv" in refusal
     assert "0: expected a whole number" in refused(*WORDS, small, "--jobs", "0")
     assert "none: no such folder" in refused(*WORDS, small, "--study", "none")
     err = refused(*WORDS, small, "--study", STUDY)

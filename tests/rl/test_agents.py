@@ -103,3 +103,8 @@ def test_a_shipped_policy_is_loaded_by_its_name(name):
         assert policy.act(observation).shape == observation["links"].shape
     with pytest.raises(TaskError, match="no such checkpoint"):
         load_policy("zero-shott")
+    for mode in ("Deterministic", "greedy", None):
+        with pytest.raises(TaskError, match=f"unknown mode {mode!r}.* valid: deterministic, stoch"):
+            load_policy("zero-shot", mode)
+    with pytest.raises(TaskError, match="unknown device 'gpu'; valid: cpu, cuda"):
+        load_policy("zero-shot", device="gpu")

@@ -33,6 +33,9 @@ class WindyTask:
 @pytest.fixture
 def windy(monkeypatch):
     monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+    for wrong in (WindyTask, "windy", None):
+        with pytest.raises(TaskError, match="expected an instance with a name"):
+            TASKS.register(wrong)
     TASKS.register(WindyTask())
 
 

@@ -72,6 +72,18 @@ def test_built_in_split_has_no_findings(cache):
     assert audit_codes(which, draw_sets(which, cache)) == []
 
 
+def test_a_task_that_no_package_has_is_an_error():
+    odd = split([member(TRAIN[0], task="rech")], [member(TEST[0], task="reach")])
+    sound = replace(audit(some(), LIBRARY), findings=())
+    for findings in (None, ()):
+        (found,) = with_goal_findings(sound, odd, findings).findings
+        assert (found.code, found.severity) == ("task-unknown", "error")
+        assert found.where == "train robot gantry-plane"
+        assert "its task 'rech' is unknown; did you mean 'reach'?" in found.why
+    accepted = replace(odd, accepted={"task-unknown": "the package is not published"})
+    assert with_goal_findings(sound, accepted, None).passed()
+
+
 def test_cache_that_ignores_the_seed_is_reported(sets, cache):
     """A valid set of another seed stored under this seed's key is reported."""
     other = draw_sets(some(), cache, replace(RECIPE, seed=1))

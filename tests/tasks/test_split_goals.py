@@ -18,7 +18,7 @@ from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.verify import verify
-from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.tasks import free_space, split_goals
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.goal_sets import arrays_of, goals_from_npz, set_npz
@@ -37,6 +37,22 @@ from morphgen.tasks.split_goals import (
 from morphgen.tasks.split_goals import sample_split_goals as make
 
 RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
+
+
+@pytest.mark.parametrize("side", ["Train", "tests", None])
+def test_unknown_sides_are_refused(side, tmp_path):
+    for call in (
+        lambda: make_split_batch(mixed(), side, 9),
+        lambda: read_goals(tmp_path, side),
+        lambda: mixed().side(side),
+    ):
+        with pytest.raises(BenchmarkError, match=f"unknown side {side!r}.* valid: test, train"):
+            call()
+
+
+def test_a_batch_is_of_a_split_and_not_of_its_name():
+    with pytest.raises(TaskError, match="split 'interpolation/arm3/reach': expected a Split, as"):
+        make_split_batch("interpolation/arm3/reach", "train", 10)
 
 
 @pytest.fixture
