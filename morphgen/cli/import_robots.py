@@ -157,7 +157,7 @@ def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict
     from morphgen.formats.bundle import bundle_folder
 
     names = {
-        file: re.sub(r"\W", "_", description.path.stem, flags=re.ASCII)
+        file: re.sub(r"\W", "_", description.path.stem.removesuffix(".urdf"), flags=re.ASCII)
         for file, description in found.items()
         if not isinstance(description, MorphgenError)
     }
