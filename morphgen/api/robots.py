@@ -99,7 +99,7 @@ def sample(
     """
     parts = default_library(library)
     loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
-    conditions = [parse_condition(where)] if where else []
+    conditions = [parse_condition(where, "where")] if where else []
     for condition in conditions:
         require_condition(condition)
     n = whole_number("sample: n", n, SamplingError, 0)
