@@ -237,6 +237,18 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.compose(Path("ur5")), "PosixPath.*: expected words, such as ur5-plane"),
         (lambda: morphgen.compose("prims", library=None), "library None: expected a folder, or"),
         (lambda: morphgen.compose("chain beads=5.5"), "valid: a whole number of repetitions, bead"),
+        (
+            lambda: morphgen.split(hold_out=None),
+            "split: hold_out None: expected a text, or several",
+        ),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", robots=[3]),
+            r"split: robots \[3\]: expected a",
+        ),
+        (
+            lambda: morphgen.split(hold_out="arm=lwr", task=None),
+            "split: task None: expected a text",
+        ),
         (lambda: morphgen.sample(".", 1), "unknown grammar '.'"),
         (lambda: morphgen.similarity(["prims", "prims"], []), "no measure is named; valid: cos"),
         (lambda: morphgen.tokens("arm3-stick", max_links=23.5), "max_links 23.5: expected a whole"),

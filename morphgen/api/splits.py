@@ -167,9 +167,9 @@ def _parse(
     **names: Names,
 ) -> tuple[RobotChoice, SplitRequest]:
     """Return the rules and the request that the arguments of ``split`` describe."""
-    several = {key: _several(value) for key, value in names.items()}
+    several = {key: _several(key, value) for key, value in names.items()}
     rules = RobotChoice(regime, hull=hull, similarity=similarity, **several)
-    tasks = _several(task)
+    tasks = _several("task", task)
     for each in tasks:
         if each not in TASKS:
             raise BenchmarkError(f"unknown task {each!r}{nearest(each, TASKS)}")
@@ -188,5 +188,14 @@ def _parse(
     return rules, SplitRequest(name, sizes, test, tasks, obstacles, seed, max_links)
 
 
-def _several(names: Names) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
+def _several(key: str, names: Names) -> tuple[str, ...]:
+    """Return the names of an argument.
+
+    Raises:
+        BenchmarkError: If it is neither a text nor several.
+    """
+    several = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else names
+    texts = tuple(several)
+    if not all(isinstance(text, str) for text in texts):
+        raise BenchmarkError(f"split: {key} {names!r}: expected a text, or several")
+    return texts
