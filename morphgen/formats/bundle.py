@@ -17,7 +17,12 @@ from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
-from morphgen.formats.files import file_sha256, replacing_folder, require_writable_folder
+from morphgen.formats.files import (
+    SYSTEM_FILES,
+    file_sha256,
+    replacing_folder,
+    require_writable_folder,
+)
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
@@ -76,7 +81,9 @@ def require_replaceable(folder: Path) -> None:
     hashes = _card_hashes(folder)
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if name in _REPLACED or (path.is_dir() and not path.is_symlink()):
+        if name in _REPLACED or path.name in SYSTEM_FILES:
+            continue
+        if path.is_dir() and not path.is_symlink():
             continue
         digest = file_sha256(path) if path.is_file() else ""
         if hashes.get(name) != digest:

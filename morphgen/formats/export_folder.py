@@ -9,7 +9,7 @@ from pathlib import Path
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import file_sha256, replacing_folder
+from morphgen.formats.files import SYSTEM_FILES, file_sha256, replacing_folder
 
 MANIFEST = "export.json"
 """File that lists the other files of an exported folder with their SHA-256."""
@@ -71,5 +71,5 @@ def _hashes(folder: Path) -> dict[str, str]:
     return {
         path.relative_to(folder).as_posix(): file_sha256(path) if path.is_file() else ""
         for path in sorted(folder.rglob("*"))
-        if path.is_symlink() or not path.is_dir()
+        if (path.is_symlink() or not path.is_dir()) and path.name not in SYSTEM_FILES
     }

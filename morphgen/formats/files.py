@@ -14,6 +14,8 @@ from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError
 
+SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+"""Files that file managers write into the folders that they show."""
 LOCK = ".lock"
 """Name of the lock file in a folder."""
 

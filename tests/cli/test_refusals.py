@@ -225,6 +225,7 @@ def test_a_bundle_with_exported_files_is_replaced(run):
     for name, row in FORMATS.items():
         if isinstance(row, FileFormat):
             (Path("out/gantry-plane") / f"robot.{name}").touch()
+    (Path("out/gantry-plane/.DS_Store")).touch()  # of a file manager
     (Path("out/gantry-plane/robot.urdf")).unlink()  # a damaged bundle is mended
     assert run(*words)[0] == 0
     assert {path.name for path in Path("out/gantry-plane").iterdir()} == {

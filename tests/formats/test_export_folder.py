@@ -22,6 +22,7 @@ def test_unchanged_export_is_replaced(tmp_path):
     manifest = json.loads((folder / MANIFEST).read_text())
     assert (manifest["format"], manifest["robot"]) == ("urdf", "arm")
     assert list(manifest["files"]) == ["meshes/a.stl"]
+    (folder / "meshes" / ".DS_Store").touch()  # of a file manager
     export(folder, "b")
     assert (folder / "meshes" / "a.stl").read_text() == "b"
     assert list(tmp_path.iterdir()) == [folder]
