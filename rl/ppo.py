@@ -146,7 +146,8 @@ class Learner:
         self.update += 1
         lost = [name for name, value in learn_metrics.items() if not math.isfinite(value)]
         if lost:
-            raise TaskError(f"update {self.update}: {', '.join(lost)} is not finite any more")
+            hint = "look at rewards and observations, or lower the learning rate"
+            raise TaskError(f"update {self.update}: not finite: {', '.join(lost)}; {hint}")
         ended = time.perf_counter()
         timesteps = self.config.num_steps * self.batch.num_envs * self.processes.size
         return UpdateMetrics(

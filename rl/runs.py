@@ -221,6 +221,12 @@ def config_from(data: object) -> RunConfig:
         if not isinstance(values, Mapping):
             raise TaskError(f"run: {name}: invalid value {shown(values)}; expected keys and values")
         read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
+    for name, values in entries.items():
+        if isinstance(values, Mapping) and name not in RunConfig.__dataclass_fields__:
+            raise TaskError(
+                f"run: unknown task {shown(name)}; run the script that registers it, or install "
+                "its package"
+            )
     nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
     values = read_fields(entries, RunConfig, "run", given=nested)
     source = RobotSource(**read_fields(nested["source"], RobotSource, "run: source"))
@@ -307,11 +313,17 @@ def require_same_run(folder: Path, config: RunConfig) -> None:
 
 def _flat(config: RunConfig) -> dict[str, Any]:
     """Return the entries of a config by dotted name; a run may continue on another GPU."""
+    device = config.device.partition(":")[0]
+    return _entries(config.as_data() | {"source": identity(config.source), "device": device})
+
+
+def _entries(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the entries of nested dictionaries by dotted name."""
     flat: dict[str, Any] = {}
-    for name, value in (config.as_data() | {"source": identity(config.source)}).items():
-        nested = value if isinstance(value, dict) else {"": value}
-        flat.update({f"{name}.{key}".rstrip("."): entry for key, entry in nested.items()})
-    return flat | {"device": config.device.partition(":")[0]}
+    for name, value in data.items():
+        nested = isinstance(value, dict) and value
+        flat |= _entries(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return flat
 
 
 def _short(value: object) -> str:

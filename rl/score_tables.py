@@ -27,6 +27,7 @@ from morphgen.rl.intervals import (
 )
 from morphgen.rl.leaderboard import relative_scores
 from morphgen.rl.scores import score_decimals
+from morphgen.rl.study import SCORES
 from morphgen.rl.submission import (
     RobotOutcomes,
     Submission,
@@ -34,7 +35,7 @@ from morphgen.rl.submission import (
     json_files,
     submission_from,
 )
-from morphgen.rl.submission_checks import require_full_lists
+from morphgen.rl.submission_checks import require_full_lists, require_same_random
 from morphgen.typing import Array
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -93,13 +94,25 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
                 found[str(file)] = submission = submission_from(data, file)
                 if not submission.robots:
                     raise BenchmarkError(f"{file}: robots: none; expected one or more")
+                seen: set[tuple[str, str]] = set()
                 for robot in submission.robots:
-                    require_full_lists(robot, f"{file}: {robot.side} robot {robot.robot}")
+                    at = f"{file}: {robot.side} robot {robot.robot}"
+                    require_full_lists(robot, at)
+                    if (robot.side, robot.robot) in seen:
+                        raise BenchmarkError(f"{at}: is there twice; expected once")
+                    seen.add((robot.side, robot.robot))
         if len(found) == before:
             raise BenchmarkError(
                 f"{path}: no submissions below it; morphgen study writes them beside scores.json"
             )
     return found
+
+
+def cells_without_episodes(paths: Sequence[Path], submissions: Mapping[str, Submission]) -> int:
+    """Return the number of cells of studies below folders that have scores and no submission."""
+    with_episodes = {Path(where).parent for where in submissions}
+    cells = {file.parent for path in paths for file in path.rglob(SCORES)}
+    return len(cells - with_episodes)
 
 
 def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
@@ -109,8 +122,9 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
         submissions: Submissions by the name of their file.
 
     Raises:
-        BenchmarkError: If two of them are of the same run, or of one split with other robots or
-            rules; or if robots differ from those of the split that comes with morphgen.
+        BenchmarkError: If two of them are of the same run, or of one split with other robots, rules
+            or scores of the random policy; or if robots differ from those of the split that comes
+            with morphgen.
     """
     by_split: dict[str, dict[str, Submission]] = {}
     for where, each in submissions.items():
@@ -118,6 +132,7 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
     rows: list[ResultRow] = []
     for split, own in by_split.items():
         _require_comparable(split, own)
+        require_same_random(list(own.items()))
         groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
         for where, each in own.items():
             group = groups.setdefault(_key(each), {})

@@ -165,7 +165,9 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
         source = RobotSource(**renamed("source", data["source"]))
         stored = _plain([_with_defaults(data["eval"]), identity(source)])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, TaskError) as error:
-        raise FormatError(f"{path}: not the scores of a cell: {error}") from error
+        raise FormatError(
+            f"{path}: not the scores of a cell: {error}; delete it to evaluate the cell again"
+        ) from error
     expected = _plain([cell.eval_config.as_data(), identity(cell.source)])
     for what, theirs, ours in zip(("evaluation", "set of robots"), stored, expected, strict=True):
         if theirs != ours:

@@ -209,8 +209,10 @@ def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
     for file in files:
         try:
             data = read_json(file)
-        except (OSError, FormatError) as error:
-            raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        except FormatError as error:  # which names the file
+            raise BenchmarkError(str(error)) from error
+        except OSError as error:
+            raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
         yield file, data
 
 

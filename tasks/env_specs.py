@@ -13,7 +13,7 @@ import numpy as np
 
 from morphgen.arguments import truth, whole_number
 from morphgen.benchmark.split import Member, compose_member
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
@@ -50,8 +50,9 @@ class GoalConfig:
         object.__setattr__(self, "tasks", tuple(self.tasks))
         object.__setattr__(self, "seed", whole_number("goal seed", self.seed, TaskError, 0))
         for config in self.tasks:
-            if getattr(config, "task", None) not in TASKS:
-                raise TaskError(f"config {config!r}: expected one of a task, such as ReachConfig()")
+            if (task := getattr(config, "task", None)) not in TASKS:
+                what = f"{type(config).__name__}: its task {task!r}"
+                raise TaskError(f"config {what} is unknown{nearest(str(task), TASKS)}")
 
     def task_config(self, task: str) -> TaskConfig:
         """Return the constants of a task.

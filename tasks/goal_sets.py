@@ -84,10 +84,16 @@ def goal_set(
         digest = int(robot_hash(robot, visuals=False), 16)
         seeds = np.random.SeedSequence([seed, digest, int(obstacles)])
         identity = {"robot": robot.name, "key": key, "seed": seed}
-        goals: GoalSet = task.sample(
+        goals = task.sample(
             robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
         )
-        return goals
+        if not isinstance(goals, task.goal_set_type):
+            raise TaskError(
+                f"task {task.name!r}: sample returned {type(goals).__name__}; expected "
+                f"{task.goal_set_type.__name__}"
+            )
+        sampled: GoalSet = goals
+        return sampled
 
     if anew:
         return sample()

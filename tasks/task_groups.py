@@ -20,6 +20,12 @@ from morphgen.tasks.task import (
     Task,
     TaskEnvs,
 )
+from morphgen.tasks.task_checks import (
+    require_envs,
+    require_fields,
+    require_result,
+    require_start,
+)
 from morphgen.tasks.tool_targets import ToolTargets
 
 
@@ -84,6 +90,7 @@ class TaskGroups:
             rows = torch.nonzero(is_at_task)[:, 0]
             member_index = row_of_spec.to(device)[env_robot_index[rows]]
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
+            require_envs(task, envs)
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps
@@ -118,24 +125,36 @@ class TaskGroups:
         """Begin episodes; the arguments and the result are those of ``TaskEnvs.begin``, n rows."""
         if len(self._groups) == 1:
             (group,) = self._groups.values()
-            return group.envs.begin(mask, random, layout)
+            return self._start(group, mask, random, layout)
         n, device = len(mask), mask.device
         q = torch.zeros(n, self._num_joints, device=device)
         block_pose = torch.zeros(n, 7, device=device)
         for group in self._groups.values():
             rows = group.rows
             task_layout = None if layout is None else layout[rows]
-            q[rows], block_pose[rows] = group.envs.begin(
-                mask[rows], random.select(rows), task_layout
+            q[rows], block_pose[rows] = self._start(
+                group, mask[rows], random.select(rows), task_layout
             )
         return q, block_pose
 
+    def _start(
+        self,
+        group: _Group,
+        mask: torch.Tensor,
+        random: EpisodeRandom,
+        layout: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        start = group.envs.begin(mask, random, layout)
+        require_start(group.task.name, start, len(group.rows), self._num_joints)
+        return start
+
     def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""
-        results = [
-            (group.rows, group.envs.evaluate(self._group_state(group, state)))
-            for group in self._groups.values()
-        ]
+        results = []
+        for group in self._groups.values():
+            result = group.envs.evaluate(self._group_state(group, state))
+            require_result(group.task.name, result, len(group.rows))
+            results.append((group.rows, result))
         rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for _, result in results]
         if len(results) == 1:
             return BatchResult(**vars(results[0][1]), reward=rewards[0])
@@ -176,6 +195,7 @@ class TaskGroups:
         for group in self._groups.values():
             alone = len(self._groups) == 1
             task_values = group.envs.observe(block_pose if alone else block_pose[group.rows])
+            require_fields(group.task, task_values, len(group.rows))
             for name, value in task_values.items():
                 if alone:
                     values[name] = value.clone()

@@ -302,7 +302,7 @@ def test_vector_environments_of_one_keep_their_axis():
         ),
         (
             lambda: morphgen.make_env("reach", "prims", num_envs=1, configs=[3]),
-            "config 3: expected one of a",
+            "config int: its task None is unknown; valid: ",
         ),
         (lambda: morphgen.fit("arm3-stick", max_primitives=0), "0 primitives: expected 1 to 32"),
         (lambda: morphgen.fit("none.stl"), "none.stl"),

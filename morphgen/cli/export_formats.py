@@ -135,12 +135,14 @@ def _with_meshes(
     """Return a function that writes meshes and the texts that name them by relative paths."""
 
     def write(robot: Robot, folder: Path, settings: ExportSettings) -> None:
-        from morphgen.formats.bundle import MESHES, split_colours, write_meshes
+        from morphgen.formats.bundle import MESHES, URDF, split_colours, write_fits, write_meshes
 
         robot = split_colours(_with_spheres(robot, settings))
         files = write_meshes(robot, folder / MESHES)
         for name, text in texts(robot, files.__getitem__).items():
             (folder / name).write_text(text, encoding="utf-8")
+        if (folder / URDF).is_file():
+            write_fits(robot, folder)
 
     return write
 

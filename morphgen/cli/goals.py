@@ -66,10 +66,13 @@ def goals(args: argparse.Namespace) -> int:
 
 
 def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
+    from morphgen.benchmark.split_file import split_names
     from morphgen.tasks.env_specs import load_robot
     from morphgen.tasks.split_goals import sample_robot_goals
 
     words = " ".join(args.words)
+    if words in split_names():
+        raise BenchmarkError(f"--task {args.task}: is for a robot; {words} is a split")
     with status(args, f"sampling goals of {args.task} for {words}"):
         robot = load_robot(words, library=args.library)
         return sample_robot_goals(

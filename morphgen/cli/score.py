@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -42,10 +43,21 @@ MODES = ("deterministic", "stochastic", "all")
 )
 def score(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    from morphgen.rl.score_tables import read_submissions, result_rows, result_tables
+    from morphgen.rl.score_tables import (
+        cells_without_episodes,
+        read_submissions,
+        result_rows,
+        result_tables,
+    )
     from morphgen.rl.scores import finite_or_none
 
     submissions = read_submissions(args.files)
+    if num_left := cells_without_episodes(args.files, submissions):
+        print(
+            f"morphgen: {num_left} cells of studies are left out: they have scores.json and no "
+            "episodes; delete it, and morphgen study evaluates their checkpoints again",
+            file=sys.stderr,
+        )
     modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
     found = {where: each for where, each in submissions.items() if each.mode in modes}
     if not found:

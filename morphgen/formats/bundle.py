@@ -125,7 +125,7 @@ def write_bundle(
         files = write_meshes(robot, partial / MESHES)
         (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
-        _write_fits(robot, partial)
+        write_fits(robot, partial)
         hashes = {
             path.relative_to(partial).as_posix(): file_sha256(path)
             for path in sorted(partial.rglob("*"))
@@ -151,15 +151,20 @@ def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """
     card = _read_card(folder)
     robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
-    return replace(apply_card(robot, card, str(folder / CARD)), fits=_read_fits(folder))
+    return replace(apply_card(robot, card, str(folder / CARD)), fits=fits_in(folder))
 
 
-def _read_fits(folder: Path) -> StoredFits:
+def fits_in(folder: Path) -> StoredFits:
+    """Return the fits that a folder has beside a robot's description; none without the file.
+
+    Raises:
+        FormatError: If the file is malformed, or a link that leaves the folder.
+    """
     path = folder / FITS
     if not path.exists():
         return {}
     if not path.resolve().is_relative_to(folder.resolve()):
-        raise FormatError(f"{path}: is a link that leaves the bundle; replace it by the file")
+        raise FormatError(f"{path}: is a link that leaves its folder; replace it by the file")
     return read_fits(path)
 
 
@@ -215,7 +220,8 @@ def read_robot(
 ) -> Robot:
     """Read a bundle's folder, a URDF, a xacro or an MJCF.
 
-    The URDF or MJCF of a bundle stands for the bundle.
+    The URDF or MJCF of a bundle stands for the bundle. Another description gets the fits of a
+    ``primitives.json`` beside it, such as that of an exported URDF.
 
     Args:
         path: The file or folder.
@@ -231,7 +237,8 @@ def read_robot(
     if path.name in (URDF, MJCF) and (path.parent / CARD).is_file():
         return read_bundle(path.parent, root=root)
     is_xacro = path.suffix == XACRO
-    return read_description(path, args, default_finder(root=root), written_frames=not is_xacro)
+    robot = read_description(path, args, default_finder(root=root), written_frames=not is_xacro)
+    return replace(robot, fits=fits_in(path.parent))
 
 
 def split_colours(robot: Robot) -> Robot:
@@ -301,7 +308,7 @@ def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
     return files
 
 
-def _write_fits(robot: Robot, folder: Path) -> None:
+def write_fits(robot: Robot, folder: Path) -> None:
     """Write the fits of the collision shapes under the keys of the rewritten meshes.
 
     The bundle's meshes have other content than the robot's, and with it other keys.

@@ -11,7 +11,7 @@ from typing import TypeAlias, TypeGuard, cast
 from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import CompositionError, FormatError, nearest
-from morphgen.formats.bundle import CARD, XACRO, read_robot
+from morphgen.formats.bundle import CARD, XACRO, fits_in, read_robot
 from morphgen.formats.data_files import read_text
 from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
@@ -275,6 +275,7 @@ def import_robot(
         root_link=root_link,
         written_frames=tool is None and path.suffix != XACRO,  # a tool is named by its link
     )
+    robot = replace(robot, fits=fits_in(path.parent))
     if srdf is not None:
         robot = with_disabled_pairs(robot, read_srdf(srdf), str(srdf))
     for option, link in (("root link", root_link), ("tool", tool)):

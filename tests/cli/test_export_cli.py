@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 
 from helpers.robots import arm
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.checks.collision_matrix import MATRIX_SAMPLES
 from morphgen.checks.robot_srdf import robot_srdf_text
 from morphgen.cli.export_formats import SAMPLES
 from morphgen.fitting import sphere_robot
 from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.export_folder import MANIFEST
+from morphgen.formats.fits import FITS
 from morphgen.formats.srdf_reader import read_srdf
 from morphgen.formats.urdf import read_urdf
 from morphgen.model.kinematics import forward_kinematics
+from morphgen.tasks.env_specs import load_robot
 
 
 def test_bundles_get_their_web_page_and_stay_valid(run, tmp_path):
@@ -100,6 +103,22 @@ def test_folders_are_written_into_the_output_folder_and_again(
     assert code == 2
     assert "mine is not of the export" in err
     assert {path.name for path in tmp_path.iterdir()} == {"bundle", folder}
+
+
+def test_an_exported_urdf_has_the_fits_and_so_the_goals_of_the_robot(run, tmp_path):
+    words = ("arm=xarm6", "ee=none")
+    assert run("export", *words, "--format", "urdf", "--out", tmp_path)[0] == 0
+    (urdf,) = tmp_path.glob("*/robot.urdf")
+    assert (urdf.parent / FITS).is_file()
+    composed, exported = load_robot(" ".join(words)), load_robot(urdf)
+    assert robot_hash(exported, visuals=False) == robot_hash(composed, visuals=False)
+    assert run("import", urdf, "--name", "mine", "--no-picture")[0] == 0
+    assert robot_hash(load_robot("robots/mine"), visuals=False) == robot_hash(
+        composed, visuals=False
+    )
+    (urdf.parent / FITS).write_text("[]")
+    code, _, err = run("check", urdf)
+    assert (code, FITS in err) == (2, True)
 
 
 def test_urdf_and_mjcf_hold_the_robot_and_its_meshes(run, tmp_path):

@@ -172,6 +172,10 @@ def files(folder):
         ("some.yaml --seed -1", "argument --seed: -1: expected a whole number, 0 or more"),
         ("some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("some.yaml --obstacles", "--obstacles goes with --task"),
+        (
+            "interpolation/arm3/reach --task reach",
+            "--task reach: is for a robot; interpolation/arm3/reach is a split",
+        ),
         ("arm=ur6 --task reach", "unknown arm 'ur6'; did you mean"),
         ("nothing/there --task reach", "nothing/there"),
         ("folder", "folder is no built split: it has no build.json"),

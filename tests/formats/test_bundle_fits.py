@@ -120,7 +120,7 @@ def test_invalid_fits_are_a_one_line_error(folder, capsys, change, why):
 def test_links_to_fits_outside_the_bundle_are_not_followed(folder, tmp_path):
     (folder / FITS).rename(tmp_path / "elsewhere.json")
     (folder / FITS).symlink_to(tmp_path / "elsewhere.json")
-    with pytest.raises(FormatError, match="leaves the bundle"):
+    with pytest.raises(FormatError, match="leaves its folder"):
         read_bundle(folder)
 
 

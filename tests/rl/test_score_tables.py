@@ -11,7 +11,12 @@ from helpers.submissions import SPLIT, data
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split
 from morphgen.errors import BenchmarkError
-from morphgen.rl.score_tables import read_submissions, result_rows, result_tables
+from morphgen.rl.score_tables import (
+    cells_without_episodes,
+    read_submissions,
+    result_rows,
+    result_tables,
+)
 from morphgen.rl.submission import submission_from
 
 BASELINE = {"mode": "", "training_seed": None}
@@ -130,6 +135,21 @@ def test_a_submission_without_robots_is_refused(tmp_path):
         read_submissions([tmp_path])
 
 
+def test_a_robot_that_is_there_twice_is_refused(tmp_path):
+    robots = data()["robots"]
+    (tmp_path / "a.json").write_text(json.dumps(data() | {"robots": [*robots, robots[0]]}))
+    with pytest.raises(BenchmarkError, match=r"a\.json: train robot \S+: is there twice; expected"):
+        read_submissions([tmp_path])
+
+
+def test_cells_without_episodes_are_counted(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scores.json").write_text("{}")
+    (tmp_path / "a" / "deterministic.json").write_text(json.dumps(data()))
+    assert cells_without_episodes([tmp_path], read_submissions([tmp_path])) == 1
+
+
 def test_small_scores_have_two_decimals():
     for near, shown in ((0.25, "2.69"), (150.0, "115.0")):
         (line,) = result_tables(result_rows(read(a=data(near=near)))).splitlines()[4:5]
@@ -158,6 +178,10 @@ SHIPPED = read_split("interpolation/arm3/reach")
         (
             {"a": data(), "b": changed(data() | {"training_seed": 1}, robot="another")},
             "its seeds have other train robots",
+        ),
+        (
+            {"a": data(), "b": changed(data("other"), random_score=[-500.0, -501, -500, -499])},
+            "b: train robot .*: random_score: mean -500.00; expected .*, as in a",
         ),
     ],
 )
