@@ -35,7 +35,11 @@ from morphgen.rl.submission import (
     json_files,
     submission_from,
 )
-from morphgen.rl.submission_checks import require_full_lists, require_same_random
+from morphgen.rl.submission_checks import (
+    require_each_once,
+    require_full_lists,
+    require_same_random,
+)
 from morphgen.typing import Array
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -94,13 +98,9 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
                 found[str(file)] = submission = submission_from(data, file)
                 if not submission.robots:
                     raise BenchmarkError(f"{file}: robots: none; expected one or more")
-                seen: set[tuple[str, str]] = set()
+                require_each_once(submission, str(file))
                 for robot in submission.robots:
-                    at = f"{file}: {robot.side} robot {robot.robot}"
-                    require_full_lists(robot, at)
-                    if (robot.side, robot.robot) in seen:
-                        raise BenchmarkError(f"{at}: is there twice; expected once")
-                    seen.add((robot.side, robot.robot))
+                    require_full_lists(robot, f"{file}: {robot.side} robot {robot.robot}")
         if len(found) == before:
             raise BenchmarkError(
                 f"{path}: no submissions below it; morphgen study writes them beside scores.json"

@@ -53,22 +53,34 @@ def check_submission(
     """
     _check_head(submission, where, split, protocol, version)
     wanted = {(each.side, each.member.name): each for each in expected}
-    seen: set[tuple[str, str]] = set()
+    require_each_once(submission, where)
     for outcomes in submission.robots:
         key = (outcomes.side, outcomes.robot)
         at = f"{where}: {outcomes.side} robot {outcomes.robot}"
         if key not in wanted:
             raise BenchmarkError(f"{at}: the split has no such robot")
-        if key in seen:
-            raise BenchmarkError(f"{at}: is there twice; expected once")
-        seen.add(key)
         _check_robot(outcomes, at, wanted[key], protocol)
+    seen = {(outcomes.side, outcomes.robot) for outcomes in submission.robots}
     sides = {side for side, _ in seen} | {"test"}
     for side, name in wanted:
         if side in sides and (side, name) not in seen:
             raise BenchmarkError(
                 f"{where}: {side} robot {name}: is missing; expected all robots of the side"
             )
+
+
+def require_each_once(submission: Submission, where: str) -> None:
+    """Require that a submission has no robot of a side twice.
+
+    Raises:
+        BenchmarkError: If it has; the message names ``where``, its file.
+    """
+    seen: set[tuple[str, str]] = set()
+    for outcomes in submission.robots:
+        if (outcomes.side, outcomes.robot) in seen:
+            at = f"{where}: {outcomes.side} robot {outcomes.robot}"
+            raise BenchmarkError(f"{at}: is there twice; expected once")
+        seen.add((outcomes.side, outcomes.robot))
 
 
 def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:

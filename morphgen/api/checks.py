@@ -8,11 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.arguments import whole_number
 from morphgen.checks.conformance import ConformanceReport, conformance
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
-from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.urdf import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
@@ -137,8 +135,6 @@ def conform(
             that of a folder.
         MorphgenError: If the robot cannot be composed or read.
     """
-    samples = whole_number("samples", samples, FormatError, 1)
-    seed = whole_number("seed", seed, FormatError, 0)
     if isinstance(robot, Robot):
         return _conform_robot(robot, samples, seed)
     return conform_source(find_robot(robot), default_library(library), samples=samples, seed=seed)

@@ -13,13 +13,12 @@ from morphgen.extras import explain_missing_extras
 from morphgen.fitting.collision_geometry import GEOMETRIES, with_geometry
 from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
-from morphgen.grammar.conditions import require_condition
+from morphgen.grammar.conditions import parse_conditions
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.grammar.sampling import SamplingError, sample_robots
-from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
 
@@ -99,9 +98,7 @@ def sample(
     """
     parts = default_library(library)
     loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
-    conditions = [parse_condition(where, "where")] if where else []
-    for condition in conditions:
-        require_condition(condition)
+    conditions = parse_conditions([where] if where else [], "where")
     n = whole_number("sample: n", n, SamplingError, 0)
     seed = whole_number("sample: seed", seed, SamplingError, 0)
     samples = sample_robots(loaded, parts, n, seed=seed, where=conditions)

@@ -34,12 +34,18 @@ from morphgen.benchmark.split_folder_files import (
     tokens_npz,
     unique_robots,
 )
-from morphgen.benchmark.split_folder_robots import differences, hashes, is_current, write_robot
+from morphgen.benchmark.split_folder_robots import differences, is_current, write_robot
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import file_sha256, locked_folder, partial_path, write_atomic
+from morphgen.formats.files import (
+    file_sha256,
+    folder_hashes,
+    locked_folder,
+    partial_path,
+    write_atomic,
+)
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
@@ -142,7 +148,7 @@ class _RobotWriter:
         if not is_kept:
             write_robot(robot, folder, light=light, picture=picture)
         return _WrittenRobot(
-            not is_kept, robot_data(robot, self.folders, self.max_links), hashes(folder)
+            not is_kept, robot_data(robot, self.folders, self.max_links), folder_hashes(folder)
         )
 
 

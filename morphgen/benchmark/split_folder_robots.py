@@ -21,7 +21,7 @@ from morphgen.formats.bundle import (
 )
 from morphgen.formats.card import card_text, robot_card
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import file_sha256, replacing_folder
+from morphgen.formats.files import replacing_folder
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.robot_set import DERIVATION, light_urdf
 from morphgen.model.robot import Robot
@@ -65,15 +65,6 @@ def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
     card = read_json(folder / CARD)
     has_picture = (folder / PICTURE).is_file()
     return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file in a folder, hexadecimal, by its path, sorted."""
-    return {
-        path.relative_to(folder).as_posix(): file_sha256(path)
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def _light_files(robot: Robot) -> dict[str, str]:

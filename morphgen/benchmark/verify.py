@@ -34,10 +34,10 @@ from morphgen.benchmark.split_folder_files import (
     robot_paths,
     token_tables,
 )
-from morphgen.benchmark.split_folder_robots import differences, hashes, same
+from morphgen.benchmark.split_folder_robots import differences, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.formats.files import file_sha256
+from morphgen.formats.files import file_sha256, folder_hashes
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
@@ -227,7 +227,7 @@ def _folder_differences(
 def _file_differences(folder: Path) -> Iterator[Difference]:
     """Yield files that differ from ``SHA256SUMS``; a file of a robot is listed under its name."""
     expected = read_sums(folder / SUMS_FILE)
-    actual = hashes(folder)
+    actual = folder_hashes(folder)
     for name in sorted((expected.keys() | actual.keys()) - {SUMS_FILE}):
         if name not in actual:
             why = f"is missing, but {SUMS_FILE} names it"

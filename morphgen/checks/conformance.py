@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
 from morphgen.checks.joint_readings import compare_joints
 from morphgen.checks.readers import LOADERS, Loader
@@ -109,12 +110,10 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
     """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``.
 
     Raises:
-        FormatError: If there are no samples, or the seed is negative.
+        FormatError: If ``samples`` is below 1, ``seed`` below 0, or one of them no whole number.
     """
-    if samples < 1 or seed < 0:
-        raise FormatError(
-            f"{samples} samples, seed {seed}: expected 1 sample or more, and a seed of 0 or more"
-        )
+    samples = whole_number("samples", samples, FormatError, 1)
+    seed = whole_number("seed", seed, FormatError, 0)
     frame = next((frame for frame in robot.frames if frame.name == TOOL), None)
     if frame is None:
         frame = Frame(robot.links[-1].name, robot.links[-1].name)

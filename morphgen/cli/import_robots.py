@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option, repeated
 from morphgen.cli.progress import status, track
 from morphgen.cli.robots import WrittenBundle, write_checked
-from morphgen.errors import FormatError, MorphgenError, one_line
+from morphgen.errors import FormatError, MorphgenError
 
 if TYPE_CHECKING:
     from morphgen.formats.named_descriptions import NamedDescription
@@ -132,11 +131,7 @@ def _import_several(
                 raise description
             robot = _import(description, names[file], xacro_args, args)
         except MorphgenError as error:
-            reason = one_line(str(error))
-            if Path(file).name not in reason:
-                reason = f"{file}: {reason}"
-            print(f"morphgen: {reason}", file=sys.stderr)
-            objects.append({"file": file, "error": type(error).__name__, "message": reason})
+            objects.append({"file": file, **opt.refusal(error, file, Path(file).name)})
             code = 2
             continue
         objects.append({"file": file, **robot.data})

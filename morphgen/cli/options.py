@@ -190,12 +190,23 @@ def for_each_robot(
         except MorphgenError as error:
             if len(sources) == 1:
                 raise
-            reason = one_line(str(error))
-            if source.label not in reason:
-                reason = f"{source.label}: {reason}"
-            print(f"morphgen: {reason}", file=sys.stderr)
-            refused[source.label] = {"error": type(error).__name__, "message": reason}
+            refused[source.label] = refusal(error, source.label, source.label)
     return results, refused
+
+
+def refusal(error: MorphgenError, label: str, name: str) -> dict[str, str]:
+    """Print why one of several robots is refused; return it for ``--json``.
+
+    Args:
+        error: The error.
+        label: What names the robot; it precedes a message without ``name``.
+        name: Part of a message by which a reader recognizes the robot.
+    """
+    reason = one_line(str(error))
+    if name not in reason:
+        reason = f"{label}: {reason}"
+    print(f"morphgen: {reason}", file=sys.stderr)
+    return {"error": type(error).__name__, "message": reason}
 
 
 def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:

@@ -82,6 +82,7 @@ def bar(
     """
     from tqdm import tqdm
 
+    raise_if_interrupted()
     hidden = getattr(args, "json", False) or None  # None: shown on a terminal only
     with (
         tqdm(
@@ -143,7 +144,6 @@ def print_line(line: str) -> None:
 @contextmanager
 def status(args: argparse.Namespace, text: str) -> Iterator[None]:
     """Show on a terminal what the command does and for how long, until the work is done."""
-    raise_if_interrupted()
     with bar(args, text, layout="{desc} [{elapsed}]"):
         yield
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
-    from morphgen.grammar.syntax import Expression
 
 NUMBER = number("-n", "number of robots", default=10)
 
@@ -43,12 +41,13 @@ NUMBER = number("-n", "number of robots", default=10)
 )
 def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
+    from morphgen.grammar.conditions import parse_conditions
     from morphgen.grammar.grammar_file import grammar_text
     from morphgen.grammar.robot_set import SetConfig, SetWorker, make_serially, make_set
     from morphgen.grammar.workers import make_in_processes, make_on_ray
 
     grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
-    _conditions(args.where)
+    parse_conditions(args.where, "--where")  # refuses invalid ones
     folder = args.out or Path("robots") / grammar.name
     config = SetConfig(
         folder,
@@ -147,6 +146,7 @@ def mutate(args: argparse.Namespace) -> None:
     """Write neighbours as bundles and print what differs."""
     from morphgen.formats.bundle import write_bundle
     from morphgen.formats.data_files import read_text
+    from morphgen.grammar.conditions import parse_conditions
     from morphgen.grammar.derivation import difference
     from morphgen.grammar.grammar_file import grammar_from_text
     from morphgen.grammar.limits import MAX_TEXT
@@ -173,7 +173,7 @@ def mutate(args: argparse.Namespace) -> None:
         args.n,
         seed=args.seed,
         name=name,
-        where=_conditions(settings["where"]),
+        where=parse_conditions(settings["where"], "--where"),
     )
     changes: dict[str, Any] = {}
     for neighbour in track(neighbours, args, "sampling", "robot", args.n):
@@ -187,17 +187,6 @@ def mutate(args: argparse.Namespace) -> None:
         changes,
         lambda: "\n".join(f"{path}: {'; '.join(lines)}" for path, lines in changes.items()),
     )
-
-
-def _conditions(texts: Sequence[str]) -> list[Expression]:
-    """Return the conditions that texts such as ``reach > 0.4`` contain."""
-    from morphgen.grammar.conditions import require_condition
-    from morphgen.grammar.syntax import parse_condition
-
-    conditions = [parse_condition(text) for text in texts]
-    for condition in conditions:
-        require_condition(condition)
-    return conditions
 
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:

@@ -72,12 +72,11 @@ def _require_writable(args: argparse.Namespace) -> None:
     """Refuse files that cannot be written, before the long work."""
     from morphgen.formats.files import require_writable_file
 
-    for option_name, path in (
-        ("--heatmap", args.heatmap),
-        ("--map", args.map),
-        ("--csv", args.csv),
+    for option_name, path, suffix in (
+        ("--heatmap", args.heatmap, ".png"),
+        ("--map", args.map, ".png"),
+        ("--csv", args.csv, ".csv"),
     ):
-        suffix = ".csv" if option_name == "--csv" else ".png"
         if path is not None:
             require_writable_file(path, option_name, suffix)
     given = [path for path in (args.heatmap, args.map, args.csv) if path is not None]

@@ -22,12 +22,11 @@ import numpy as np
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.benchmark.split_folder_robots import hashes
 from morphgen.benchmark.token_layout import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES
 from morphgen.benchmark.tokens import tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import CARD, write_bundle
-from morphgen.formats.files import file_sha256
+from morphgen.formats.files import file_sha256, folder_hashes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import Library, default_library
@@ -130,7 +129,7 @@ def file_hashes(robot: Robot) -> dict[str, str]:
     """Return the hashes of a bundle's files by path, without the card, which has the version."""
     with TemporaryDirectory() as parent:
         folder = write_bundle(robot, Path(parent) / robot.name, (), picture=False)
-        return {name: value for name, value in hashes(folder).items() if name != CARD}
+        return {name: value for name, value in folder_hashes(folder).items() if name != CARD}
 
 
 def score() -> float:

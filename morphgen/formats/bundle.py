@@ -18,8 +18,9 @@ from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
 from morphgen.formats.files import (
-    SYSTEM_FILES,
     file_sha256,
+    first_edit,
+    folder_hashes,
     replacing_folder,
     require_writable_folder,
 )
@@ -78,20 +79,13 @@ def require_replaceable(folder: Path) -> None:
         return
     if not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is not a bundle (no {CARD}); choose another name")
-    hashes = _card_hashes(folder)
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if name in _REPLACED or path.name in SYSTEM_FILES:
-            continue
-        if path.is_dir() and not path.is_symlink():
-            continue
-        digest = file_sha256(path) if path.is_file() else ""
-        if hashes.get(name) != digest:
-            why = "was changed since" if name in hashes else "is not of the bundle"
-            raise FormatError(
-                f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
-                "name or folder"
-            )
+    if edit := first_edit(folder, _card_hashes(folder), _REPLACED):
+        name, is_changed = edit
+        why = "was changed since" if is_changed else "is not of the bundle"
+        raise FormatError(
+            f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
+            "name or folder"
+        )
 
 
 def write_bundle(
@@ -126,11 +120,7 @@ def write_bundle(
         (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         write_fits(robot, partial)
-        hashes = {
-            path.relative_to(partial).as_posix(): file_sha256(path)
-            for path in sorted(partial.rglob("*"))
-            if path.is_file()
-        }
+        hashes = folder_hashes(partial)
         card = robot_card(robot, findings, hashes, {"morphgen": version("morphgen")})
         (partial / CARD).write_text(card_text(card), encoding="utf-8")
         if picture:

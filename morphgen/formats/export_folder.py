@@ -9,7 +9,7 @@ from pathlib import Path
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import SYSTEM_FILES, file_sha256, replacing_folder
+from morphgen.formats.files import first_edit, folder_hashes, replacing_folder
 
 MANIFEST = "export.json"
 """File that lists the other files of an exported folder with their SHA-256."""
@@ -34,7 +34,7 @@ def writing_export(folder: Path, format_name: str, robot_name: str) -> Iterator[
     _require_replaceable(folder, robot_name)
     with replacing_folder(folder) as partial:
         yield partial
-        manifest = {"format": format_name, "robot": robot_name, "files": _hashes(partial)}
+        manifest = {"format": format_name, "robot": robot_name, "files": folder_hashes(partial)}
         text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
         (partial / MANIFEST).write_text(text, encoding="utf-8")
 
@@ -57,19 +57,9 @@ def _require_replaceable(folder: Path, robot_name: str) -> None:
             f"{folder} is an export of robot {data.get('robot')!r}, not of {robot_name!r}; move it "
             "away, or choose another --out"
         )
-    for name, digest in _hashes(folder).items():
-        if name != MANIFEST and written.get(name) != digest:
-            why = "was changed after the export" if name in written else "is not of the export"
-            raise FormatError(
-                f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
-                "--out"
-            )
-
-
-def _hashes(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file below a folder by its path; links count by their target."""
-    return {
-        path.relative_to(folder).as_posix(): file_sha256(path) if path.is_file() else ""
-        for path in sorted(folder.rglob("*"))
-        if (path.is_symlink() or not path.is_dir()) and path.name not in SYSTEM_FILES
-    }
+    if edit := first_edit(folder, written, {MANIFEST}):
+        name, is_changed = edit
+        why = "was changed after the export" if is_changed else "is not of the export"
+        raise FormatError(
+            f"{folder} is not replaced: {name} {why}; move the folder away, or choose another --out"
+        )

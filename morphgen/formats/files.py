@@ -6,7 +6,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -28,6 +28,40 @@ def file_sha256(path: Path) -> str:
     """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def folder_hashes(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file in a folder, hexadecimal, by its path, sorted."""
+    return {
+        path.relative_to(folder).as_posix(): file_sha256(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def first_edit(
+    folder: Path, hashes: Mapping[str, object], generated: Collection[str]
+) -> tuple[str, bool] | None:
+    """Return the first file of a folder that is not as it was written.
+
+    Args:
+        folder: The folder.
+        hashes: SHA-256 of the files that were written, by their path.
+        generated: Files that are not compared.
+
+    Returns:
+        Path of the file, and whether it was changed (True) or added (False); None without such a
+        file. Links are followed; one that leads to no file counts as changed or added. Missing
+        files and ``SYSTEM_FILES`` do not count.
+    """
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        is_entry = path.is_symlink() or not path.is_dir()
+        if not is_entry or name in generated or path.name in SYSTEM_FILES:
+            continue
+        if hashes.get(name) != (file_sha256(path) if path.is_file() else ""):
+            return name, name in hashes
+    return None
 
 
 def require_writable_file(path: Path, name: str = "", suffix: str = "") -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 
 from morphgen.errors import GrammarError
-from morphgen.grammar.syntax import Expression, unknown
+from morphgen.grammar.syntax import Expression, parse_condition, unknown
 from morphgen.grammar.values import Scope, evaluate, typical_value
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, reach
@@ -109,6 +109,22 @@ def holds(condition: Expression, properties: RobotProperties) -> bool:
         case sign:
             left, right = (_value(operand, properties) for operand in condition.operands)
             return _COMPARATORS[sign](left, right)
+
+
+def parse_conditions(texts: Iterable[str], origin: str) -> list[Expression]:
+    """Return the conditions that texts such as ``reach > 0.4`` contain.
+
+    Args:
+        texts: The texts.
+        origin: What contains them, for messages, such as ``--where``.
+
+    Raises:
+        GrammarError: If one is not a condition on known properties.
+    """
+    conditions = [parse_condition(text, origin) for text in texts]
+    for condition in conditions:
+        require_condition(condition)
+    return conditions
 
 
 def require_condition(expression: Expression) -> None:

@@ -88,7 +88,10 @@ def test_a_seed_gives_the_same_spheres_again():
 
 
 def test_protruding_share_of_a_ball_around_a_cube():
-    """Of a sphere of radius r around a cube of edge 2a < 2r, six caps of height r - a protrude."""
+    """A sphere of radius r around a cube of edge 2a has six caps outside of the cube.
+
+    Each cap has the height r - a.
+    """
     a, r = 0.05, 0.06
     measured = quality(solid_of([Shape(Box((2 * a,) * 3))]), [Shape(Sphere(r))])
     assert measured.protrusion_share == pytest.approx(6 * (r - a) / (2 * r), rel=0.01)

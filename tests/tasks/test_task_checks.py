@@ -1,4 +1,4 @@
-"""What a task of a user returns is checked: the message names the task and the part."""
+"""Errors about the types and shapes that a user's task returns name the task and the part."""
 
 from dataclasses import dataclass, replace
 
