@@ -60,7 +60,7 @@ AGENTS = {
     f"se{PAPER_AGENT}": "`se`, the paper's observations",
     f"se{PAPER_AGENT}@test": "`se` on the test robot",
 }
-BASELINES = ("scripted", "ik", "jacobian", "random")
+BASELINES = ("scripted", "ik", "jacobian", "random", "zero")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
 CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030", "#805ad5")
 sys.path.append(str(ROOT / "benchmarks"))
