@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
@@ -34,15 +35,22 @@ class Registry(Generic[T]):
     ``choices`` of a command line option.
     """
 
-    def __init__(self, kind: str, group: str, builtin: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        kind: str,
+        group: str,
+        builtin: Mapping[str, str],
+        require: Callable[[T], None] = lambda item: None,
+    ) -> None:
         """Create a registry.
 
         Args:
             kind: Noun for the objects in messages.
             group: Entry point group of other packages.
             builtin: Locations of morphgen's own objects by name, as ``module:attribute``.
+            require: Raises a ``TaskError`` for an object of others that lacks something.
         """
-        self.kind, self.group = kind, group
+        self.kind, self.group, self._require = kind, group, require
         self.builtin = tuple(builtin)
         """Names of morphgen's own objects, in their order."""
         self._builtin = builtin
@@ -55,12 +63,14 @@ class Registry(Generic[T]):
         own table and entry points. Use an entry point where several processes are needed.
 
         Raises:
-            TaskError: If another object has this name, or it is no such object, or a class.
+            TaskError: If another object has this name, or it is no such object, or a class, or
+                lacks something.
         """
         if isinstance(item, type) or not isinstance(getattr(item, "name", None), str):
             raise TaskError(f"{self.kind} {item!r}: expected an instance with a name")
         if item.name in self and self._loaded.get(item.name) is not item:
             raise TaskError(f"{self.kind} {item.name!r}: the name is taken; choose another")
+        self._require(item)
         self._loaded[item.name] = item
         return item
 
@@ -105,6 +115,8 @@ class Registry(Generic[T]):
                 f"{self.kind} {name!r}: entry point {path!r} is called "
                 f"{getattr(item, 'name', None)!r}; expected the name of the entry point"
             )
+        if name not in self._builtin:
+            self._require(item)
         return item
 
     @cached_property
@@ -115,10 +127,40 @@ class Registry(Generic[T]):
         return {entry.name: entry.value for entry in entry_points(group=self.group)}
 
 
+def _require_task(task: Task[Any, Any]) -> None:
+    """Require a task's name and constants, and methods that take the arguments of the interface.
+
+    Raises:
+        TaskError: If something is missing or differs.
+    """
+    from inspect import signature
+
+    where = f"task {task.name!r}"
+    if not re.fullmatch("[a-z][a-z0-9]*", task.name):
+        raise TaskError(f"{where}: expected a name of lower-case letters and digits")
+    for name in ("config_type", "goal_set_type", "goal_format", "cache_folder", "fields"):
+        if not hasattr(task, name):
+            raise TaskError(f"{where}: the class attribute {name!r} is missing")
+    config_type = task.config_type
+    if getattr(config_type, "task", None) != task.name:
+        raise TaskError(
+            f"{where}: {config_type.__name__}.task is {getattr(config_type, 'task', None)!r}; "
+            f"expected {task.name!r}"
+        )
+    keywords = ("obstacles", "ground", "seeds", "identity")
+    for name, count, names in (("sample", 2, keywords), ("certify", 3, ()), ("make_envs", 3, ())):
+        taken = signature(getattr(task, name))
+        try:
+            taken.bind(*range(count), **dict.fromkeys(names))
+        except TypeError as error:
+            raise TaskError(f"{where}: {name}{taken}: {error}") from error
+
+
 TASKS: Registry[Task[Any, Any]] = Registry(
     "task",
     "morphgen.tasks",
     {"reach": "morphgen.tasks.reach.task:REACH", "push": "morphgen.tasks.push.task:PUSH"},
+    _require_task,
 )
 """Tasks; see ``morphgen.tasks.task.Task``."""
 SIMULATORS: Registry[Simulator] = Registry(

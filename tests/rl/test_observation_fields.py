@@ -12,6 +12,8 @@ from morphgen.rl.inference import Policy
 from morphgen.rl.learner_state import state_of
 from morphgen.rl.observation_layout import Layout, layout_of
 from morphgen.rl.ppo import Learner
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import GOAL, ObservationField
 
@@ -26,8 +28,12 @@ class WindyLine(OnALine):
         return {**super().observe(), "wind": wind}
 
 
-class WindyTask:
-    name, fields = "windy", (GOAL, WIND)
+class WindyConfig(ReachConfig):
+    task = "windy"
+
+
+class WindyTask(Reach):
+    name, config_type, fields = "windy", WindyConfig, (GOAL, WIND)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.task import GOAL, ObservationField
+from morphgen.tasks.task import GOAL, ObservationField, Task
 
 EXTRA = ObservationField("extra", 1, GOAL.mask)
 
@@ -107,6 +107,33 @@ def test_a_sound_task_is_stepped(make):
 def test_faults_are_named(make, parts, message):
     with pytest.raises(TaskError, match=f"task 'hover': .*{message}"):
         make(**parts)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"name": "Hover-Task"}, "'Hover-Task': expected a name of lower-case letters and digits"),
+        ({"name": "float"}, "'float': HoverConfig.task is 'hover'; expected 'float'"),
+        ({"config_type": None}, "'hover': the class attribute 'config_type' is missing"),
+        (
+            {"sample": lambda self, robot, config: None},
+            r"'hover': sample\(robot, config\): got an unexpected keyword argument 'obstacles'",
+        ),
+        (
+            {"make_envs": lambda self: None},
+            r"'hover': make_envs\(\): too many positional arguments",
+        ),
+    ],
+)
+def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
+    monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+    described = {name: getattr(Reach, name) for name in ("goal_set_type", "goal_format", "fields")}
+    methods = {name: getattr(Reach, name) for name in ("sample", "certify", "make_envs")}
+    whole = {"name": "hover", "config_type": HoverConfig, "cache_folder": "hover", **described}
+    parts = {name: part for name, part in {**whole, **methods, **parts}.items() if part}
+    with pytest.raises(TaskError, match=f"task {message}"):
+        TASKS.register(type("Hover", (Task,), parts)())
+    assert parts["name"] not in TASKS
 
 
 def test_a_run_of_an_unknown_task_is_named():
