@@ -86,6 +86,7 @@ def test_policy_with_tool_position_is_evaluated_and_played(run):
     assert (code, out[:11]) == (0, "episode 1: ")
 
 
+@pytest.mark.slow
 def test_the_goal_of_the_training_is_that_of_all_commands_on_its_policy(run, tmp_path):
     quick = ("--steps", "32", "--no-tensorboard")
     assert run(*RUN, *quick, "--goal", "pose")[0] == 0

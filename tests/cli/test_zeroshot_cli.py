@@ -22,24 +22,13 @@ def test_shipped_policies_are_small_and_act_on_any_robot(name):
         assert (task in policy.tasks) == (task == run_config.source.task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "controllers"),
     [
-        pytest.param(
-            "--obstacles",
-            ["zero-shot-obstacles", "ik", "jacobian", "random"],
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "--goal pose",
-            ["zero-shot-pose", "ik", "jacobian", "random"],
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "--goal pose --obstacles",
-            ["zero-shot-pose-obstacles", "ik", "jacobian", "random"],
-            marks=pytest.mark.slow,
-        ),
+        ("--obstacles", ["zero-shot-obstacles", "ik", "jacobian", "random"]),
+        ("--goal pose", ["zero-shot-pose", "ik", "jacobian", "random"]),
+        ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
         ("--task push", ["zero-shot-push", "scripted", "random"]),
     ],
 )

@@ -12,7 +12,7 @@ from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import solid_of
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 
-SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 4, 5))]
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2, 3, 4, 5))]
 """Links of two and of three primitives; more of the same are slow."""
 
 

@@ -227,7 +227,9 @@ def test_a_diverged_environment_is_reset_once_and_the_step_undone(specs):
         assert all(values.float().isfinite().all() for values in part.values())
 
 
-@pytest.mark.parametrize("names", [("reach",), ("push",), MIXED])
+@pytest.mark.parametrize(
+    "names", [MIXED, *(pytest.param((task,), marks=pytest.mark.slow) for task in ("reach", "push"))]
+)
 def test_steps_and_resets_read_no_tensor(specs, names):
     batch = stub_batch(specs, names, 6, observe=CHANNELS)
     controller = Zero()

@@ -19,11 +19,14 @@ from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
+import warp as wp
+
 from morphgen.tasks.sim import warp_group, warp_sim
 from morphgen.tasks.sim.warp_model import structures
 from morphgen.tasks.sim.warp_sim import WarpSimulation
 from morphgen.tasks.step_graph import StepGraph
 
+wp.config.optimization_level = 0  # on an empty cache, compiling takes longer than the tests
 IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
 DIFFERENT = ("arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims", "chain beads=2")
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -95,6 +98,7 @@ def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(ar
         assert torch.allclose(together.q[i], alone.q[0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_environments_that_do_not_repeat_in_order_have_a_row_each(arms):
     order = (0, 0, 2, 1, 2)
     scenes = [arms[i] for i in order]
@@ -169,7 +173,8 @@ def test_contacts_that_do_not_fit_are_reported(monkeypatch):
     assert sim.counts[0, 1] == 1
 
 
-@pytest.mark.parametrize("aside", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
+@pytest.mark.slow
+@pytest.mark.parametrize("aside", [0.0, 0.05])
 def test_blocks_are_pushed_as_in_mujoco(aside):
     """The gantry's vertical plate pushes the block at 0.2 m/s without touching the ground."""
     scenes = [push_scene()]
@@ -187,6 +192,7 @@ def test_blocks_are_pushed_as_in_mujoco(aside):
     assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
 
 
+@pytest.mark.slow
 def test_dropped_blocks_spin_and_come_to_rest_as_in_mujoco():
     pose = Pose.from_xyz_rpy((0.3, -0.4, 0.2), (0.2, 0.1, 0.4))
     scenes = [Scene(robot("prims"), Pose((5, 0, 0)), Block((0.15,) * 3, pose, 0.1))]
@@ -226,6 +232,7 @@ def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
     assert torch.allclose(sim.block_pose[:, 2], tops, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_reset_moves_obstacles_and_blocks_without_mass():
     scene = push_scene()
     fixed = replace(scene, block=replace(scene.block, mass=0.0))
@@ -270,7 +277,7 @@ def test_policies_of_the_simulator_are_judged_in_mujoco():
     assert evaluation_simulator("warp") == "mujoco"
 
 
-@pytest.mark.parametrize("task", ["reach", "push"])
+@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "push"])
 def test_a_batch_has_the_episodes_and_nearly_the_steps_of_mujoco(task):
     """The same seed gives the same starts and goals, and the same actions the same rewards."""
     robots = ["arm=ur5 ee=stick", "arm=xarm7 ee=stick"]
