@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
+from inspect import signature
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from morphgen.errors import MissingDependencyError, TaskError, nearest
@@ -90,7 +91,8 @@ class Registry(Generic[T]):
         """Return the object of a name.
 
         Raises:
-            TaskError: If the name is unknown, or the object cannot be imported or has another name.
+            TaskError: If the name is unknown, or the object cannot be imported, has another name or
+                lacks something.
         """
         if name not in self._loaded:
             self._loaded[name] = self._load(name)
@@ -133,20 +135,15 @@ def _require_task(task: Task[Any, Any]) -> None:
     Raises:
         TaskError: If something is missing or differs.
     """
-    from inspect import signature
-
     where = f"task {task.name!r}"
     if not re.fullmatch("[a-z][a-z0-9]*", task.name):
         raise TaskError(f"{where}: expected a name of lower-case letters and digits")
     for name in ("config_type", "goal_set_type", "goal_format", "cache_folder", "fields"):
         if not hasattr(task, name):
             raise TaskError(f"{where}: the class attribute {name!r} is missing")
-    config_type = task.config_type
-    if getattr(config_type, "task", None) != task.name:
-        raise TaskError(
-            f"{where}: {config_type.__name__}.task is {getattr(config_type, 'task', None)!r}; "
-            f"expected {task.name!r}"
-        )
+    named = getattr(task.config_type, "task", None)
+    if named != task.name:
+        raise TaskError(f"{where}: config_type.task is {named!r}; expected {task.name!r}")
     keywords = ("obstacles", "ground", "seeds", "identity")
     for name, count, names in (("sample", 2, keywords), ("certify", 3, ()), ("make_envs", 3, ())):
         taken = signature(getattr(task, name))

@@ -113,7 +113,7 @@ def test_faults_are_named(make, parts, message):
     ("parts", "message"),
     [
         ({"name": "Hover-Task"}, "'Hover-Task': expected a name of lower-case letters and digits"),
-        ({"name": "float"}, "'float': HoverConfig.task is 'hover'; expected 'float'"),
+        ({"name": "float"}, "'float': config_type.task is 'hover'; expected 'float'"),
         ({"config_type": None}, "'hover': the class attribute 'config_type' is missing"),
         (
             {"sample": lambda self, robot, config: None},
