@@ -26,6 +26,10 @@ class Named(Protocol):
 
 
 T = TypeVar("T", bound=Named)
+_RESERVED = frozenset(
+    {"tokens", "links", "actions", "velocity", "previous_action", "tool", "points", "obstacles"}
+)
+"""Entries of observations that are no fields of tasks."""
 
 
 class Registry(Generic[T]):
@@ -130,11 +134,13 @@ class Registry(Generic[T]):
 
 
 def _require_task(task: Task[Any, Any]) -> None:
-    """Require a task's name and constants, and methods that take the arguments of the interface.
+    """Require a task's name, constants and fields, and methods that take their arguments.
 
     Raises:
-        TaskError: If something is missing or differs.
+        TaskError: If something is missing or differs, or a field has a name that is taken.
     """
+    from morphgen.tasks.task import STANDARD_FIELDS  # imports numpy, which names alone do not need
+
     where = f"task {task.name!r}"
     if not re.fullmatch("[a-z][a-z0-9]*", task.name):
         raise TaskError(f"{where}: expected a name of lower-case letters and digits")
@@ -144,6 +150,12 @@ def _require_task(task: Task[Any, Any]) -> None:
     named = getattr(task.config_type, "task", None)
     if named != task.name:
         raise TaskError(f"{where}: config_type.task is {named!r}; expected {task.name!r}")
+    standard = {field.name: field for field in STANDARD_FIELDS}
+    for field in task.fields:
+        if field.name in _RESERVED or standard.get(field.name, field) != field:
+            raise TaskError(
+                f"{where}: observation field {field.name!r}: the name is taken; choose another"
+            )
     keywords = ("obstacles", "ground", "seeds", "identity")
     for name, count, names in (("sample", 2, keywords), ("certify", 3, ()), ("make_envs", 3, ())):
         taken = signature(getattr(task, name))

@@ -12,31 +12,19 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.tasks.step_result import StepResult
-from morphgen.tasks.task import STANDARD_FIELDS, Task, TaskEnvs
-
-RESERVED = frozenset(
-    {"tokens", "links", "actions", "velocity", "previous_action", "tool", "points", "obstacles"}
-)
-"""Entries of observations that are no fields of tasks."""
+from morphgen.tasks.task import Task, TaskEnvs
 
 
 def require_envs(task: Task[Any, Any], envs: object) -> None:
-    """Require the environments of a task, and fields that do not contradict the standard ones.
+    """Require what ``Task.make_envs`` returns.
 
     Raises:
-        TaskError: If ``make_envs`` returned something else, or a field has a name that is taken.
+        TaskError: If it is something else.
     """
     if not isinstance(envs, TaskEnvs):
         raise TaskError(
             f"task {task.name!r}: make_envs returned {type(envs).__name__}; expected TaskEnvs"
         )
-    standard = {field.name: field for field in STANDARD_FIELDS}
-    for field in task.fields:
-        if field.name in RESERVED or standard.get(field.name, field) != field:
-            raise TaskError(
-                f"task {task.name!r}: observation field {field.name!r}: the name is taken; choose "
-                "another"
-            )
 
 
 def require_start(task: str, start: object, k: int, num_joints: int) -> None:

@@ -70,6 +70,17 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
         assert any(numbers <= {cell.split(" ")[0] for cell in line} for line in DOCS), agent
 
 
+@pytest.mark.parametrize("file", sorted((ROOT / "results/many-episodes").glob("*.json")))
+def test_results_of_many_episodes_are_those_of_the_page(file):
+    ((row,),) = json.loads(file.read_text("utf-8")).values()
+    assert row["episodes"] == 510
+    score = f"{row['score']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
+    name, _, sim = file.stem.rpartition("-")
+    column = {"mujoco": 2, "pybullet": 4}[sim]
+    cells = [line[column : column + 2] for line in DOCS if line[1:2] and f"`{name}`" in line[1]]
+    assert [score, f"{row['success']:.1%}"] in cells
+
+
 def test_scores_follow_from_the_stored_episodes():
     submissions = read_submissions([ROOT / "results"])
     assert len(submissions) > 60
