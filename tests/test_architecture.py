@@ -128,11 +128,11 @@ def test_every_package_has_a_layer():
 
 
 @pytest.mark.parametrize("folder", [*FOLDERS, ROOT / "tests"], ids=lambda folder: folder.name)
-def test_modules_are_short(folder):
+def test_no_module_is_too_long(folder):
     modules = folder.rglob("*.py")
     lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in modules}
     assert lengths
-    assert {str(path): n for path, n in lengths.items() if n > 400} == {}
+    assert {str(path): n for path, n in lengths.items() if n > 1000} == {}
 
 
 def modules_after(statement):
