@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from lxml import etree
-
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf_read import read_mjcf
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf import read_urdf, require_description_file
+from morphgen.formats.xml import root_tag
 from morphgen.model.robot import Robot
 
 SUFFIXES = (".urdf", ".xacro", ".xml")
 """File name suffixes of robot descriptions."""
-_BLOCK = 64 * 2**10
-"""Number of bytes that are parsed at a time to find the root element."""
-_MAX_BLOCKS = 16
-"""Number of blocks within which the root element of an MJCF begins."""
+_MAX_HEAD = 2**20
+"""Number of bytes within which the root element of an MJCF begins."""
 
 
 def read_description(
@@ -54,7 +51,7 @@ def read_description(
 
 
 def is_mjcf(path: Path) -> bool:
-    """Return whether a file is an MJCF: its root element is ``<mujoco>``, and the XML so far valid.
+    """Return whether a file is an MJCF: its root element is ``<mujoco>``.
 
     A file with the suffix ``.xacro`` is none; it is not opened.
 
@@ -63,18 +60,5 @@ def is_mjcf(path: Path) -> bool:
     """
     if path.suffix == ".xacro" or not path.is_file():
         return False
-    parser = etree.XMLPullParser(
-        ("start",), resolve_entities=False, no_network=True, load_dtd=False
-    )
     with path.open("rb") as file:
-        for _ in range(_MAX_BLOCKS):
-            block = file.read(_BLOCK)
-            try:
-                parser.feed(block)
-            except etree.XMLSyntaxError:
-                block = b""
-            for _, element in parser.read_events():
-                return isinstance(element, etree._Element) and element.tag == "mujoco"
-            if not block:
-                return False
-    return False
+        return root_tag(file.read(_MAX_HEAD)) == "mujoco"

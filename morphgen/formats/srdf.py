@@ -12,7 +12,7 @@ from typing import TypeAlias
 from lxml import etree
 
 from morphgen.errors import FormatError, nearest
-from morphgen.formats.urdf_schema import shortened
+from morphgen.formats.xml import shortened
 from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 

@@ -26,8 +26,7 @@ from morphgen.formats.srdf import (
     LinkSpheres,
     Srdf,
 )
-from morphgen.formats.urdf_schema import shortened
-from morphgen.formats.xml import parse_xml
+from morphgen.formats.xml import parse_xml, shortened
 
 _Flat = TypeVar("_Flat", bound=FlatElement | Chain)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from lxml import etree
 
+from morphgen.formats.xml import shortened
 from morphgen.model.findings import Finding
 
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -20,8 +21,6 @@ MIN_LENGTH = 1e-6
 """Smallest length of a primitive [m]; simulators round smaller ones to zero."""
 MAX_TEXT = 1000
 """Longest name or file name in a URDF [characters]."""
-SHOWN_TEXT = 80
-"""Longest excerpt of a text in a message [characters]."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +45,6 @@ class UrdfLocation:
         """Return a finding at an element's line: a warning if reading repairs it, else an error."""
         where = f"{self.origin}:{element.sourceline} {self.owner}"
         return Finding(code, "warning" if repair else "error", where, why, fix, repair)
-
-
-def shortened(text: str) -> str:
-    """Return the beginning of a text, for a message."""
-    return text if len(text) <= SHOWN_TEXT else f"{text[: SHOWN_TEXT - 3]}..."
 
 
 @dataclass(frozen=True)

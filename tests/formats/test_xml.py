@@ -117,3 +117,108 @@ def test_other_errors_are_found_despite_undeclared_prefixes() -> None:
         parse_description(
             b'\n<?xml version="0.0"?><!DOCTYPE r [<!ENTITY e "x">]><r a:b="1">&e;</r>', "r.urdf"
         )
+
+
+def described(
+    body: bytes = b"", name: bytes = b"r", before: bytes = b"", after: bytes = b""
+) -> bytes:
+    return before + b'<robot name="' + name + b'">\n' + body + b'<link name="l"/></robot>' + after
+
+
+# What each loader does was tried: Pinocchio 4.1, MuJoCo 4.0, PyBullet 3.2.7 (all three parse by
+# tinyxml2) and yourdfpy 0.0.60 (libxml2's recovery).
+@pytest.mark.parametrize(
+    ("data", "name", "repair"),
+    [
+        (described(b"<!-- a -- b -->"), "r", "invalid comments"),
+        (described(b"<!-- a --->"), "r", "invalid comments"),
+        (described(before=b"<!-- a -- b -->"), "r", "invalid comments"),
+        (described(b"<!-- \x01 -->"), "r", "invalid comments"),
+        (described(name=b"Arm & Hand"), "Arm & Hand", "bare '&'"),
+        (described(b" a & b "), "r", "bare '&'"),
+        (described(name=b"a&nbsp;b"), "a&nbsp;b", "bare '&'"),
+        (described(name=b"a&amp b &lt;"), "a&amp b <", "bare '&'"),
+        (described(after=b"\nthe end"), "r", "text after"),
+        (described(after=b"</robot>"), "r", "text after"),
+        (described(after=b'<robot name="second"><link name="m"/></robot>'), "r", "text after"),
+        (described(after=b"<!-- a -- b -->"), "r", "text after"),
+        (described(after=b"\x00\x00"), "r", "text after"),
+        (described(after=b"<!-- not closed"), "r", "text after"),
+        (described(before=b"junk"), "r", "text before"),
+        (described(before=b"\xef\xbb\xbf\xef\xbb\xbf"), "r", "text before"),
+        (described(name=b"a<b>"), "a<b>", "attributes with '<'"),
+        (described(b'<a b="1"c="2"/>'), "r", "attributes with '<'"),
+        (described(name=b"a\x01b"), "a\ufffdb", "U+FFFD"),
+        (described(b" ]]> "), "r", "as tinyxml2 does"),
+        (described(b"< a/>"), "r", "as tinyxml2 does"),
+        (described(name=b"t\xefp"), "t\xefp", "read as latin1"),
+        (described(b"<!-- t\xefp -->"), "r", "read as latin1"),
+        (described(before=b'<?xml version="1.0" encoding="foo-8"?>'), "r", "read as utf-8"),
+        (described(before=b'<?xml version="1.0" encoding="utf-16"?>'), "r", "read as utf-8"),
+        (
+            described(before=b'<?xml version="1.0" encoding="us-ascii"?>', name=b"t\xc3\xafp"),
+            "t\xefp",
+            "read as utf-8",
+        ),
+        (described(before=b'<?xml encoding="utf-8"?>'), "r", "version was read as 1.0"),
+        (described(b'<?xml version="1.0"?>'), "r", "XML declaration"),
+        (described(b"<!foo>"), "r", "'<!foo>' was left out"),
+    ],
+)
+def test_what_loaders_read_although_it_is_not_xml_is_read_with_a_warning(
+    data: bytes, name: str, repair: str
+) -> None:
+    failure(data)
+    root, (finding,) = parse_description(data, "robot.urdf")
+    assert root.get("name") == name
+    assert [link.get("name") for link in root.iterfind("link")] == ["l"]
+    assert root.find("link").sourceline == 2
+    assert finding.severity == "warning"
+    assert repair in finding.repair
+    assert finding.where.startswith("robot.urdf:")
+
+
+def test_a_declared_encoding_counts_in_a_document_that_is_repaired() -> None:
+    text = '<?xml version="1.0" encoding="{}"?><robot name="{}"/><!-- a -- b -->'
+    for encoding, name in (("ISO-8859-1", "é"), ("gb2312", "机器人"), ("utf-16", "é")):
+        root, _ = parse_description(text.format(encoding, name).encode(encoding), "r.urdf")
+        assert root.get("name") == name
+
+
+def test_repairs_of_a_kind_are_one_finding_with_a_count() -> None:
+    data = described(b"\n<!-- a -- b -->" * 3 + b" x & y ")
+    _, (comments, ampersand) = parse_description(data, "r.urdf")
+    assert "(3 times)" in comments.why
+    assert comments.where == "r.urdf:3 document"
+    assert "times" not in ampersand.why
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        described(b'<link name="a" name="b"/>'),
+        described(b"<link name/>"),
+        described(b"<link name=a/>"),
+        described(b"a < b"),
+        described(b"<a></b>"),
+        described()[:-8],
+        described(b"<!-- a"),
+        described(b"<![CDATA[ a"),
+        b"<!-- a -- b -->",
+    ],
+)
+def test_what_has_two_meanings_stays_an_error(data: bytes) -> None:
+    with pytest.raises(FormatError, match=r"^robot.urdf:\d+:\d+: "):
+        parse_description(data, "robot.urdf")
+
+
+@pytest.mark.parametrize("fault", [b"<!-- a -- b -->", b"x & y", b'<a b="<"/>', b""])
+@pytest.mark.parametrize("doctype", [b"<!DOCTYPE r>", b'<!doctype r [<!ENTITY e "x">]>'])
+@pytest.mark.parametrize("place", ["before", "body", "after"])
+def test_a_doctype_is_an_error_beside_other_faults(
+    fault: bytes, doctype: bytes, place: str
+) -> None:
+    pieces = {"before": b"", "body": b"", "after": b"", place: doctype}
+    body = pieces.pop("body") + fault
+    with pytest.raises(FormatError):
+        parse_description(described(body, **pieces), "robot.urdf")
