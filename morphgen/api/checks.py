@@ -8,10 +8,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.checks.conformance import ConformanceReport, conformance
+from morphgen.checks.conformance import ConformanceReport, compare
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
+from morphgen.formats.gate import loader_copy
 from morphgen.formats.urdf import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import (
@@ -173,8 +174,10 @@ def _conform_robot(robot: Robot, samples: int, seed: int) -> ConformanceReport:
 
 
 def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
-    report, robot = conformance(bundle, samples, seed), read_bundle(bundle)
-    holds = (*hold_files(robot, bundle), *_hold_in_environments(robot))
+    robot = read_bundle(bundle)
+    with loader_copy(bundle) as folder:
+        report = compare(robot, folder, samples, seed)
+        holds = (*hold_files(robot, folder), *_hold_in_environments(robot))
     return replace(
         report,
         passed=report.passed and all(row.passed is not False for row in holds),

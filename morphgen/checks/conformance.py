@@ -15,6 +15,7 @@ from morphgen.checks.joint_readings import compare_joints
 from morphgen.checks.readers import LOADERS, Loader
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle
+from morphgen.formats.gate import loader_copy
 from morphgen.formats.urdf_text import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot
@@ -103,11 +104,15 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
     Raises:
         FormatError: If ``bundle_dir`` is not a bundle, ``samples`` is below 1 or ``seed`` below 0.
     """
-    return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
+    robot = read_bundle(bundle_dir)
+    with loader_copy(bundle_dir) as folder:
+        return compare(robot, folder, samples, seed)
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
     """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``.
+
+    The loaders open the folder, so it must be morphgen's own or a ``loader_copy``.
 
     Raises:
         FormatError: If ``samples`` is below 1, ``seed`` below 0, or one of them no whole number.

@@ -279,23 +279,30 @@ def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
             if not isinstance(mesh, Mesh) or mesh in files:
                 continue
             folder.mkdir(exist_ok=True)
-            triangles = load_mesh(mesh)
-            if len(triangles.faces) <= MAX_STL_FACES:
-                data, suffix = export_stl(triangles), "stl"
-            else:  # too large for MuJoCo's STL reader
-                obj = export_obj(triangles, include_normals=False, header=None)
-                data, suffix = obj.encode(), "obj"
-            digest = hashlib.sha256(data).hexdigest()[:8]
-            # The name of a mesh that another bundle wrote already ends with a digest.
-            base, dash, last_word = mesh.path.stem.rpartition("-")
-            stem = base if dash and len(last_word) == 8 else mesh.path.stem
-            safe_stem = "".join(
-                c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in stem
-            )
-            name = f"{safe_stem}-{digest}.{suffix}"
+            name, data = mesh_file(mesh)
             (folder / name).write_bytes(data)
             files[mesh] = f"{MESHES}/{name}"
     return files
+
+
+def mesh_file(mesh: Mesh) -> tuple[str, bytes]:
+    """Return the name and content of the file that every loader can read for a mesh.
+
+    Raises:
+        MeshError: If the mesh cannot be read.
+    """
+    triangles = load_mesh(mesh)
+    if len(triangles.faces) <= MAX_STL_FACES:
+        data, suffix = export_stl(triangles), "stl"
+    else:  # too large for MuJoCo's STL reader
+        obj = export_obj(triangles, include_normals=False, header=None)
+        data, suffix = obj.encode(), "obj"
+    digest = hashlib.sha256(data).hexdigest()[:8]
+    # The name of a mesh that another bundle wrote already ends with a digest.
+    base, dash, last_word = mesh.path.stem.rpartition("-")
+    stem = base if dash and len(last_word) == 8 else mesh.path.stem
+    safe_stem = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in stem)
+    return f"{safe_stem}-{digest}.{suffix}", data
 
 
 def write_fits(robot: Robot, folder: Path) -> None:

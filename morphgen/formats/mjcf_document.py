@@ -28,6 +28,23 @@ MAX_COPIES = 10_000
 GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
 """Types of geoms that a robot can have, for errors."""
 
+_IGNORED = ("size", "visual", "statistic", "custom", "sensor", "deformable")
+"""Sections without a counterpart in ``Robot``. Some allocate memory as the file demands."""
+_ASSETS = ("mesh", "material", "hfield")
+"""Assets that are kept; textures, skins and models would be read from files."""
+_ELEMENTS = frozenset(
+    [
+        *("mujoco", "mujocoinclude", "include", "compiler", "option", "flag", "default", *_ASSETS),
+        *("asset", "worldbody", "body", "frame", "replicate", "inertial", "joint", "freejoint"),
+        *("geom", "site", "camera", "light", "contact", "pair", "exclude", "tendon", "spatial"),
+        *("fixed", "pulley", "equality", "connect", "weld", "keyframe", "key", "actuator"),
+        *("general", "motor", "position", "velocity", "intvelocity", "orientation", "pid"),
+        *("damper", "cylinder", "muscle", "adhesion", "dcmotor"),
+    ]
+)
+"""Elements that MuJoCo gets. All others are refused or left out."""
+_LEFT_OUT = frozenset([*_IGNORED, "texture", "skin", "model", "layer", "lengthrange"])
+"""Elements that are left out with everything in them, wherever they are."""
 _REFUSED = {
     "plugin": "plugins are code",
     "extension": "plugins are code",
@@ -35,12 +52,13 @@ _REFUSED = {
     "composite": "a robot has rigid links",
     "flexcomp": "a robot has rigid links",
     "flex": "a robot has rigid links",
+    "flexstrain": "a robot has rigid links",
 }
 """Elements that are refused, and why."""
-_IGNORED = ("option", "size", "visual", "statistic", "custom", "sensor", "deformable")
-"""Sections without a counterpart in ``Robot``. Some allocate memory as the file demands."""
-_ASSETS = ("mesh", "material", "hfield")
-"""Assets that are kept; textures, skins and models would be read from files."""
+_FILES = re.compile(r"file|file(back|down|front|left|right|up)|(asset|mesh|texture)dir")
+"""Attributes that name files or folders."""
+_ALLOCATING = ("user", "act", "actdim", "nsample", "delay", "interp")
+"""Attributes by which MuJoCo allocates memory, for values that a robot does not have."""
 _LINE = re.compile(r",? line \d+(, column \d+)?")
 
 
@@ -67,12 +85,20 @@ class MjcfDocument:
         return FormatError(f"{self.path}: {' '.join(_LINE.sub('', why).split())}")
 
 
-def read_document(path: Path, finder: PackageFinder) -> MjcfDocument:
+def read_document(path: Path, finder: PackageFinder, *, with_options: bool = False) -> MjcfDocument:
     """Read an MJCF with its includes, and resolve the files of its meshes.
 
     Included files come from the folders that ``require_allowed_text`` allows, meshes from those of
     ``resolve_uri``. Their names are relative to the folder of ``path``; those of a nested include
     also to the folder of the file that includes it. Textures, height fields and skins are not read.
+
+    MuJoCo gets the elements of an allow-list. It ignores namespaces, which would hide an element
+    from that list, so names with a namespace are refused.
+
+    Args:
+        path: The file.
+        finder: Finds ROS packages, and the folder that files may come from.
+        with_options: Whether to keep the options of a simulation.
 
     Raises:
         UnsoundError: If a mesh is not found; it lists all of them.
@@ -81,25 +107,26 @@ def read_document(path: Path, finder: PackageFinder) -> MjcfDocument:
     """
     includes = _Includes(path, finder)
     root, findings = includes.read(path, 0)
-    _require_supported(root, path)
-    for section in [*root.iterchildren(*_IGNORED)]:
-        root.remove(section)
-    for asset in [*root.iterfind("asset/*")]:
-        if asset.tag not in _ASSETS:
-            _remove(asset)
-    for element in root.iter():
-        # MuJoCo allocates the longest ``user`` of an element for all elements of its kind.
-        _drop(element, "user")
-    for element in root.iter("material", "light"):
-        _drop(element, "texture")
-        for layer in [*element]:
-            element.remove(layer)
+    etree.cleanup_namespaces(root)
+    _require_bounded_copies(root, path)
+    if not with_options:
+        for element in [*root.iterchildren("option")]:
+            root.remove(element)
     for field in root.iterfind("asset/hfield"):
         field.set("name", field.get("name") or PurePosixPath(field.get("file", "")).stem)
         _drop(field, "file", "content_type", "elevation")
         field.set("nrow", "2")
         field.set("ncol", "2")
+    for element in root.iter("material", "light"):
+        _drop(element, "texture")
     meshes = _take_mesh_files(root, path, finder)
+    for element in root.iter():
+        _drop(element, *_ALLOCATING)
+        if named := [key for key in element.attrib if _FILES.fullmatch(str(key))]:
+            raise FormatError(
+                f"{path}: <{element.tag}> has the attribute {named[0]!r}; only assets, includes "
+                "and the compiler name files"
+            )
     where = str(path)
     return MjcfDocument(
         path,
@@ -136,6 +163,7 @@ class _Includes:
         data = read_bytes(path, self._bytes_left)
         self._bytes_left -= len(data)
         root, findings = parse_description(data, str(path))
+        _keep_known(root, path)
         for element in [*root.iter("include")]:
             included = self._file(element, path)
             child, more = self.read(included, depth + 1)
@@ -174,18 +202,45 @@ class _Includes:
         return file
 
 
-def _require_supported(root: etree._Element, path: Path) -> None:
+def _keep_known(root: etree._Element, path: Path) -> None:
+    """Remove what a robot does not need from a file, and refuse what MuJoCo must not get."""
+    if root.tag not in ("mujoco", "mujocoinclude"):
+        raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
+    _require_plain(root, path)
+    for element in [*root.iter()]:
+        tag = str(element.tag)
+        if tag in _REFUSED:
+            name = element.get("name") or element.get("plugin") or element.get("model")
+            label = f"<{tag}>" if name is None else f"<{tag}> {name!r}"
+            raise FormatError(f"{path}: {label} is refused: {_REFUSED[tag]}")
+        if tag == "mesh" and "builtin" in element.attrib:
+            raise FormatError(
+                f"{path}: mesh {element.get('name')!r} is built in MuJoCo; give it a file, or use "
+                "a primitive geom"
+            )
+    for element in [*root.iter(*_LEFT_OUT)]:
+        _remove(element)
+    for element in root.iter():
+        if element.tag not in _ELEMENTS:
+            raise FormatError(
+                f"{path}:{element.sourceline}: <{element.tag}> is no element of MJCF that is read"
+            )
+
+
+def _require_plain(root: etree._Element, path: Path) -> None:
+    """Require names without a namespace."""
+    for element in root.iter():
+        for name in map(etree.QName, (str(element.tag), *map(str, element.attrib))):
+            if name.namespace is not None:
+                raise FormatError(
+                    f"{path}:{element.sourceline}: {name.localname!r} has the namespace "
+                    f"{name.namespace!r}; names in an MJCF have none, remove it"
+                )
+
+
+def _require_bounded_copies(root: etree._Element, path: Path) -> None:
     if root.tag != "mujoco":
         raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
-    for element in root.iter(*_REFUSED):
-        name = element.get("name") or element.get("plugin") or element.get("model")
-        label = f"<{element.tag}>" if name is None else f"<{element.tag}> {name!r}"
-        raise FormatError(f"{path}: {label} is refused: {_REFUSED[str(element.tag)]}")
-    for mesh in root.iterfind("asset/mesh[@builtin]"):
-        raise FormatError(
-            f"{path}: mesh {mesh.get('name')!r} is built in MuJoCo; give it a file, or use a "
-            "primitive geom"
-        )
     copies = sum(_copies(element, path) for element in root.iter("replicate"))
     if copies > MAX_COPIES:
         raise FormatError(

@@ -1,0 +1,125 @@
+"""Copies of strangers' robots that other libraries may open.
+
+A library opens whatever a description names: files elsewhere on the machine, pipes that never end,
+meshes with references of their own. Therefore a loader gets a copy: the description with known
+elements only, its includes inserted, and its meshes rewritten, in a private folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from lxml import etree
+
+from morphgen.formats.bundle import MJCF, URDF, mesh_file
+from morphgen.formats.data_files import read_bytes
+from morphgen.formats.description import is_mjcf
+from morphgen.formats.mjcf_compile import compile_document
+from morphgen.formats.mjcf_document import read_document
+from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
+from morphgen.formats.urdf import MAX_URDF_BYTES, require_description_file, robot_from_xml
+from morphgen.formats.urdf_schema import CHILDREN
+from morphgen.formats.xacro import expand
+from morphgen.formats.xml import parse_description
+from morphgen.model.geometry import Mesh
+
+_CHILDREN = {
+    **CHILDREN,
+    "robot": ("link", "joint", "material", "mujoco"),
+    "mujoco": ("compiler", "option"),
+    "option": ("flag",),
+}
+"""Child elements of a URDF that loaders get, by parent element."""
+_FILE_ATTRIBUTES = ("assetdir", "meshdir", "strippath", "texturedir")
+"""Attributes of ``<compiler>`` that say where files lie; in the copy they lie beside it."""
+
+
+@contextmanager
+def loader_copy(
+    path: Path, finder: PackageFinder | None = None, args: Mapping[str, str] | None = None
+) -> Iterator[Path]:
+    """Yield a private folder with a copy of a robot that other libraries may open.
+
+    Args:
+        path: A bundle's folder, a URDF, a xacro or an MJCF. Nothing in it is trusted.
+        finder: Finds ROS packages, and the folder that files may come from.
+        args: Values of the xacro's arguments.
+
+    Yields:
+        The folder, which is removed afterwards. It holds ``robot.urdf`` of a bundle, a URDF or a
+        xacro, ``robot.xml`` of a bundle or an MJCF, and beside them their meshes as STL or OBJ.
+        Elements that a robot does not need are left out.
+
+    Raises:
+        UnsoundError: If the tree of a URDF is broken or a mesh is not found.
+        MeshError: If a mesh cannot be read.
+        FormatError: If a file cannot be read, is refused, or names one outside of its folder.
+    """
+    finder = finder or default_finder()
+    files = [path / URDF, path / MJCF] if path.is_dir() else [path]
+    with TemporaryDirectory(prefix="morphgen-") as name:
+        folder = Path(name)
+        for file in files:
+            if path.is_dir() and not file.exists():
+                continue  # a loader says that it is missing
+            require_description_file(file)
+            if file.name == MJCF if path.is_dir() else is_mjcf(file):
+                _copy_mjcf(file, folder, finder)
+            else:
+                _copy_urdf(file, folder, finder, args or {})
+        yield folder
+
+
+def _copy_mjcf(path: Path, folder: Path, finder: PackageFinder) -> None:
+    document = read_document(path, finder, with_options=True)
+    compile_document(document)
+    root = etree.fromstring(document.text)
+    copied = _mesh_copies(folder)
+    for element in root.iterfind("asset/mesh[@name]"):
+        if element.get("name", "") in document.meshes:
+            element.set("file", copied(document.meshes[element.get("name", "")]))
+    (folder / MJCF).write_bytes(etree.tostring(root, encoding="utf-8"))
+
+
+def _copy_urdf(path: Path, folder: Path, finder: PackageFinder, args: Mapping[str, str]) -> None:
+    if path.suffix == ".xacro":
+        data = expand(path, args, finder)
+    else:
+        data = read_bytes(path, MAX_URDF_BYTES)
+    robot_from_xml(data, path, finder)
+    root, _ = parse_description(data, str(path))
+    _keep_known(root)
+    copied = _mesh_copies(folder)
+    for element in root.iter("mesh"):
+        element.set("filename", copied(resolve_uri(element.get("filename", ""), path, finder)))
+    (folder / URDF).write_bytes(etree.tostring(root, encoding="utf-8"))
+
+
+def _keep_known(element: etree._Element) -> None:
+    """Remove elements that loaders do not get, names with a namespace, and empty shapes."""
+    for key in [*element.attrib]:
+        if key.startswith("{") or (element.tag == "compiler" and key in _FILE_ATTRIBUTES):
+            del element.attrib[key]
+    for child in [*element]:
+        if child.tag not in _CHILDREN.get(str(element.tag), ()):
+            element.remove(child)
+            continue
+        _keep_known(child)
+        if child.tag in ("visual", "collision") and not len(child.findall("geometry/*")):
+            element.remove(child)
+
+
+def _mesh_copies(folder: Path) -> Callable[[Path], str]:
+    """Return a function that writes a mesh into a folder and returns its name there."""
+    names: dict[Path, str] = {}
+
+    def copied(path: Path) -> str:
+        if path not in names:
+            names[path], data = mesh_file(Mesh(path))
+            (folder / names[path]).write_bytes(data)
+        return names[path]
+
+    return copied
