@@ -25,9 +25,9 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.formats.data_files import read_json
-from morphgen.rl.intervals import Interval, wilson_interval
+from morphgen.rl.intervals import Interval
 from morphgen.rl.runs import read_config
-from morphgen.rl.scores import Score, score_from_json
+from morphgen.rl.scores import Score, score_from_json, success_of
 from morphgen.rl.study_cells import stored_cell, tuned_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -115,10 +115,7 @@ def results_of(study: str, split: str, task: str | None = None) -> dict[tuple[st
 
 def _result(seeds: list[list[Score]]) -> Result:
     scores = [score for seed in seeds for score in seed]
-    successes = sum(round(score.success * score.episodes) for score in scores)
-    episodes = sum(score.episodes for score in scores)
-    success = wilson_interval(successes, episodes)
-    return Result(len(seeds), mean(score.score for score in scores), success)
+    return Result(len(seeds), mean(score.score for score in scores), success_of(scores))
 
 
 def by_mean(modes: Modes) -> Mapping[Side, Result]:

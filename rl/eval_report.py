@@ -7,7 +7,6 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from tabulate import tabulate
 
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
-from morphgen.rl.scores import Score, scores_to_json
+from morphgen.rl.scores import SCORE_KEYS, Score, scores_to_json, success_of
 
 SIDES = {"train": "MT", "test": "ZS"}
 """The paper's names of the mean score of a side: multi-task and zero-shot."""
@@ -42,8 +41,8 @@ def summary(scores_by_mode: Scores) -> str:
         for side, task in groups:
             own = [each for each in scores if (each.side, each.task) == (side, task)]
             score = np.mean([each.score for each in own])
-            success = np.mean([each.success for each in own])
-            means.append(f"{SIDES[side]} {task} {score:.2f}, success {success:.0%}")
+            success = success_of(own).as_percent()
+            means.append(f"{SIDES[side]} {task} {score:.2f}, success {success}")
         unstable = sum(each.unstable for each in scores)
         if unstable:
             means.append(f"{UNSTABLE}: {unstable}")
@@ -80,8 +79,7 @@ def write_scores(path: Path, scores_by_mode: Scores) -> None:
         write_file(path, score_table(scores_by_mode, "github") + "\n")
     else:
         text = io.StringIO()
-        names = ["mode", *(field.name for field in fields(Score))]
-        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer = csv.DictWriter(text, ["mode", *SCORE_KEYS], lineterminator="\n")
         writer.writeheader()
         for mode, rows in data.items():
             writer.writerows({"mode": mode, **row} for row in rows)
@@ -98,7 +96,7 @@ def _row(mode: str, score: Score) -> tuple[str, ...]:
         mode,
         f"{score.score:.2f}",
         interval,
-        f"{score.success:.0%}",
+        success_of([score]).as_percent(),
         f"{score.raw:.2f}",
         f"{score.random:.2f}",
         f"{score.distance:.3f} m{angle}",

@@ -17,7 +17,7 @@ from morphgen.model.kinematics import reach
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
-from morphgen.rl.intervals import mean_interval
+from morphgen.rl.intervals import episode_interval
 from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
@@ -365,7 +365,8 @@ def _score(
     random_raw = np.array([episode.score for episode in random_episodes])
     task = TASKS[spec.task]
     relative = raw - np.resize(random_raw, len(raw)) if task.relative_to_random else raw
-    interval = mean_interval(relative)
+    successes = np.array([episode.success for episode in episodes])
+    interval = episode_interval([relative], [successes], relative=task.relative_to_random)
     distance = float(np.mean([episode.distance for episode in episodes]))
     return Score(
         robot=spec.robot.name,
@@ -378,7 +379,7 @@ def _score(
         high=interval.high,
         raw=float(raw.mean()),
         random=float(random_raw.mean()),
-        success=float(np.mean([episode.success for episode in episodes])),
+        success=float(successes.mean()),
         random_success=float(np.mean([episode.success for episode in random_episodes])),
         distance=distance,
         relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,

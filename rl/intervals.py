@@ -1,4 +1,4 @@
-"""Averages with bootstrap intervals.
+"""Averages with their intervals: bootstrap for scores, Wilson for successes.
 
 After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
 """
@@ -19,13 +19,18 @@ LEVEL = 0.95
 RESAMPLES = 2000
 MAX_RESAMPLED = 2**26
 """Largest number of values that are resampled at once: 512 MB."""
+_MAX_DIGITS = 6
+"""Largest number of decimals of a rate's ends, which have as many as tell them apart."""
 TRIM = 0.25
 """Fraction that the interquartile mean leaves out at each end."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An average or a rate with its interval; the ends are nan if there is only one sample."""
+    """An average or a rate with its interval.
+
+    The ends are nan if the samples cannot tell them: there is one, or all resamples have one mean.
+    """
 
     value: float
     low: float
@@ -33,20 +38,10 @@ class Interval:
 
     def as_percent(self) -> str:
         """Return a rate as text, such as ``85% (64% to 95%)``."""
-        return f"{self.value:.0%} ({self.low:.0%} to {self.high:.0%})"
-
-
-def mean_interval(samples: ArrayLike) -> Interval:
-    """Return the mean of independent samples, shape (k,).
-
-    Raises:
-        ValueError: If there are no samples.
-    """
-    values = _table(samples, 1)
-    mean = float(values.mean())
-    if len(values) < 2:
-        return Interval(mean, math.nan, math.nan)
-    return _interval(mean, (values,), np.mean, paired=False)
+        ends = (self.low, self.high)
+        texts = [[f"{end:.{digits}%}" for end in ends] for digits in range(_MAX_DIGITS + 1)]
+        low, high = next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
+        return f"{self.value:.0%} ({low} to {high})"
 
 
 def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
@@ -56,7 +51,7 @@ def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
         strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
 
     Raises:
-        ValueError: If a stratum has no samples.
+        ValueError: If there is no stratum, or one has no samples.
     """
     tables = tuple(_table(samples, 1) for samples in strata)
     mean = float(np.mean([table.mean() for table in tables]))
@@ -70,15 +65,45 @@ def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
     return _interval(mean, tables, statistic, paired=False)
 
 
-def wilson_interval(successes: int, trials: int) -> Interval:
-    """Return a success rate with its interval (Wilson 1927), which stays within 0 and 1.
+def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
+    """Return a mean success rate with its interval (Wilson 1927), which stays within 0 and 1.
+
+    It has a width at 0 and 1, too. It is that of one rate for all strata: strata of different rates
+    make it too wide, never too narrow.
 
     Args:
-        successes: Number of successes.
-        trials: Number of trials, at least 1.
+        rates: Success rate of each stratum, such as the episodes of a robot and seed, shape (k,);
+            or that of all, a number.
+        trials: Number of trials of each stratum, at least 1, shape (k,) or a number.
     """
-    result = binomtest(successes, trials).proportion_ci(LEVEL, method="wilson")
-    return Interval(successes / trials, float(result.low), float(result.high))
+    rates, trials = np.broadcast_arrays(np.asarray(rates, dtype=np.float64), trials)
+    mean = float(rates.mean())
+    # As many trials as have the variance of the mean of the strata: all, if they are equally large.
+    total = round(rates.size**2 / float(np.sum(1 / trials)))
+    result = binomtest(round(mean * total), total).proportion_ci(LEVEL, method="wilson")
+    return Interval(mean, float(result.low), float(result.high))
+
+
+def episode_interval(
+    scores: Sequence[ArrayLike], successes: Sequence[ArrayLike], *, relative: bool
+) -> Interval:
+    """Return the mean over robots of their mean scores.
+
+    Its interval is ``success_interval`` if the score of an episode is its success, as that of push;
+    else ``stratified_mean_interval``.
+
+    Args:
+        scores: Scores of the episodes of each robot, shape (k,).
+        successes: Whether each of these episodes was a success, shape (k,).
+        relative: Whether the scores are relative to the random policy, and so no successes.
+
+    Raises:
+        ValueError: If there is no robot, or one has no episodes.
+    """
+    if not relative and all(map(np.array_equal, scores, successes)):
+        tables = [_table(each, 1) for each in successes]
+        return success_interval([each.mean() for each in tables], [len(each) for each in tables])
+    return stratified_mean_interval(scores)
 
 
 def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
@@ -114,7 +139,7 @@ def _interval(
     paired: bool,
 ) -> Interval:
     if all(np.ptp(sample) == 0 for sample in samples):
-        return Interval(value, value, value)
+        return Interval(value, math.nan, math.nan)
     num_values = sum(len(sample) for sample in samples)
     interval = bootstrap(
         samples,
@@ -127,6 +152,8 @@ def _interval(
         method="percentile",
         random_state=np.random.default_rng(0),
     ).confidence_interval
+    if interval.low == interval.high:
+        return Interval(value, math.nan, math.nan)
     return Interval(value, float(interval.low), float(interval.high))
 
 

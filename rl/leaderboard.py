@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from tabulate import tabulate
 
@@ -13,7 +14,7 @@ from morphgen.benchmark.split import SIDES, Side
 from morphgen.errors import BenchmarkError
 from morphgen.formats.records import FiniteNumber, Record
 from morphgen.rl.eval_report import SIDES as SIDE_NAMES
-from morphgen.rl.intervals import stratified_mean_interval
+from morphgen.rl.intervals import Interval, episode_interval, success_interval
 from morphgen.rl.scores import finite_or_none, score_decimals
 from morphgen.rl.submission import RobotOutcomes, Submission
 from morphgen.tasks.registry import TASKS
@@ -35,7 +36,7 @@ class SideScore(Record, frozen=True):
     success: FiniteNumber
     """Mean success rate, 0 to 1."""
     low: FiniteNumber | None = None
-    """Lower end of the 95% bootstrap interval of ``score``; None if it is not known."""
+    """Lower end of the 95% interval of ``score``; None if it is not known."""
     high: FiniteNumber | None = None
     """Upper end of the interval."""
 
@@ -84,6 +85,11 @@ class Row(Record, frozen=True):
             remarks.append(f"fine-tuned {self.finetuned:,}")
         return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
 
+    def success(self, side: SideScore) -> Interval:
+        """Return the success rate of a side with its Wilson interval over all episodes."""
+        episodes = side.robots * self.episodes * max(len(self.seeds), 1)
+        return success_interval(side.success, episodes)
+
     def group(self, side: Side, task: str) -> SideScore | None:
         """Return the result of a side at a task."""
         return next((s for s in self.sides if (s.side, s.task) == (side, task)), None)
@@ -109,7 +115,11 @@ def score_submission(
                 groups.setdefault((side, outcomes.task), []).append(outcomes)
     sides = []
     for (side, task), robots in groups.items():
-        interval = stratified_mean_interval([relative_scores(each, random) for each in robots])
+        interval = episode_interval(
+            [relative_scores(each, random) for each in robots],
+            [each.success for each in robots],
+            relative=TASKS[task].relative_to_random,
+        )
         success = float(np.mean([np.mean(each.success) for each in robots]))
         ends = finite_or_none((interval.low, interval.high))
         sides.append(SideScore(side, task, len(robots), interval.value, success, *ends))
@@ -193,14 +203,28 @@ def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
     for rank, row in enumerate(ranked(rows), 1):
         cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
         for side, task in groups:
-            cells += _cells(row.group(side, task), decimals[side, task])
+            cells += _cells(row, row.group(side, task), decimals[side, task])
         lines.append([*cells, str(row.episodes)])
     return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
 
 
-def _cells(score: SideScore | None, decimals: int) -> list[str]:
-    if score is None:
+def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the ranking for JSON; every side has the ends of its success rate's interval, too."""
+    table = []
+    for row in ranked(rows):
+        sides = []
+        for side in row.sides:
+            success = row.success(side)
+            ends = {"success_low": success.low, "success_high": success.high}
+            sides.append(msgspec.to_builtins(side) | ends)
+        table.append(msgspec.to_builtins(row) | {"sides": sides})
+    return table
+
+
+def _cells(row: Row, side: SideScore | None, decimals: int) -> list[str]:
+    if side is None:
         return ["-", "", ""]
-    ends = (score.low, score.high)
+    # Releases of version 0.3.0 have ends without a width, which say nothing.
+    ends = () if side.low == side.high else (side.low, side.high)
     interval = " to ".join(f"{end:.{decimals}f}" for end in ends if end is not None)
-    return [f"{score.score:.{decimals}f}", interval, f"{score.success:.0%}"]
+    return [f"{side.score:.{decimals}f}", interval, row.success(side).as_percent()]

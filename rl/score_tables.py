@@ -23,7 +23,7 @@ from morphgen.rl.intervals import (
     Interval,
     iqm_interval,
     stratified_mean_interval,
-    wilson_interval,
+    success_interval,
 )
 from morphgen.rl.leaderboard import relative_scores
 from morphgen.rl.scores import score_decimals
@@ -229,17 +229,16 @@ def _side_results(
         scores = np.array(
             [[relative_scores(table[name]).mean() for name in robots] for table in tables]
         )
-        successes = [
-            success for table in tables for name in robots for success in table[name].success
-        ]
+        successes = [table[name].success for table in tables for name in robots]
+        episodes = [len(each) for each in successes]
         yield (
             side,
             SideResult(
                 len(robots),
-                len(successes),
+                sum(episodes),
                 float(scores.mean()),
                 iqm_interval(scores, together=True),
-                wilson_interval(sum(successes), len(successes)),
+                success_interval([np.mean(each) for each in successes], episodes),
                 _difference(tables, robots, _outcomes(reference, side, task) if reference else {}),
             ),
         )

@@ -8,9 +8,12 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from morphgen.benchmark.split import Side
+from morphgen.rl.intervals import Interval, success_interval
 
 _TEXTS = ("robot", "side", "task")
 """Fields of a score that are no numbers."""
+_SUCCESS_ENDS = ("success_low", "success_high")
+"""Ends of the 95% Wilson interval of ``success``, which follow from the fields of a score."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,9 @@ class Score:
     score: float
     """``raw``, or ``raw - random`` for tasks with ``Task.relative_to_random``."""
     low: float
-    """Lower end of the 95% bootstrap interval of ``score`` over episodes; nan for one episode."""
+    """Lower end of the 95% interval of ``score`` over episodes; see ``episode_interval``."""
     high: float
-    """Upper end of the 95% bootstrap interval of ``score`` over episodes; nan for one episode."""
+    """Upper end of the interval; nan like ``low`` if the episodes cannot tell it."""
     raw: float
     """Mean score of the episodes; see ``Task.episode_score``."""
     random: float
@@ -51,9 +54,23 @@ class Score:
     """Mean angle from success at the end of an episode [rad]; nan without orientation."""
 
 
+SCORE_KEYS = (*(field.name for field in fields(Score)), *_SUCCESS_ENDS)
+"""Keys of a score in JSON, and columns of CSV."""
+
+
+def success_of(scores: Sequence[Score]) -> Interval:
+    """Return the mean success rate of robots, or of robots and seeds, with its Wilson interval."""
+    return success_interval([each.success for each in scores], [each.episodes for each in scores])
+
+
 def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:
-    """Return scores as JSON values, with null instead of nan."""
-    return [finite_or_none(asdict(score)) for score in scores]
+    """Return scores as JSON values, with null instead of nan, and the interval of the success."""
+    table = []
+    for score in scores:
+        success = success_of([score])
+        ends = dict(zip(_SUCCESS_ENDS, (success.low, success.high), strict=True))
+        table.append(finite_or_none(asdict(score) | ends))
+    return table
 
 
 def finite_or_none(value: Any) -> Any:  # noqa: ANN401
@@ -81,7 +98,11 @@ def score_from_json(data: Mapping[str, Any]) -> Score:
         TypeError: If a field is missing or unknown.
         ValueError: If a field is of another type, or score or success is not finite.
     """
-    values: dict[str, Any] = {k: math.nan if v is None else v for k, v in data.items()}
+    values: dict[str, Any] = {
+        key: math.nan if value is None else value
+        for key, value in data.items()
+        if key not in _SUCCESS_ENDS
+    }
     score = Score(**values)
     where = f"{score.side} robot {score.robot}"
     for field in fields(Score):

@@ -8,7 +8,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.intervals import Interval, iqm_interval
 from morphgen.rl.recorders import read_metrics
 from morphgen.rl.robot_source import tasks_of
-from morphgen.rl.scores import Score, finite_or_none, scores_to_json
+from morphgen.rl.scores import SCORE_KEYS, Score, finite_or_none, scores_to_json, success_of
 from morphgen.rl.study import Cell, as_record
 from morphgen.rl.training import subruns_of
 
@@ -51,8 +51,8 @@ class Group:
     """Mean score."""
     iqm: Interval
     """Interquartile mean of the scores, with its bootstrap interval."""
-    success: float
-    """Mean success rate, 0 to 1."""
+    success: Interval
+    """Mean success rate, 0 to 1, with its Wilson interval over the episodes of robots and seeds."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def _groups(done: Mapping[Cell, Sequence[Score]], task: str) -> dict[Side, Group
         if not table[0]:
             continue
         values = np.array([[score.score for score in seed] for seed in table])
-        success = float(np.mean([score.success for seed in table for score in seed]))
+        success = success_of([score for seed in table for score in seed])
         # Policies of single robots are independent samples on the robots that they learned.
         iqm = iqm_interval(values, together=not (per_robot and side == cell.source.side))
         groups[side] = Group(float(values.mean()), iqm, success)
@@ -230,7 +230,7 @@ def _line(row: Row) -> list[str]:
     for side in SIDES:
         group = row.groups.get(side)
         if group is not None:
-            cells += [f"{group.mean:.2f}", _interval(group.iqm), f"{group.success:.0%}"]
+            cells += [f"{group.mean:.2f}", _interval(group.iqm), group.success.as_percent()]
         elif not row.mode and side in row.sides:
             cells += [MISSING] * 3
         else:
@@ -257,7 +257,7 @@ def _interval(interval: Interval) -> str:
 def _csv(results: Results) -> str:
     """Return CSV text with a line per cell, mode and robot, or one per missing cell."""
     text = io.StringIO()
-    names = ["split", "agent", "seed", "status", "mode", *(field.name for field in fields(Score))]
+    names = ["split", "agent", "seed", "status", "mode", *SCORE_KEYS]
     writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     for cell, scores in results.items():

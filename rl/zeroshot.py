@@ -13,7 +13,7 @@ from morphgen.rl.evaluation import (
     evaluate_checkpoints,
     require_trained_tasks,
 )
-from morphgen.rl.intervals import Interval, wilson_interval
+from morphgen.rl.intervals import Interval, success_interval
 from morphgen.rl.robot_source import RobotSource
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.scores import Score
@@ -93,7 +93,7 @@ def result_of(controller: str, score: Score) -> ZeroShotResult:
     return ZeroShotResult(
         controller,
         score.episodes,
-        wilson_interval(round(score.success * score.episodes), score.episodes),
+        success_interval(score.success, score.episodes),
         score.distance,
         score.angle,
         score.score,

@@ -14,6 +14,8 @@ from typing import Any, NoReturn, TypeAlias
 
 from morphgen.errors import MorphgenError, nearest
 
+_MIN_HELP_WIDTH = 11
+"""Least width of a line of a help, however narrow the terminal is; that of argparse."""
 Run: TypeAlias = Callable[[argparse.Namespace], "int | None"]
 
 
@@ -141,7 +143,7 @@ class Command:
         parser.set_defaults(run=self.run, parser=parser, extra=self.extra, **self.defaults)
 
     def _texts(self) -> dict[str, Any]:
-        width = shutil.get_terminal_size().columns - 2
+        width = max(shutil.get_terminal_size().columns - 2, _MIN_HELP_WIDTH)
         summary = f"{self.summary[0].upper()}{self.summary[1:]}."
         lines = [f"  morphgen {example}" for example in self.examples]
         return {

@@ -73,8 +73,9 @@ if TYPE_CHECKING:
     ),
     option("--method", metavar="NAME", help="with --submission: name of the method in rankings"),
     *opt.LIBRARY_JSON,
-    details="Scores have 95% bootstrap intervals over episodes. The score of reach is relative to "
-    "the random policy; that of push is the success rate.",
+    details="Scores have 95% bootstrap intervals over episodes, success rates 95% Wilson "
+    "intervals. The score of reach is relative to the random policy; that of push is the success "
+    "rate.",
     examples=(
         "eval runs/interpolation/arm3/reach/me-tf/seed0 --on test",
         "eval ik --split interpolation/arm3/reach",

@@ -37,18 +37,21 @@ if TYPE_CHECKING:
     flag("--markdown", "print the table as Markdown"),
     *opt.JOBS_LIBRARY_JSON,
     details="Every episode of every test robot must be there, with the goals, simulator and "
-    "constants of the release. Scores and 95% bootstrap intervals are computed from the episodes, "
-    "and ranked beside the reference scores of the release. A submission with a fault is refused "
-    "with one line, and nothing is ranked; so is a release whose files differ from its SHA256SUMS, "
-    "and so are submissions that disagree about the random policy, if the release has no "
-    "submission of it.",
+    "constants of the release. Scores and 95% intervals are computed from the episodes: bootstrap "
+    "for scores, Wilson for successes. They are ranked beside the reference scores of the release. "
+    "A submission with a fault is refused with one line, and nothing is ranked; so is a release "
+    "whose files differ from its SHA256SUMS, and so are submissions that disagree about the random "
+    "policy, if the release has no submission of it.",
     examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
 )
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
-    import msgspec
-
-    from morphgen.rl.leaderboard import random_scores, ranked, ranking_table, score_submission
+    from morphgen.rl.leaderboard import (
+        random_scores,
+        ranking_data,
+        ranking_table,
+        score_submission,
+    )
     from morphgen.rl.submission import read_submission
     from morphgen.rl.submission_checks import check_submission, require_same_random
     from morphgen.tasks.eval_protocol import expected_robots
@@ -82,9 +85,12 @@ def score(args: argparse.Namespace) -> None:
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
-        "rows": [msgspec.to_builtins(row) for row in ranked(rows)],
+        "rows": ranking_data(rows),
     }
-    notes = ["MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of every robot"]
+    notes = [
+        "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of each robot; "
+        "successes: Wilson"
+    ]
     if relative:
         whose = "the release" if random else "each submission"
         notes.append(

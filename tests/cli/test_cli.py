@@ -339,3 +339,13 @@ def test_internal_errors_keep_their_traceback(monkeypatch):
     monkeypatch.setattr(catalogue, "catalogue", fail)
     with pytest.raises(ZeroDivisionError):
         main(["list"])
+
+
+@pytest.mark.parametrize("columns", [0, -1, 1, 2, 3, 12, 10**6, "abc", ""])
+@pytest.mark.parametrize("words", [["--help"], ["export", "--help"], ["split", "new", "--help"]])
+def test_the_help_fits_every_terminal(words, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit) as exit_:
+        main(words)
+    assert exit_.value.code == 0
+    assert "--help" in "".join(capsys.readouterr().out.split())
