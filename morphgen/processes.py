@@ -30,6 +30,8 @@ CHUNK_SIZE = 8
 """Default number of items that a worker processes before it reports."""
 POLL_INTERVAL = 0.2
 """Interval at which workers check whether the parent has stopped [s]."""
+STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+"""Signals that stop a command as Ctrl-C does: of a service manager, of a closed terminal."""
 RAY_TIMEOUT = 5.0
 """Longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes."""
 
@@ -50,7 +52,7 @@ def parallel_map(
     progress: Progress = no_progress,
     chunk: int = CHUNK_SIZE,
 ) -> Iterator[R]:
-    """Yield ``work(item)`` for every item, in the order of the items.
+    """Return an iterator over ``work(item)`` for every item, in the order of the items.
 
     Args:
         work: A function that can be pickled; each process receives it once.
@@ -67,8 +69,12 @@ def parallel_map(
     chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
     results = map(work, items) if jobs <= 1 else _in_processes(work, chunks, jobs)
+    return _reporting(results, progress, len(items))
+
+
+def _reporting(results: Iterable[R], progress: Progress, total: int) -> Iterator[R]:
     for done, result in enumerate(results, 1):
-        progress(done, len(items))
+        progress(done, total)
         yield result
 
 
@@ -128,12 +134,14 @@ def sigint_blocked() -> Iterator[None]:
 def init_worker(stopped: c_byte) -> None:
     """Initialise a worker process.
 
-    It ignores Ctrl-C, exits when the parent process ends, and interrupts its work when the parent
-    sets ``stopped``, which is in memory that all processes share.
+    It ignores Ctrl-C and a closed terminal, which its parent receives, too; it exits when the
+    parent process ends, and interrupts its work when the parent sets ``stopped``, which is in
+    memory that all processes share.
     """
     global _stopped
     _stopped = stopped
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for each in (signal.SIGINT, *STOP_SIGNALS):
+        signal.signal(each, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _interrupt)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     threading.Thread(target=_interrupt_when_stopped, daemon=True).start()

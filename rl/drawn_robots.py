@@ -147,7 +147,10 @@ def draw(
     """
     key = replace(source, drawn_hash=""), config
     if key not in _drawn:
-        _drawn[key] = _draw_all(*key, jobs, progress)
+        robots = _draw_all(*key, jobs, progress)
+        while len(_drawn) >= _MAX_DRAWN:
+            del _drawn[next(iter(_drawn))]
+        _drawn[key] = robots
     robots = _drawn[key]
     if source.drawn_hash not in ("", robots.hash):
         raise TaskError(
@@ -158,6 +161,9 @@ def draw(
 
 
 _drawn: dict[tuple[RobotSource, GoalConfig], DrawnRobots] = {}
+"""The robots drawn last, by source and goals."""
+_MAX_DRAWN = 8
+"""Largest number of sources whose robots are kept."""
 
 
 def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:

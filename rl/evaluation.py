@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -282,11 +282,10 @@ def evaluate(
         TaskError: If no robot has one of the tasks.
         MorphgenError: If a robot or simulator cannot be built.
     """
-    specs = specs_of(source, GoalConfig(tasks=config.tasks))
-    if tasks is not None:
-        specs = [spec for spec in specs if spec.task in tasks]
-        if not specs:
-            raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
+    tasks = None if tasks is None else tuple(tasks)
+    specs = _specs(source, config, tasks)
+    if not specs and tasks is not None:
+        raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
     library = tuple(map(Path, source.library))
     episodes: list[list[Episode]] = [[] for _ in specs]
     for i, make in enumerate(controllers):
@@ -297,19 +296,28 @@ def evaluate(
         new_episodes = _run_all(make, specs, config, interface, library, show)
         for robot_episodes, new in zip(episodes, new_episodes, strict=True):
             robot_episodes.extend(new)
-    key = (source, replace(config, workers=1), None if tasks is None else tuple(tasks))
-    if key not in _random_cache:
-        make_random = partial(Random, config.seed)
-        _random_cache[key] = _run_all(make_random, specs, config, Interface(), library)
+    random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
     scores: list[Score] = []
-    for spec, own, of_random in zip(specs, episodes, _random_cache[key], strict=True):
+    for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True):
         record(spec, source.side, own, of_random)
         scores.append(_score(spec, source.side, own, of_random))
     return scores
 
 
-_random_cache: dict[object, list[list[Episode]]] = {}
-"""Episodes of the random policy by robot, run once per process."""
+def _specs(
+    source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None
+) -> list[EnvSpec]:
+    specs = specs_of(source, GoalConfig(tasks=config.tasks))
+    return [spec for spec in specs if tasks is None or spec.task in tasks]
+
+
+@lru_cache(maxsize=64)
+def _random_episodes(
+    source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None
+) -> list[list[Episode]]:
+    """Return the episodes of the random policy by robot; memoised, for all modes of a policy."""
+    make, library = partial(Random, config.seed), tuple(map(Path, source.library))
+    return _run_all(make, _specs(source, config, tasks), config, Interface(), library)
 
 
 def _run_all(

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.formats.data_files import parse_json, read_text
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import naming, write_atomic
 from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.runs import RunConfig
 from morphgen.rl.scores import finite_or_none
@@ -68,8 +68,9 @@ class Metrics:
 
     def record(self, report: UpdateMetrics) -> None:
         """Write a line."""
-        self._file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
-        self._file.flush()
+        with naming(Path(self._file.name)):
+            self._file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
+            self._file.flush()
 
     def close(self) -> None:
         """Close the file."""

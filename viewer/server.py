@@ -15,10 +15,10 @@ from typing import Any
 
 import viser
 import websockets.asyncio.server
-import websockets.http11
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+from websockets.server import ServerProtocol
 
 from morphgen.viewer.access import AccessPolicy, content_security_policy, refusal_reason
 from morphgen.viewer.frame import frame_page
@@ -59,6 +59,12 @@ _LOG.addFilter(_OneLine())
 
 class _Connection(ServerConnection):
     """A websocket that closes at the first message that no page of the viewer sends."""
+
+    def __init__(self, protocol: ServerProtocol, *arguments: Any, **options: Any) -> None:  # noqa: ANN401  (as its base class)
+        """Let the lines of a request be as long as ``MAX_REQUEST_LINE``."""
+        super().__init__(protocol, *arguments, **options)
+        read_line = protocol.reader.read_line
+        protocol.reader.read_line = lambda m: read_line(max(m, MAX_REQUEST_LINE))  # type: ignore[method-assign]
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ANN401  (as its base class)
         """Return the next message; viser never sees a malformed one."""
@@ -106,7 +112,6 @@ def _guarded(policy: AccessPolicy, receive: Receive) -> Iterator[None]:
     """
     module = websockets.asyncio.server
     original, started = module.serve, []
-    websockets.http11.MAX_LINE_LENGTH = MAX_REQUEST_LINE
 
     def serve(*arguments: Any, process_request: Answer, **options: Any) -> Any:  # noqa: ANN401
         started.append(True)

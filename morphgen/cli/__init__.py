@@ -35,17 +35,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        0 for success, 1 for findings or failed checks, 2 for invalid input, 130 when interrupted.
+        0 for success, 1 for findings or failed checks, 2 for invalid input; 130 when interrupted,
+        143 when terminated, 129 when the terminal was closed.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # names may have letters that a terminal lacks
         sys.stdout.reconfigure(errors="backslashreplace")
+    received: list[int] = []
     try:
         try:
-            return _run(argv)
+            return _run(argv, received)
         except KeyboardInterrupt as interrupt:
             text = str(interrupt) or "nothing half-written is left"
             print(f"morphgen: interrupted; {text}", file=sys.stderr)
-            return 130
+            return 128 + (received or [signal.SIGINT])[0]
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()
@@ -58,7 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(argv: Sequence[str] | None) -> int:
+def _run(argv: Sequence[str] | None, received: list[int]) -> int:
+    """Run a command; the signals that stop it are appended to ``received``."""
     from morphgen.cli.command import UsageError, parse
     from morphgen.errors import MorphgenError, one_line
     from morphgen.extras import missing_extra
@@ -77,11 +80,11 @@ def _run(argv: Sequence[str] | None) -> int:
     if args.command is None:
         parser.print_help()
         return 2
-    with _record_ctrl_c() as interrupts:
+    with _stopping_cleanly(received):
         try:
             return int(args.run(args) or 0)
         except Exception as error:
-            if interrupts:  # a package that was being imported turned Ctrl-C into another error
+            if received:  # a package that was being imported turned Ctrl-C into another error
                 raise KeyboardInterrupt from error
             if isinstance(error, MorphgenError):
                 return _refuse(error, str(error), args)
@@ -89,30 +92,41 @@ def _run(argv: Sequence[str] | None) -> int:
                 return _refuse(error, text, args)
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise
-            return _refuse(error, f"{error.filename or 'output'}: {error.strerror}", args)
+            return _refuse(error, f"{error.filename or 'output'}: {error.strerror or error}", args)
 
 
 @contextmanager
-def _record_ctrl_c() -> Iterator[list[int]]:
-    """Raise ``KeyboardInterrupt`` on Ctrl-C as always, and append to the yielded list."""
+def _stopping_cleanly(received: list[int]) -> Iterator[None]:
+    """Raise ``KeyboardInterrupt`` on every signal that stops a command, so that it cleans up.
+
+    The signals are appended to the list. Those that have another handler, or are ignored as by
+    ``nohup``, stay as they are.
+    """
     from morphgen.cli.progress import interrupts
+    from morphgen.processes import STOP_SIGNALS
 
     interrupts.clear()
+    defaults = (signal.default_int_handler, signal.SIG_DFL)
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, *STOP_SIGNALS)}
+    before = {each: handler for each, handler in before.items() if handler in defaults}
 
-    def record(number: int, frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         interrupts.append(number)
+        for each in STOP_SIGNALS:  # often sent twice: the second would stop the cleaning up
+            if each in before and number in STOP_SIGNALS:
+                signal.signal(each, signal.SIG_IGN)
         signal.default_int_handler(number, frame)
 
-    before = signal.getsignal(signal.SIGINT)
-    is_main = threading.current_thread() is threading.main_thread()
-    if before is not signal.default_int_handler or not is_main:  # another handler, or ignored
-        yield interrupts
-        return
-    signal.signal(signal.SIGINT, record)
+    if threading.current_thread() is not threading.main_thread():
+        before = {}
+    for each in before:
+        signal.signal(each, stop)
     try:
-        yield interrupts
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def _refuse(error: Exception, text: str, args: Namespace) -> int:

@@ -113,7 +113,9 @@ def _text(results: Sequence[GoalResult], seed: int) -> str:
 
 def _row(result: GoalResult) -> tuple[str, ...]:
     goals, certificate_errors = result.goals, result.certificate_errors
-    certified = "" if certificate_errors is None else "NO" if certificate_errors else "yes"
+    certified = (
+        "not tested" if certificate_errors is None else "NO" if certificate_errors else "yes"
+    )
     rate = "" if result.acceptance is None else f"{result.acceptance:.3g}"
     count = "none" if goals is None else str(len(goals.q))
     boxes = str(len(goals.obstacles)) if goals else "yes" if result.obstacles else "0"

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli.command import command, option, repeated, whole_number
 from morphgen.cli.options import LIBRARY
+from morphgen.processes import STOP_SIGNALS
 
 if TYPE_CHECKING:
     from morphgen.viewer.app import Viewer
 
-STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
-"""Signals that stop the server as Ctrl-C does: of a service manager, of a closed terminal."""
 SIGNAL_POLL = 0.5
 """Longest delay before a signal is handled [s]."""
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -57,8 +56,6 @@ def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
     from morphgen.viewer.app import serve
 
-    for name in STOP_SIGNALS:
-        signal.signal(name, signal.default_int_handler)
     try:
         viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
         _wait(args.host, viewer)

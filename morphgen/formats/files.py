@@ -106,15 +106,27 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file atomically, by way of ``partial_path``; one process at a time may do so.
 
     Raises:
-        OSError: If it cannot be written; then nothing is left behind.
+        OSError: If it cannot be written, with its name; then nothing is left behind.
     """
     partial = partial_path(path)
     try:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
         partial.replace(path)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             partial.unlink()
+        if isinstance(error, OSError):
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an ``OSError`` without a file name, such as that of a full disk, name this file."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
         raise
 
 
@@ -192,7 +204,11 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces ``folder`` if the block succeeds."""
+    """Yield a temporary folder that replaces ``folder`` if the block succeeds.
+
+    Raises:
+        FormatError: If it cannot be written, or the block meets another ``OSError``.
+    """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -206,7 +222,10 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         else:
             partial.rename(folder)
     except OSError as error:
-        raise FormatError(f"cannot write {folder}: {error}") from error
+        name = Path(error.filename or partial)
+        is_read = not name.is_relative_to(partial)
+        what = name if is_read else f"cannot write {folder / name.relative_to(partial)}"
+        raise FormatError(f"{what}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

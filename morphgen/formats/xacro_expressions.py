@@ -13,6 +13,7 @@ deny-list names them, and do not bound the size of the results of all operations
 from __future__ import annotations
 
 import ast
+import threading
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
@@ -24,9 +25,8 @@ MAX_LENGTH = 10_000
 """Longest expression [characters]."""
 
 _ORIGIN = "<expression>"
-# Python would print warnings about expressions such as ``2if x else 3``.
-warnings.filterwarnings("ignore", category=SyntaxWarning, module=_ORIGIN)
-warnings.filterwarnings("ignore", category=DeprecationWarning, module=_ORIGIN)
+_PARSING = threading.Lock()
+"""Held while Python's warnings are off: they are those of all threads."""
 
 
 class Expression:
@@ -42,7 +42,9 @@ class Expression:
         if len(text) > MAX_LENGTH:
             raise RefusedError(f"an expression is longer than {MAX_LENGTH} characters")
         try:
-            tree = ast.parse(text, _ORIGIN, "eval")
+            with _PARSING, warnings.catch_warnings():  # of texts such as ``2if x else 3``
+                warnings.simplefilter("ignore")
+                tree = ast.parse(text, _ORIGIN, "eval")
             self._node = Translation(text).of(tree.body)
         except (MemoryError, RecursionError) as error:
             raise RefusedError("an expression is nested too deeply") from error

@@ -24,7 +24,13 @@ from typing import Any
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
-from morphgen.formats.files import locked_folder, partial_path, replacing_folder, write_atomic
+from morphgen.formats.files import (
+    locked_folder,
+    naming,
+    partial_path,
+    replacing_folder,
+    write_atomic,
+)
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf_text import urdf_text
@@ -112,14 +118,15 @@ def make_set(
         finished = _finished(config)
         missing = [i for i in range(n) if i not in finished]
         progress(n - len(missing))
-        with (config.folder / JOURNAL).open("a", encoding="utf-8") as journal:
+        path = config.folder / JOURNAL
+        with naming(path), path.open("a", encoding="utf-8") as journal:
             journal.write("\n")  # ends a line that an interruption cut short
             for made, record in enumerate(work(config, missing), 1):
                 journal.write(json.dumps(record) + "\n")
                 journal.flush()
                 progress(n - len(missing) + made)
         report = _write_index(config, len(missing), len(finished))
-        (config.folder / JOURNAL).unlink()
+        path.unlink()
     return report
 
 
@@ -341,6 +348,7 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     with ExitStack() as stack:
         sources = {path for path, _ in locations.values()}
         files = {path: stack.enter_context(path.open("rb")) for path in sources}
+        stack.enter_context(naming(config.folder / INDEX))
         index = stack.enter_context(partial.open("wb"))
         for number in sorted(locations):
             path, offset = locations[number]

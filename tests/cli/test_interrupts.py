@@ -1,4 +1,4 @@
-"""Ctrl-C while workers start prints one line and leaves no process and no partial file."""
+"""A signal while workers start prints one line and leaves no process and no partial file."""
 
 import os
 import signal
@@ -46,7 +46,14 @@ def test_ctrl_c_as_the_first_worker_starts_prints_one_line(tmp_path):
     check(tmp_path, "sample", 0.0)
 
 
-def check(tmp_path, name, later):
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sample", "goals", "split"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_the_end_of_a_session_stops_workers_as_ctrl_c_does(tmp_path, name, number):
+    check(tmp_path, name, 0.3, number)
+
+
+def check(tmp_path, name, later, number=signal.SIGINT):
     (tmp_path / "split.yaml").write_text(split_text(small_split()))
     process = subprocess.Popen(
         [sys.executable, "-m", "morphgen", *map(str, COMMANDS[name])],
@@ -65,9 +72,10 @@ def check(tmp_path, name, later):
             assert time.monotonic() < deadline
             time.sleep(0.002)
         time.sleep(later)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        # As a terminal does; a hang-up also stops Python's resource tracker, which says so.
+        (os.kill if number == signal.SIGHUP else os.killpg)(process.pid, number)
         out, err = process.communicate(timeout=PATIENCE)
-        assert (process.returncode, out) == (130, "")
+        assert (process.returncode, out) == (128 + number, "")
         assert err.startswith("morphgen: interrupted; ")
         assert err.index("\n") == len(err) - 1
         while group(process.pid) and time.monotonic() < deadline + PATIENCE:
