@@ -105,7 +105,12 @@ def sample(
     return (sample.robot for sample in samples)
 
 
-def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:
+def read(
+    path: str | PathLike[str],
+    *,
+    root: str | PathLike[str] | None = None,
+    skip_missing_meshes: bool = False,
+) -> Robot:
     """Read a robot from a bundle's folder, a URDF, a xacro or an MJCF.
 
     Examples:
@@ -117,11 +122,14 @@ def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) 
         path: The file or folder.
         root: A folder that meshes, includes and YAML may come from, besides the description's own
             folder and package.
+        skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out. The
+            robot's ``source_findings`` name them.
 
     Raises:
         FormatError: If the path is none of these, or the description is invalid.
     """
-    return read_robot(Path(path), root=None if root is None else Path(root))
+    folder = None if root is None else Path(root)
+    return read_robot(Path(path), root=folder, skip_missing_meshes=skip_missing_meshes)
 
 
 def write(

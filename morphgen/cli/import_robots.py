@@ -48,6 +48,10 @@ _PARTS = Path("parts")
         "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
         "robot",
     ),
+    flag(
+        "--skip-missing-meshes",
+        "leave out the shapes of a URDF whose mesh is missing; the findings and the card name them",
+    ),
     option("--part", choices=PART_KINDS, help="also write a manifest: the robot becomes a part"),
     path_option("--parts", "DIR", f"with --part: folder of the manifests (default: {_PARTS})"),
     option(
@@ -195,6 +199,7 @@ def _import(
             srdf=args.srdf,
             name=name,
             repair=not args.as_is,
+            skip_missing_meshes=args.skip_missing_meshes,
         )
     folder = bundle_folder(args.out, robot.name)
     if description.path.resolve().is_relative_to(folder.resolve()):

@@ -206,7 +206,11 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
 
 
 def read_robot(
-    path: Path, args: dict[str, str] | None = None, *, root: Path | None = None
+    path: Path,
+    args: dict[str, str] | None = None,
+    *,
+    root: Path | None = None,
+    skip_missing_meshes: bool = False,
 ) -> Robot:
     """Read a bundle's folder, a URDF, a xacro or an MJCF.
 
@@ -218,6 +222,7 @@ def read_robot(
         args: xacro arguments.
         root: A folder from which meshes, includes and YAML may be read, besides the description's
             own folder and package.
+        skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out.
 
     Raises:
         FormatError: If it is neither of these, or invalid.
@@ -227,7 +232,8 @@ def read_robot(
     if path.name in (URDF, MJCF) and (path.parent / CARD).is_file():
         return read_bundle(path.parent, root=root)
     is_xacro = path.suffix == XACRO
-    robot = read_description(path, args, default_finder(root=root), written_frames=not is_xacro)
+    finder = default_finder(root=root, skip_missing=skip_missing_meshes)
+    robot = read_description(path, args, finder, written_frames=not is_xacro)
     return replace(robot, fits=fits_in(path.parent))
 
 

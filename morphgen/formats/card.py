@@ -29,6 +29,7 @@ _PROVENANCE = (
     "accepted",
     "primitives",
     "convex",
+    "packages",
 )
 """Keys of a card that become the robot's ``provenance``."""
 
@@ -47,6 +48,7 @@ class _CardRecord(Record, frozen=True):
     accepted: dict[str, dict[str, str]] = field(default_factory=dict)
     primitives: dict[str, Any] = field(default_factory=dict)
     convex: dict[str, Any] = field(default_factory=dict)
+    packages: list[dict[str, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if any(not {"label", "part"} <= part.keys() for part in self.parts):

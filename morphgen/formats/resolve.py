@@ -7,11 +7,13 @@ import importlib.metadata
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 from itertools import product
 from pathlib import Path, PurePosixPath
+from typing import Literal
 from urllib.parse import unquote
 
 from morphgen.errors import FormatError
@@ -27,9 +29,11 @@ _DATA_ROOTS = {
 _MORPHGEN_PACKAGES = ("morphgen.templates", "morphgen.robots_real")
 _SUBFOLDERS = ("urdf", "urdfs", "xacro", "xacros", "robot", "robots")
 _ROOT_HINT = "name the folder that it may come from as root (--root DIR of morphgen import)"
+SKIP_HINT = "or leave out what has none by --skip-missing-meshes of morphgen import"
 _PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
 _PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
+_LICENCE_TAG = re.compile(rb"<license[^>]*>([^<]{1,200})<")
 _NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 
 
@@ -43,13 +47,15 @@ class PackageFinder:
     """Name and folder of known packages."""
     root: Path | None = None
     """A folder from which files may be read, besides the description's own folder and package."""
+    skip_missing: bool = False
+    """Whether shapes of a URDF whose mesh is not found are left out, with a finding."""
 
     def find(self, package: str, *files: Path) -> Path:
         """Return the folder of a package.
 
         The search order is: the folder in ``packages``; for each of ``files``, from the file
         upwards, a folder that is the package (by its ``package.xml`` or its name) or contains it
-        directly, above the file's tree (see ``resolve_uri``) only with a ``package.xml`` or ROS's
+        directly, above the file's tree (see ``find_file``) only with a ``package.xml`` or ROS's
         suffix; in each root, a folder of that name or, up to two levels down, one whose
         ``package.xml`` has that name. Descriptions are often copied into a folder without ROS's
         suffix, so ``x_description`` and ``x_support`` are then searched as ``x``. Names are
@@ -63,22 +69,34 @@ class PackageFinder:
             raise FormatError(
                 f"{prefix}{package!r} is not a package name (letters, digits, _ and -)"
             )
-        for name, folder in self.packages:
-            if name == package:
-                return _absolute(folder)
-        stems = [package, _PACKAGE_SUFFIX.sub("", package)]
-        for name in dict.fromkeys(stems):
-            for candidate in self._candidates(name, files):
-                return candidate
+        for candidate, _ in self.candidates(package, files):
+            return candidate
         around = f"in or beside the folders above {files[0]}, " if files else ""
         roots = ", ".join(map(str, self.roots)) or "(none)"
         raise FormatError(
             f"{prefix}package {package!r} not found: looked {around}in the roots {roots};"
-            " give the folder that holds it as another root"
+            " give the folder that holds it as --root"
         )
 
-    def _candidates(self, name: str, files: Iterable[Path]) -> Iterator[Path]:
-        """Yield the folders that may be the package ``name``, in search order."""
+    def candidates(self, package: str, files: Iterable[Path]) -> Iterator[tuple[Path, bool]]:
+        """Yield the folders that may be a package, in search order.
+
+        Each comes with whether it is an installed package or one of ROS's environment, which the
+        user did not name.
+        """
+        for name, folder in self.packages:
+            if name == package:
+                yield _absolute(folder), False
+        stems = dict.fromkeys([package, _PACKAGE_SUFFIX.sub("", package)])
+        for name in stems:
+            yield from ((folder, False) for folder in self._around(name, files))
+        for name in stems:
+            for root in self.roots:
+                for folder in self._in_root(name, root):
+                    yield folder, root != self.root and not any(_is_in(f, [root]) for f in files)
+
+    @staticmethod
+    def _around(name: str, files: Iterable[Path]) -> Iterator[Path]:
         for file in files:
             tree = _tree(file)
             for folder, near in product(_ancestors(file), ("", name)):
@@ -90,18 +108,24 @@ class PackageFinder:
                     is_named and (may_be_plain or _is_package(package))
                 ):
                     yield package
-        for root in self.roots:
-            if root.name == name or _declared_name(root) == name:
-                yield root
-            if (root / name).is_dir():
-                yield root / name
-            for manifest in sorted([*root.glob("*/package.xml"), *root.glob("*/*/package.xml")]):
-                if _declared_name(manifest.parent) == name:
-                    yield manifest.parent
+
+    @staticmethod
+    def _in_root(name: str, root: Path) -> Iterator[Path]:
+        if root.name == name or _declared_name(root) == name:
+            yield root
+        if (root / name).is_dir():
+            yield root / name
+        for manifest in sorted([*root.glob("*/package.xml"), *root.glob("*/*/package.xml")]):
+            if _declared_name(manifest.parent) == name:
+                yield manifest.parent
 
 
 def default_finder(
-    roots: Iterable[Path] = (), packages: Mapping[str, Path] | None = None, root: Path | None = None
+    roots: Iterable[Path] = (),
+    packages: Mapping[str, Path] | None = None,
+    root: Path | None = None,
+    *,
+    skip_missing: bool = False,
 ) -> PackageFinder:
     """Return a finder for the given roots, then ROS's environment, then the pip data packages.
 
@@ -110,6 +134,7 @@ def default_finder(
         packages: Folders of packages by name.
         root: A folder from which files may be read, besides the description's own folder and
             package; it is also searched for packages.
+        skip_missing: Whether shapes of a URDF whose mesh is not found are left out.
 
     Returns:
         A finder with the present values of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
@@ -125,16 +150,37 @@ def default_finder(
     shares = (prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH"))
     folders = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
     named = sorted((name, _absolute(folder)) for name, folder in (packages or {}).items())
-    return PackageFinder(tuple(dict.fromkeys(folders)), tuple(named), root)
+    return PackageFinder(tuple(dict.fromkeys(folders)), tuple(named), root, skip_missing)
+
+
+@dataclass(frozen=True)
+class FoundFile:
+    """A file that a description refers to."""
+
+    path: Path
+    package: str = ""
+    """Package of its URI, if it names one."""
+    place: Literal["", "beside", "installed"] = ""
+    """``beside`` if the package is unknown and the file was found around the description;
+    ``installed`` if the package is an installed one that the user did not name."""
+    folder: Path = Path()
+    """Folder of the package."""
 
 
 def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
+    """Return the file that a URI inside a robot description refers to; see ``find_file``."""
+    return find_file(uri, base_file, finder).path
+
+
+def find_file(uri: str, base_file: Path, finder: PackageFinder) -> FoundFile:
     """Return the file that a URI inside a robot description refers to.
 
     Supported are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
     and relative paths (from the description's folder, then from the finder's ``root``). A name is
     tried as written, then with its ``%`` escapes decoded; backslashes count as slashes; letter case
-    matters.
+    matters. The first package that has the file counts. If none around the description has it, it
+    is also searched without the package's name: in the folders of the description's tree, nearest
+    first, and in the finder's ``root``, there also by the last parts of its path.
 
     Security: a description may only refer to files of ROS packages and of its own tree, because a
     stranger's file could otherwise copy private files into a bundle. The tree is the nearest folder
@@ -160,34 +206,82 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         raise FormatError(
             f"{base}: cannot read {uri!r}; valid: package://, model://, file:// or a path"
         )
-    if scheme in ("package", "model"):
-        package, _, rest = rest.lstrip("/").partition("/")
-        folder = boundary = finder.find(package, base)
-    else:
-        folder, boundary = base.parent, _tree(base)
+    tree, root = _tree(base), finder.root
     # A root also replaces a search path: PyBullet's data names meshes from its top folder.
-    folders = (folder, finder.root) if not scheme and finder.root else (folder,)
+    folders = [base.parent, *([root] if root and not scheme else [])]
+    places = [(FoundFile(Path(), folder=folder), tree, rest) for folder in folders]
+    if scheme in ("package", "model"):
+        places = _package_places(*rest.lstrip("/").partition("/")[::2], base, finder)
     missing = []
-    for near, name in product(folders, dict.fromkeys([rest, unquote(rest)])):
-        absolute = scheme in ("file", "") and Path(name).is_absolute()
-        path = Path(os.path.normpath(name if absolute else near / name.lstrip("/")))
-        inside = path.is_relative_to(boundary) or _is_in(path, [finder.root])
-        if not inside and not (absolute and _is_in_package(path, finder)):
-            raise FormatError(
-                f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
-                f" move the file inside, refer to it by package://, or {_ROOT_HINT}"
-            )
-        if path.is_file():
-            real = path.resolve()
-            trees = (boundary, _tree(base.resolve()), finder.root)
-            if not _is_in(real, trees) and not _is_in_package(real, finder):
+    for place, boundary, name in places:
+        for text in dict.fromkeys([name, unquote(name)]):
+            absolute = scheme in ("file", "") and Path(text).is_absolute()
+            path = Path(os.path.normpath(text if absolute else place.folder / text.lstrip("/")))
+            inside = path.is_relative_to(boundary) or _is_in(path, [root])
+            if not inside and not (absolute and _is_in_package(path, finder)):
                 raise FormatError(
-                    f"{base}: {uri!r} is a symbolic link that leaves {boundary}, the folder of its"
-                    f" description; put the file itself there, or {_ROOT_HINT}"
+                    f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
+                    f" move the file inside, refer to it by package://, or {_ROOT_HINT}"
                 )
-            return path
-        missing.append(path)
+            if path.is_file():
+                real = path.resolve()
+                trees = (boundary, _tree(base.resolve()), root)
+                if not _is_in(real, trees) and not _is_in_package(real, finder):
+                    raise FormatError(
+                        f"{base}: {uri!r} is a symbolic link that leaves {boundary}, the folder of"
+                        f" its description; put the file itself there, or {_ROOT_HINT}"
+                    )
+                return replace(place, path=path)
+            if place.place != "beside":
+                missing.append(path)
+    if not missing:
+        finder.find(rest.lstrip("/").partition("/")[0], base)  # raises: the package is unknown
     raise FormatError(f"{base}: {uri!r} does not exist: looked for {_listed(missing)}")
+
+
+def _package_places(
+    package: str, rest: str, base: Path, finder: PackageFinder
+) -> list[tuple[FoundFile, Path, str]]:
+    """Return where a file of a package may be, with the folder not to leave and its name there."""
+    places: list[tuple[FoundFile, Path, str]] = []
+    installed: list[tuple[FoundFile, Path, str]] = []
+    if _PACKAGE_NAME.match(package):
+        for folder, is_installed in finder.candidates(package, [base]):
+            place: Literal["", "installed"] = "installed" if is_installed else ""
+            found = FoundFile(Path(), package, place, folder)
+            (installed if is_installed else places).append((found, folder, rest))
+    tree = _tree(base)
+    beside = FoundFile(Path(), package, "beside")
+    for folder in _ancestors(base):
+        if folder.is_relative_to(tree):
+            places.append((replace(beside, folder=folder), tree, rest))
+    if finder.root is not None:
+        parts = PurePosixPath(rest).parts
+        for k in range(len(parts)):
+            name = "/".join(parts[k:])
+            places.append((replace(beside, folder=finder.root), finder.root, name))
+    return places + installed
+
+
+def package_source(file: FoundFile) -> dict[str, str]:
+    """Return ``source`` and ``licence`` of an installed package that a file was found in.
+
+    The source is the pip distribution with its version, else the folder's name.
+    """
+    manifest = file.folder / "package.xml"
+    declared = _LICENCE_TAG.search(manifest.read_bytes()) if manifest.is_file() else None
+    licence = declared[1].decode(errors="replace").strip() if declared else ""
+    for name, folders in _DATA_ROOTS.items():
+        with suppress(importlib.metadata.PackageNotFoundError):
+            distribution = importlib.metadata.distribution(name)
+            if _is_in(file.folder, [_absolute(distribution.locate_file(f)) for f in folders]):
+                about = distribution.metadata.json
+                licence = licence or str(about.get("license_expression", about.get("license", "")))
+                return {
+                    "source": f"{name} {distribution.version}",
+                    "licence": licence or "unknown",
+                }
+    return {"source": file.folder.name, "licence": licence or "unknown"}
 
 
 def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from lxml import etree
 
 from morphgen.errors import nearest
-from morphgen.formats.urdf_schema import UrdfLocation, content_findings
+from morphgen.formats.urdf_schema import UrdfLocation, content_findings, unread_findings
+from morphgen.formats.xml import shortened
 from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 
@@ -38,7 +39,7 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     large = tuple(_size_findings(root, origin))
     if large:
         return large
-    findings = _first(_robot_findings(root, origin))
+    findings = [*_first(_robot_findings(root, origin)), *unread_findings(root, origin)]
     unexpanded = _first_xacro(root)
     if unexpanded is None:
         return tuple(findings)
@@ -94,7 +95,7 @@ def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     yield from _duplicates(links, origin)
     yield from _duplicates(joints, origin)
     yield from _tree(links, joints, origin)
-    yield from _kinds(joints, origin)
+    yield from _kinds(root, origin)
     yield from _mimics(joints, origin)
     for element in [*links, *joints, *root.findall("material")]:
         yield from content_findings(element, UrdfLocation.of(element, origin))
@@ -103,10 +104,14 @@ def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
 def _wrong_root(root: etree._Element, origin: str) -> Finding:
     name = etree.QName(root)
     fix = "give a URDF or xacro, whose root element is <robot>, or an MJCF, whose is <mujoco>"
-    if name.localname == "robot":
-        fix = f"remove the default namespace {name.namespace!r}"
-    why = f"the root element is <{name.localname}>, not <robot>"
-    return UrdfLocation(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
+    tag = f"{root.prefix}:{name.localname}" if root.prefix else name.localname
+    why = f"the root element is <{tag}>, not <robot>"
+    if root.prefix:
+        fix = f"remove the prefix {root.prefix!r} from all elements; robot software reads none"
+    elif name.localname == "robot":
+        why = f"the root element <robot> is in the namespace {shortened(str(name.namespace))!r}"
+        fix = "remove xmlns=... from it"
+    return UrdfLocation(origin, f"<{tag}>").finding(root, "root-not-robot", why, fix)
 
 
 def _first_xacro(root: etree._Element) -> etree._Element | None:
@@ -203,10 +208,57 @@ def _cycles(parent_of: dict[str, str]) -> Iterator[list[str]]:
             yield list(reversed(path[path.index(name) :]))
 
 
-def _kinds(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+def above_free_base(root: etree._Element) -> list[etree._Element]:
+    """Return the joints and links of a URDF that are left out because its robot moves freely.
+
+    These are a floating or planar joint and all that is not below it, if nothing else moves there:
+    the world, with what stands in it.
+    """
+    joints = root.findall("joint")
+    children: dict[str | None, list[str | None]] = {}
+    for parent, child in map(_ends, joints):
+        children.setdefault(parent, []).append(child)
+    below = {}
+    """Links below each free joint."""
     for joint in joints:
+        if joint.get("type") in _REPLACEMENT:
+            reached, todo = set[str | None](), [_ends(joint)[1]]
+            while todo:
+                link = todo.pop()
+                if link not in reached:
+                    reached.add(link)
+                    todo += children.get(link, [])
+            below[joint] = reached
+    if not below:
+        return []
+    base = min(below, key=lambda joint: len(below[joint]))
+    outside = [joint for joint in joints if _ends(joint)[0] not in below[base]]
+    if any(
+        joint.get("type") != "fixed" and not below[base] <= below.get(joint, set())
+        for joint in outside
+    ):
+        return []
+    links = [link for link in root.iterfind("link") if link.get("name") not in below[base]]
+    return [*outside, *links]
+
+
+def _kinds(root: etree._Element, origin: str) -> Iterator[Finding]:
+    left_out = above_free_base(root)
+    for joint in root.iterfind("joint"):
         kind = joint.get("type")
-        if kind in _REPLACEMENT:
+        if kind in _REPLACEMENT and joint in left_out:
+            links = [element for element in left_out if element.tag == "link"]
+            names = ", ".join(repr(link.get("name")) for link in links[:5])
+            shapes = sum(1 for link in links for _ in link.iterchildren("visual", "collision"))
+            yield UrdfLocation.of(joint, origin).finding(
+                joint,
+                "base-free",
+                f"it is {kind} and lets the whole robot move; the base of a robot is fixed",
+                "attach the robot by a joint of type fixed, if it stands",
+                f"joint {joint.get('name')!r} of type {kind} and {len(links)} links above it with "
+                f"{shapes} shapes, {names}, were left out",
+            )
+        elif kind in _REPLACEMENT:
             yield UrdfLocation.of(joint, origin).finding(
                 joint,
                 "joint-type-unsupported",

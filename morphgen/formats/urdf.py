@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import cast
 
 import numpy as np
@@ -13,13 +14,21 @@ from lxml import etree
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_bytes
-from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
-from morphgen.formats.structure import structure_findings
+from morphgen.formats.resolve import (
+    SKIP_HINT,
+    FoundFile,
+    PackageFinder,
+    default_finder,
+    find_file,
+    package_source,
+)
+from morphgen.formats.structure import above_free_base, structure_findings
 from morphgen.formats.urdf_capsules import joined_capsules
 from morphgen.formats.urdf_schema import CHILDREN
 from morphgen.formats.urdf_text import MORPHGEN_TAG
 from morphgen.formats.xacro import expand
-from morphgen.formats.xml import parse_description
+from morphgen.formats.xml import parse_description, shortened
+from morphgen.model import rotation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import (
     IDENTITY,
@@ -37,9 +46,11 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic, Robot
 from morphgen.model.rotation import Vec3
+from morphgen.typing import Array
 
 MAX_URDF_BYTES = 8 * 2**20
 """Largest URDF that is read [bytes]."""
+_MESH = "geometry[1]/mesh"
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -140,9 +151,11 @@ def robot_from_xml(
     errors = tuple(finding for finding in findings if finding.severity == "error")
     if errors:
         raise UnsoundError(str(path), errors)
+    for element in () if trusted else above_free_base(root):
+        root.remove(element)
     meshes = _resolved_meshes(root, path, finder)
-    colours = {m.get("name", ""): _colour(m) for m in root.iterfind("material")}
-    link_list = [_link(element, meshes, colours) for element in root.iterfind("link")]
+    colours, unknown = _named_colours(root, str(path))
+    link_list = [_link(element, meshes.files, colours) for element in root.iterfind("link")]
     links = {link.name: link for link in link_list}
     joints = [_joint(element) for element in root.iterfind("joint")]
     joint_names = {joint.name for joint in joints}
@@ -160,7 +173,7 @@ def robot_from_xml(
     # Locations without the folder make the card the same on every machine.
     source_findings = tuple(
         replace(finding, where=f"{path.name}{finding.where.removeprefix(str(path))}")
-        for finding in (*repairs, *findings)
+        for finding in (*repairs, *findings, *meshes.findings, *unknown)
     )
     name = root.get("name", "")
     robot = Robot(
@@ -168,6 +181,7 @@ def robot_from_xml(
         tuple(links[link] for link in order),
         tuple(joints),
         home=home,
+        provenance={"packages": meshes.packages} if meshes.packages else {},
         source_findings=source_findings,
     )
     frames = [frame.get("name", "") for frame in root.iterfind(f"{MORPHGEN_TAG}/frame")]
@@ -209,28 +223,113 @@ def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
     return home
 
 
-def _resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> dict[str, Path]:
-    """Return the files of all meshes by URI.
+@dataclass(frozen=True)
+class _Meshes:
+    """The meshes of a URDF."""
+
+    files: Mapping[str, Path]
+    """File of each mesh by its URI."""
+    packages: list[dict[str, str]]
+    """Installed packages that files come from, for the card."""
+    findings: list[Finding]
+
+
+def _resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
+    """Find the files of all meshes; remove shapes whose mesh is missing, if the finder skips them.
 
     Raises:
-        UnsoundError: If a file is missing; it lists all of them.
+        UnsoundError: If a file is missing, and not skipped; it lists all of them.
     """
-    meshes: dict[str, Path] = {}
+    found: dict[str, FoundFile] = {}
     missing: dict[str, Finding] = {}
-    for element in root.iter("mesh"):
+    for element in root.iterfind(f"link/*/{_MESH}"):
         uri = element.get("filename", "")
-        if uri in meshes or uri in missing:
+        if uri in found or uri in missing:
             continue
         try:
-            meshes[uri] = resolve_uri(uri, path, finder)
+            found[uri] = _find_mesh(uri, root, path, finder)
         except FormatError as error:
             where = f"{path}:{element.sourceline}"
             missing[uri] = Finding(
-                "mesh-unresolved", "error", where, str(error), "correct the mesh path"
+                "mesh-unresolved", "error", where, str(error), f"correct the mesh path, {SKIP_HINT}"
             )
-    if missing:
+    if missing and not finder.skip_missing:
         raise UnsoundError(str(path), list(missing.values()))
-    return meshes
+    skipped = 0
+    for link in root.iterfind("link"):
+        for shape in [*link.iterchildren("visual", "collision")]:
+            mesh = shape.find(_MESH)
+            if mesh is not None and mesh.get("filename") in missing:
+                link.remove(shape)
+                skipped += 1
+    packages, findings = _place_findings(found, str(path))
+    if missing:
+        names = ", ".join(repr(shortened(uri)) for uri in [*missing][:5])
+        repair = f"{skipped} shapes were left out, because {len(missing)} meshes are missing"
+        first = next(iter(missing.values()))
+        fix = "give the meshes, and import the file again"
+        findings.append(
+            Finding("mesh-skipped", "warning", first.where, first.why, fix, f"{repair}: {names}")
+        )
+    return _Meshes({uri: file.path for uri, file in found.items()}, packages, findings)
+
+
+def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder) -> FoundFile:
+    """Find a mesh as written, else as MuJoCo does by ``<mujoco><compiler>``."""
+    try:
+        return find_file(uri, path, finder)
+    except FormatError:
+        compiler = root.find("mujoco/compiler")
+        if compiler is None:
+            raise
+        # MuJoCo strips the paths of a URDF unless told otherwise.
+        name = PurePosixPath(uri.replace("\\", "/").rpartition("://")[2])
+        inside = name if compiler.get("strippath") == "false" else name.name
+        with suppress(FormatError):
+            folder = compiler.get("meshdir", "").replace("\\", "/")
+            return find_file((PurePosixPath(folder) / inside).as_posix(), path, finder)
+        raise
+
+
+def _place_findings(
+    found: Mapping[str, FoundFile], origin: str
+) -> tuple[list[dict[str, str]], list[Finding]]:
+    """Return the installed packages of files, and findings about unexpected places, by package."""
+    groups: dict[tuple[str, str], list[FoundFile]] = {}
+    for file in found.values():
+        if file.place:
+            groups.setdefault((file.place, file.package), []).append(file)
+    packages, findings = [], []
+    for (place, package), files in groups.items():
+        if place == "installed":
+            source = package_source(files[0])
+            packages.append({"package": package, **source})
+            findings.append(
+                Finding(
+                    "mesh-from-package",
+                    "warning",
+                    origin,
+                    f"package {package!r} is not around the file; {len(files)} meshes come from "
+                    f"the one in {source['source']}, such as {files[0].path}",
+                    "put the meshes beside the file, if these are not the ones",
+                    f"{len(files)} meshes of package {package!r} come from {source['source']}, "
+                    f"licence {source['licence']}",
+                )
+            )
+        else:
+            findings.append(
+                Finding(
+                    "mesh-beside",
+                    "warning",
+                    origin,
+                    f"package {package!r} is not known; {len(files)} of its meshes were found "
+                    f"beside the file, such as {files[0].path}",
+                    f"name the folder of the file {package!r}, or name the package by --root",
+                    f"{len(files)} meshes of the unknown package {package!r} were read from the "
+                    "file's own folders",
+                )
+            )
+    return packages, findings
 
 
 def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
@@ -278,17 +377,14 @@ def _link(
         element.get("name", ""),
         _inertial(element.find("inertial")),
         joined_capsules(
-            (
-                visual.get("name", ""),
-                Shape(geometry, _origin(visual), _visual_rgba(visual, colours)),
-            )
+            (visual.get("name", ""), shape)
             for visual in element.iterfind("visual")
-            if (geometry := _geometry(visual, meshes)) is not None
+            if (shape := _shape(visual, meshes, _visual_rgba(visual, colours))) is not None
         ),
         joined_capsules(
-            (collision.get("name", ""), Shape(geometry, _origin(collision)))
+            (collision.get("name", ""), shape)
             for collision in element.iterfind("collision")
-            if (geometry := _geometry(collision, meshes)) is not None
+            if (shape := _shape(collision, meshes, None)) is not None
         ),
     )
 
@@ -313,6 +409,35 @@ def _joint(element: etree._Element) -> Joint:
         _number(dynamics, "friction") or 0.0,
         _mimic(element.find("mimic")),
     )
+
+
+def _named_colours(
+    root: etree._Element, origin: str
+) -> tuple[dict[str, Rgba | None], list[Finding]]:
+    """Return the colours of materials by name, and a finding about names without a material.
+
+    The robot's own materials come first, then those that the shapes of any link define.
+    """
+    colours = {m.get("name", ""): _colour(m) for m in root.iterfind("material")}
+    used = root.findall("link/visual/material")
+    for material in used:
+        colours[material.get("name", "")] = colours.get(material.get("name", "")) or _colour(
+            material
+        )
+    unknown = [m for m in used if m.get("name") and colours[m.get("name", "")] is None]
+    unknown = [m for m in unknown if m.find("texture") is None]
+    if not unknown:
+        return colours, []
+    names = ", ".join(dict.fromkeys(repr(shortened(m.get("name", ""))) for m in unknown[:5]))
+    finding = Finding(
+        "material-unknown",
+        "info",
+        f"{origin}:{unknown[0].sourceline}",
+        f"{len(unknown)} shapes have a <material> that has no <color>: {names}",
+        "define the material with a <color>",
+        f"{len(unknown)} shapes have no colour, because their material has none: {names}",
+    )
+    return colours, [finding]
 
 
 def _colour(material: etree._Element) -> Rgba | None:
@@ -353,7 +478,11 @@ def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | 
         case "sphere":
             geometry = Sphere(float(element.get("radius", "")))
         case "capsule":
-            geometry = Capsule(float(element.get("radius", "")), float(element.get("length", "")))
+            length = _number(element, "length")
+            if length is None:
+                a, b = _end_points(element)
+                length = math.dist(a, b)
+            geometry = Capsule(float(element.get("radius", "")), length)
         case "cylinder":
             geometry = Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
         case _:
@@ -367,9 +496,31 @@ def _origin(holder: etree._Element) -> Pose:
     origin = holder.find("origin")
     if origin is None:
         return IDENTITY
-    return Pose.from_xyz_rpy(
-        _vector(origin.get("xyz", "0 0 0")), _vector(origin.get("rpy", "0 0 0"))
-    )
+    xyz = _vector(origin.get("xyz", "0 0 0"))
+    if (text := origin.get("quat_xyzw")) is not None:
+        x, y, z, w = _numbers(text)
+        return Pose(xyz, rotation.normalize((w, x, y, z)))
+    return Pose.from_xyz_rpy(xyz, _vector(origin.get("rpy", "0 0 0")))
+
+
+def _shape(holder: etree._Element, meshes: Mapping[str, Path], rgba: Rgba | None) -> Shape | None:
+    """Convert a ``<visual>`` or ``<collision>``; None if it has no shape or one of size zero."""
+    geometry = _geometry(holder, meshes)
+    if geometry is None:
+        return None
+    T_link_shape = _origin(holder)
+    capsule = holder.find("geometry[1]/capsule")
+    if isinstance(geometry, Capsule) and capsule is not None and not capsule.get("length"):
+        a, b = _end_points(capsule)
+        x, y, z = ((b - a) / geometry.length).tolist()
+        T_link_shape @= Pose(tuple(((a + b) / 2).tolist()), rotation.from_z((x, y, z)))
+    return Shape(geometry, T_link_shape, rgba)
+
+
+def _end_points(capsule: etree._Element) -> tuple[Array, Array]:
+    """Return the centres of a capsule's spheres, which MJCF's ``fromto`` holds."""
+    points = np.reshape(_numbers(capsule.get("fromto", "")), (2, 3))
+    return points[0], points[1]
 
 
 def _visual_rgba(visual: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:

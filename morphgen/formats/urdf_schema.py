@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from lxml import etree
 
+from morphgen.errors import nearest
+from morphgen.formats.urdf_text import MUJOCO_BOUNDS
 from morphgen.formats.xml import shortened
 from morphgen.model.findings import Finding
 
@@ -85,6 +87,14 @@ CHILDREN = {
 }
 """Child elements that are read, by parent element."""
 
+_UNREAD = ("calibration", "safety_controller")
+"""Children that are not read, but whose numbers are checked: loaders refuse invalid ones."""
+_READ_CHILDREN = {
+    "robot": ("link", "joint", "material", "mujoco", "morphgen"),
+    **{tag: tuple(n for n in names if n not in _UNREAD) for tag, names in CHILDREN.items()},
+    "mujoco": ("compiler",),
+    "morphgen": ("home", "frame"),
+}
 _REPEATABLE = ("visual", "collision")
 _EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
     "joint": {"parent": "", "child": ""},
@@ -106,7 +116,7 @@ _REQUIRED_TEXT = {
     "mesh": ("filename",),
 }
 _NUMBERS = {
-    "origin": (Numbers("xyz", (3,)), Numbers("rpy", (3,))),
+    "origin": (Numbers("xyz", (3,)), Numbers("rpy", (3,)), Numbers("quat_xyzw", (4,))),
     "axis": (Numbers("xyz", (3,)),),
     "limit": tuple(Numbers(name) for name in ("lower", "upper", "effort", "velocity")),
     "mimic": (Numbers("multiplier"), Numbers("offset")),
@@ -124,7 +134,8 @@ _NUMBERS = {
     "sphere": (Numbers("radius", required=True, positive=True),),
     "capsule": (
         Numbers("radius", required=True, positive=True),
-        Numbers("length", required=True, positive=True),
+        Numbers("length", positive=True),
+        Numbers("fromto", (6,)),
     ),
     "cylinder": (
         Numbers("radius", required=True, positive=True),
@@ -133,6 +144,99 @@ _NUMBERS = {
     "mesh": (Numbers("scale", (1, 3), nonzero=True, accepts_commas=True, accepts_surplus=True),),
     "color": (Numbers("rgba", (4,)),),
 }
+
+
+_LABELS = {
+    "robot": ("version",),
+    "visual": ("name",),
+    "collision": ("name",),
+    "material": ("name",),
+    "geometry": (),
+    "mujoco": (),
+    "compiler": ("meshdir", "strippath", "fusestatic", "discardvisual", *MUJOCO_BOUNDS),
+    "morphgen": (),
+    "home": ("joint", "position"),
+    "frame": ("name",),
+}
+"""Further attributes that are read or only say how to load the file."""
+_ATTRIBUTES = {
+    tag: (
+        *_REQUIRED_TEXT.get(tag, ()),
+        *(numbers.attribute for numbers in _NUMBERS.get(tag, ())),
+        *_LABELS.get(tag, ()),
+    )
+    for tag in (*_REQUIRED_TEXT, *_NUMBERS, *_LABELS)
+}
+"""Attributes that are read, by element."""
+_EXTENSIONS = (
+    "acceleration calibration collision_checking contact contact_coefficients controller_gains "
+    "deceleration deformable dont_collapse gazebo gravity inertial_frame jerk joint_properties "
+    "kinematic ros2_control safety_controller self_collision_checking self_filter sensor specular "
+    "surface texture transmission type verbose"
+)
+"""Names that robot software knows and that a robot has no place for; others may be slips."""
+
+
+def unread_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
+    """Yield a finding for each kind of attribute, element and text that is not read.
+
+    Each has its count and first place. Names that no robot software is known to have are warnings
+    with the nearest name that is read; known extensions are for information.
+    """
+    unread: dict[tuple[str, str, str], list[tuple[etree._Element, UrdfLocation]]] = {}
+    here = UrdfLocation.of(root, origin)
+    todo = [(root, here)]
+    while todo:
+        element, location = todo.pop()
+        tag = str(element.tag)
+        for name in map(str, element.attrib):
+            if name not in _ATTRIBUTES.get(tag, ()):
+                unread.setdefault((tag, "attribute", name), []).append((element, location))
+        texts = [element.text, *(child.tail for child in element)]
+        if any(text and text.strip() for text in texts):
+            unread.setdefault((tag, "text", ""), []).append((element, location))
+        deeper = []
+        for child in element:
+            name = str(child.tag)
+            inside = UrdfLocation.of(child, origin) if element is root else location
+            if name in _READ_CHILDREN.get(tag, ()):
+                deeper.append((child, inside))
+            elif tag != "geometry":  # a finding of its own
+                unread.setdefault((tag, "element", name), []).append((child, inside))
+        todo += reversed(deeper)
+    for (tag, kind, name), found in unread.items():
+        yield _unread_finding(tag, kind, name, found)
+
+
+def _unread_finding(
+    tag: str, kind: str, name: str, found: list[tuple[etree._Element, UrdfLocation]]
+) -> Finding:
+    first, location = found[0]
+    local = etree.QName(name).localname if name else ""
+    if kind == "element":
+        prefix = f"{first.prefix}:" if first.prefix else ""
+        inside = sum(sum(1 for _ in element.iterdescendants()) for element, _ in found)
+        what = f"{len(found)} <{prefix}{local}> of <{tag}>" + (
+            f" with {inside} elements inside" if inside else ""
+        )
+        valid = _READ_CHILDREN.get(tag, ())
+    elif kind == "attribute":
+        prefixes = {namespace: prefix for prefix, namespace in first.nsmap.items()}
+        prefix = f"{prefixes.get(etree.QName(name).namespace)}:" if local != name else ""
+        what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _ATTRIBUTES.get(tag, ())
+    else:
+        what, valid = f"{len(found)} text of <{tag}>", ()
+    is_known = name in _EXTENSIONS.split() or local != name
+    hint = nearest(shortened(name), valid) if valid else ""
+    guess = f"{hint.partition('?')[0]}?" if "?" in hint else ""
+    return Finding(
+        f"{kind}-unread",
+        "info" if is_known else "warning",
+        f"{location.origin}:{first.sourceline} {location.owner}",
+        f"a robot has no place for {what}" if is_known else f"{what}: not of URDF{hint}",
+        "none is needed" if is_known else "correct the name, or remove it",
+        f"left out: {what}" + (f", not of URDF{guess}" if not is_known else ""),
+    )
 
 
 def content_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
@@ -147,6 +251,7 @@ def content_findings(element: etree._Element, location: UrdfLocation) -> Iterato
     for numbers in _NUMBERS.get(tag, ()):
         yield from _number_findings(element, numbers, location)
     yield from _missing_findings(element, location)
+    yield from _alternative_findings(element, location)
     if tag == "geometry":
         yield from _geometry_findings(element, location)
     for name in CHILDREN.get(tag, ()):
@@ -239,7 +344,7 @@ def _number_findings(
             yield location.finding(
                 element,
                 "attribute-missing",
-                f"<{element.tag}> has no {name}",
+                f"<{element.tag}> has no {name}{_others(element)}",
                 f'write <{element.tag} {name}="...">',
             )
         return
@@ -299,6 +404,39 @@ def _number_findings(
             f"{shown} flattens the mesh",
             "write factors other than 0",
         )
+
+
+def _alternative_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+    """Check attributes of which an element has either one or the other."""
+    quaternion = element.get("quat_xyzw", "1").split()
+    if element.tag == "origin" and (
+        (element.get("rpy") and element.get("quat_xyzw"))
+        or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
+    ):
+        yield location.finding(
+            element,
+            "rotation-invalid",
+            "its quat_xyzw is zero, or beside rpy",
+            "write one rotation, as a quaternion of length 1 or as rpy",
+        )
+    ends = element.get("fromto", "").split()
+    if (
+        element.tag == "capsule"
+        and not element.get("length")
+        and (not ends or ends[:3] == ends[3:])
+    ):
+        yield location.finding(
+            element,
+            "attribute-missing",
+            f"<capsule> has no length{_others(element)}, and no two end points as fromto",
+            'write <capsule length="...">',
+        )
+
+
+def _others(element: etree._Element) -> str:
+    """Return the first attribute that is not read, for an error about one that is missing."""
+    others = [name for name in map(str, element.attrib) if name not in _ATTRIBUTES[element.tag]]
+    return f", but {shortened(others[0])}" if others else ""
 
 
 def _tags(names: tuple[str, ...]) -> str:

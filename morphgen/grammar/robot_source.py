@@ -247,6 +247,7 @@ def import_robot(
     srdf: Path | None = None,
     name: str | None = None,
     repair: bool = True,
+    skip_missing_meshes: bool = False,
 ) -> Robot:
     """Read any robot description, and add what it lacks: a tool frame and ignored pairs.
 
@@ -264,6 +265,8 @@ def import_robot(
         repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
             loaders refuse the robot. The provenance lists them, and all that was corrected to read
             the file.
+        skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out, with a
+            finding, instead of an error.
 
     Raises:
         FormatError: If a file cannot be read, or names a link that the description does not have.
@@ -271,7 +274,7 @@ def import_robot(
     robot = read_description(
         path,
         args,
-        default_finder(root=root),
+        default_finder(root=root, skip_missing=skip_missing_meshes),
         root_link=root_link,
         written_frames=tool is None and path.suffix != XACRO,  # a tool is named by its link
     )
@@ -290,7 +293,9 @@ def import_robot(
     if tool is not None or _has_tool_link(robot):
         robot = _with_tool(robot, tool or TOOL)
     robot = replace(
-        robot, name=robot.name if name is None else name, provenance={"source": path.name}
+        robot,
+        name=robot.name if name is None else name,
+        provenance={"source": path.name, **robot.provenance},
     )
     robot = record_repairs(robot, robot.source_findings)
     if repair:

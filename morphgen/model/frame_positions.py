@@ -15,7 +15,7 @@ import numpy as np
 from morphgen.model import rotation
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import TOOL, Robot
-from morphgen.model.rotation import Quat, Vec3
+from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
 
@@ -45,7 +45,7 @@ def _aligned_joints(robot: Robot, frame: str) -> tuple[list[_AlignedJoint], Pose
         if joint.is_movable:
             leader = int(np.abs(gains[row[k]]).argmax())
             gain, offset = float(gains[row[k], leader]), float(offsets[row[k]])
-            T_joint_axis = Pose(quaternion=_rotation_from_z(joint.unit_axis))
+            T_joint_axis = Pose(quaternion=rotation.from_z(joint.unit_axis))
             T_axis_next = T_joint_axis.inverse() @ T_joint_next
             slides = joint.kind == "prismatic"
             joints.append(_AlignedJoint(T_axis_next, leader, gain, offset, slides))
@@ -132,12 +132,3 @@ def _rows(T: Pose) -> tuple[float, ...]:
 def _transform(T: Pose, points: Array) -> Array:
     # einsum, because starting the threads of a matrix product costs more than it saves
     return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
-
-
-def _rotation_from_z(axis: Vec3) -> Quat:
-    """Return a rotation that maps the z axis to a unit axis."""
-    x, y, z = axis
-    if z < -0.5:  # near -z the formula below is singular: first turn by pi about x
-        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _rotation_from_z((x, -y, -z)))
-    # The quaternion (1 + z . axis, z x axis) rotates z to the axis by the shortest way.
-    return rotation.normalize((1 + z, -y, x, 0.0))

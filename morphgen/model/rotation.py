@@ -114,3 +114,12 @@ def to_rpy(q: Quat) -> Vec3:
     yaw = math.atan2(d, a) if cos_pitch > _GIMBAL else 0.0
     cy, sy = math.cos(yaw), math.sin(yaw)
     return (math.atan2(sy * c - cy * f, cy * e - sy * b), pitch, yaw)
+
+
+def from_z(axis: Vec3) -> Quat:
+    """Return a rotation that maps the z axis to a unit axis."""
+    x, y, z = axis
+    if z < -0.5:  # near -z the formula below is singular: first turn by pi about x
+        return multiply((0.0, 1.0, 0.0, 0.0), from_z((x, -y, -z)))
+    # The quaternion (1 + z . axis, z x axis) rotates z to the axis by the shortest way.
+    return normalize((1 + z, -y, x, 0.0))

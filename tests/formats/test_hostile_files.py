@@ -42,7 +42,6 @@ URDFS = {
     "latin-1 called utf-8": '<robot name="é"/>'.encode("latin-1"),
     "utf-16 without a mark": SOUND.encode("utf-16-le"),
     "utf-16 with the wrong mark": b"\xff\xfe" + SOUND.encode("utf-16-be"),
-    "unknown encoding": b'<?xml version="1.0" encoding="klingon"?>' + SOUND.encode(),
     "binary": bytes(range(256)) * 100,
     "json": b'{"robot": 1}',
     "html": b"<!DOCTYPE html><html><body/></html>",

@@ -53,6 +53,9 @@ FAULTS = [
     ("attribute-missing", ('joint="j" ', ""), 17),
     ("element-missing", ('<parent link="a"/>', ""), 12),
     ("element-missing", ('<child link="b"/>', ""), 12),
+    ("rotation-invalid", ('rpy="0 0 1"', 'rpy="0 0 1" quat_xyzw="0 0 0 1"'), 7),
+    ("rotation-invalid", ('rpy="0 0 1"', 'quat_xyzw="0 0 0 0"'), 7),
+    ("number-count", ('rpy="0 0 1"', 'quat_xyzw="0 0 1"'), 7),
     ("number-malformed", ('rpy="0 0 1"', 'rpy="0 0 nan"'), 7),
     ("number-malformed", ('xyz="0 0 1"', 'xyz="0 0 up"'), 13),
     ("number-malformed", ('upper="1e0"', 'upper="inf"'), 13),
@@ -80,7 +83,7 @@ FAULTS = [
     ("cycle", ('<parent link="b"/>', '<parent link="c"/>'), 16),
     ("disconnected", ('<link name="c"/>', '<link name="c"/>\n<link name="d"/>'), 16),
     ("mimic-cycle", ('mimic joint="j"', 'mimic joint="k"'), 16),
-    ("joint-type-unsupported", ('type="revolute"', 'type="floating"'), 12),
+    ("joint-type-unsupported", ('type="continuous"', 'type="floating"'), 16),
     ("joint-type-unsupported", ('type="continuous"', 'type="planar"'), 16),
     ("joint-type-unknown", ('type="revolute"', 'type="hinge"'), 12),
     ("text-invalid", ('link name="c"', 'link name="c&#10;d"'), 15),
@@ -147,7 +150,8 @@ def test_faults_are_reported_with_their_line(code, change, line):
 
 @pytest.mark.parametrize(("code", "change"), SUSPICIOUS)
 def test_recoverable_faults_are_warnings_and_load(code, change):
-    assert [(f.code, f.severity) for f in findings(changed(change))] == [(code, "warning")]
+    kinds = {(f.code, f.severity) for f in findings(changed(change))}
+    assert kinds - {("element-unread", "info")} == {(code, "warning")}
     load(changed(change))
 
 
@@ -180,14 +184,6 @@ def test_every_cycle_is_reported_once():
     faults = findings(f'<robot name="r">{links}{joints}</robot>')
     cycles = [finding.why for finding in faults if finding.code == "cycle"]
     assert [why.partition(": ")[2] for why in cycles] == ["b -> c -> b", "f -> d -> e -> f"]
-
-
-def test_unknown_elements_are_ignored():
-    foreign = (
-        '<gazebo reference="b"><origin xyz="x"/><box/></gazebo>'
-        '<transmission name="t"><joint/></transmission>'
-    )
-    assert findings(SOUND.replace('<link name="a"/>', f'<link name="a"/>{foreign}')) == ()
 
 
 def mutations() -> list[str]:
