@@ -24,7 +24,7 @@ print(f"random actions: {info['distance']:.2f} m from the goal, success: {info['
 env.close()
 
 # %%
-# Environment i has robot i modulo their number. All robots share one padded observation space.
+# Environment i has robot i modulo their number. All robots share one observation space.
 robots = ["ur5-stick", "panda-stick", "arm3-stick"]
 envs = morphgen.make_env("reach", robots, num_envs=6, sim="mujoco", seed=0)
 observations, infos = envs.reset(seed=0)
@@ -34,7 +34,7 @@ print({name: entry.shape for name, entry in observations.items()})
 # Baselines act on the batch of tensors below the vector environment.
 controller = BASELINES["jacobian"].make(0)
 for _ in range(150):
-    actions = controller.act(envs.batch).numpy()
+    actions = controller.act(envs.batch).numpy()[:, envs.action_links]
     observations, rewards, terminations, truncations, infos = envs.step(actions)
 print("jacobian controller:", infos["distance"].round(3), "m from the goals")
 envs.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -17,12 +17,16 @@ from morphgen.tasks.host import is_host
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
+from morphgen.tasks.reset_options import EpisodePlacer
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
 from morphgen.tasks.step_result import TaskState
+from morphgen.tasks.straight_paths import StraightPaths
 from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
+
+_FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +159,8 @@ class TaskBatch:
         self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
         self.observation_config = observe or ObservationConfig()
         self.layouts = EpisodeLayouts(self.specs, index, layouts, self.observation_config)
+        paths = StraightPaths(self.layouts, index)
+        self._place = EpisodePlacer(self.specs, index, paths)
         self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
         self._observation = BatchObservation(
             robot_tables,
@@ -164,7 +170,22 @@ class TaskBatch:
             self.layouts,
             self.action_mask,
             self.observation_config,
+            paths,
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which goes on as this batch does.
+
+        Raises:
+            TaskError: If the simulator holds its state where it cannot be copied.
+        """
+        kind = type(self.simulation)
+        if kind.__getstate__ is object.__getstate__:
+            raise TaskError(
+                f"a {kind.__name__} cannot be copied: make another environment, or use the "
+                "simulator 'mujoco'"
+            )
+        return vars(self)
 
     @property
     def num_envs(self) -> int:
@@ -172,8 +193,8 @@ class TaskBatch:
         return len(self.env_robot_index)
 
     @property
-    def seed(self) -> int:
-        """Seed of the episodes."""
+    def seed(self) -> int | tuple[int, ...]:
+        """Seed of the episodes, or a seed of each environment."""
         return self._episodes.seed
 
     @property
@@ -189,38 +210,67 @@ class TaskBatch:
         """Return the current value of an observation field of the tasks, shape (n, size)."""
         return self.groups.fields(self.simulation.block_pose)[name]
 
-    def reset(self, seed: int | None = None, *, spread: bool = False) -> Observation:
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        *,
+        spread: bool = False,
+        options: Mapping[str, Any] | None = None,
+    ) -> Observation:
         """Begin an episode in every environment.
 
         Args:
             seed: Seed of all episodes from now on, which begin with the first; by default the next
-                episodes begin.
+                episodes begin. A list has the seed of each environment, whose episodes are then
+                those of environment 0 of a batch with that seed.
             spread: Whether these first episodes begin at random fractions of their time limit, so
                 that they do not all end at the same step; for learners.
+            options: Where these first episodes begin: joint positions ``q`` and, depending on the
+                task, ``goal`` or ``block`` (``Task.reset_options``); a vector for all environments,
+                or one for each. The rest is drawn as always.
 
         Raises:
-            TaskError: If the seed is out of range.
+            TaskError: If a seed is out of range, or an option is invalid. The same episodes are
+                then still the next.
         """
+        before = self.state_dict() if options else {}
         if seed is not None:
             self._episodes.restart(seed, torch.zeros_like(self._episodes.next_episode))
-        random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool))
+        try:
+            random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool), options)
+        except TaskError:
+            if before:
+                self.load_state_dict(before)
+            raise
         if spread:
             self.episode_step.copy_(random.integers(Stream.SPREAD, self.max_episode_steps))
         return self.observe()
 
-    def step(self, actions: torch.Tensor) -> Step:
+    def step(self, actions: torch.Tensor, hold: torch.Tensor | None = None) -> Step:
         """Act for one control step.
 
         Args:
             actions: Shape (n, L); continuous: in [-1, 1], clipped; discrete: indices of ``BINS``.
+            hold: Environments whose episode has just begun and begins with the next step instead,
+                shape (n,), bool: they ignore their action, and their reward is 0.
 
         Raises:
             TaskError: If the actions are invalid.
             SimulationError: If the simulator failed.
         """
+        held_episode = None if hold is None else self._episodes.next_episode - 1
         before = self.act(actions)
         diverged = self.simulation.step(before.targets)
-        return self.finish(before, diverged)
+        step = self.finish(before, diverged)
+        if hold is None or held_episode is None:
+            return step
+        # What happened to these environments in the step is undone: their episode begins again.
+        next_episode = torch.where(hold, held_episode, self._episodes.next_episode)
+        self._episodes.restart(self.seed, next_episode)
+        self._begin(hold)
+        flags = {name: getattr(step, name) & ~hold for name in _FLAGS}
+        reward = step.reward.masked_fill(hold, 0)
+        return replace(step, observation=self.observe(), reward=reward, **flags)
 
     def act(self, actions: torch.Tensor) -> BeforePhysics:
         """Advance the joint targets by the actions: the part of ``step`` before the physics.
@@ -354,16 +404,19 @@ class TaskBatch:
         T_root_tool = frame_pose(self.robot_tables.tool_chain, self.env_robot_index, q)
         return T_root_tool[:, :3, :3]
 
-    def _begin(self, mask: torch.Tensor) -> EpisodeRandom:
+    def _begin(self, mask: torch.Tensor, options: Mapping[str, Any] | None = None) -> EpisodeRandom:
         """Begin episodes in some environments; return their random numbers.
 
         Args:
             mask: The environments, shape (n,), bool.
+            options: As of ``reset``, if all environments begin.
         """
         random = self._episodes.begin(mask)
         self.layouts.draw(mask, random)
         layout = self.layouts.current if self.layouts.any else None
         q, block_pose = self.groups.begin(mask, random, layout)
+        if options:
+            q, block_pose = self._place(options, self.groups, q, block_pose)
         self._observation.begin(mask, random)
         obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()

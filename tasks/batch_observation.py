@@ -54,6 +54,7 @@ class BatchObservation:
         layouts: EpisodeLayouts,
         action_mask: torch.Tensor,
         config: ObservationConfig,
+        paths: StraightPaths,
     ) -> None:
         """Gather the tables of all environments.
 
@@ -65,6 +66,7 @@ class BatchObservation:
             layouts: Layouts of the obstacles in the running episodes.
             action_mask: Links whose joint obeys actions, shape (n, L), bool.
             config: Optional entries.
+            paths: Tests of straight paths.
         """
         self._tables, self._index, self._config = robot_tables, env_robot_index, config
         self._groups, self._layouts = groups, layouts
@@ -85,7 +87,6 @@ class BatchObservation:
         self._kinematics: KinematicChannels | None = None
         if names := config.kinematic_channels:
             has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
-            paths = StraightPaths(layouts, index)
             self._kinematics = KinematicChannels(
                 robot_tables, index, names, has_block=has_block, first_free=paths
             )

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from functools import partial
+from inspect import currentframe
 from os import PathLike
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from morphgen.arguments import whole_number
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
 from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics_torch import frame_pose
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.channels import KINEMATIC_CHANNELS
+from morphgen.tasks.env_specs import task_configs
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.numpy_step import EnvStep, numpy_stepper, pad_action
 from morphgen.tasks.observation import Observation, ObservationConfig
@@ -27,15 +31,19 @@ from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_s
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
 from morphgen.tasks.vector import (
+    LINK_ENTRIES,
+    RENDER_MODES,
     NumpyObservation,
     action_space,
+    final_state,
     numpy_observation,
     observation_space,
+    render_arguments,
+    require_limit,
+    text_spec,
 )
 
-RENDER_MODES = ("rgb_array",)
-_LINK_ENTRIES = ("tokens", "velocity", *KINEMATIC_CHANNELS)
-"""Entries of observations with a row for each link."""
+T = TypeVar("T")
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
@@ -49,11 +57,19 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     of a joint's largest step, in [-1, 1]; discrete ones are indices of
     ``morphgen.tasks.actions.BINS``.
 
-    ``info`` has ``success``, ``distance``, ``score``, ``diverged``, ``terms``, for goals that
-    are poses ``angle`` (see ``Step``), and ``self_collision``: whether links collide with each
-    other in this environment. Episodes end by themselves: no time limit wrapper is needed.
+    ``info`` has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
+    ``terms``, for goals that are poses ``angle`` (see ``Step``), and ``self_collision``: whether
+    links collide with each other in this environment. Episodes end by themselves, after
+    ``spec.max_episode_steps`` at the latest: no time limit wrapper is needed.
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
+
+    With ``goal_env=True`` observations are ``achieved_goal``, ``desired_goal`` and
+    ``observation``, a vector of all other entries in the order of their names, as hindsight replay
+    needs them. The reward is then ``compute_reward``: the terms that depend on the goal alone.
+
+    A copy (``copy.deepcopy``, ``pickle``) goes on exactly as the original would; with simulators
+    that hold their state elsewhere, such as PyBullet, it is refused.
 
     Reach and push on the CPU step in NumPy (``NumpyStepper``), several times as fast as the batch;
     all results equal the batch's to the rounding of single precision. A task whose ``TaskEnvs`` has
@@ -80,9 +96,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         obstacles: bool = False,
         layouts: LayoutSide = "train",
         kind: ActionKind = "continuous",
-        observe: ObservationConfig | None = None,
-        contacts: Contacts | None = None,
-        config: TaskConfig | None = None,
+        observe: ObservationConfig | Mapping[str, Any] | None = None,
+        contacts: Contacts | Mapping[str, Any] | None = None,
+        config: TaskConfig | Mapping[str, Any] | None = None,
         goal_seed: int = 0,
         cache: str | PathLike[str] | None = None,
         library: LibraryFolders = (),
@@ -90,6 +106,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         progress: Progress = no_progress,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
+        goal_env: bool = False,
     ) -> None:
         """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
@@ -106,7 +123,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             kind: Actions are ``continuous`` or ``discrete``.
             observe: Optional entries of observations.
             contacts: Pairs of things that collide; by default everything.
-            config: Constants of the task.
+            config: Constants of the task. Like ``observe`` and ``contacts`` it may be a dictionary,
+                as in the JSON of ``spec.to_json()``.
             goal_seed: Seed of goals, starts and obstacles.
             cache: Folder of stored goal sets; by default one in the user's cache.
             library: Folders of your own parts.
@@ -115,29 +133,38 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             progress: Called with the number of robots whose goal set is ready, and their total.
             render_mode: ``rgb_array`` or None.
             size: Width and height of rendered pictures [pixels].
+            goal_env: Whether observations and rewards have the form for hindsight replay.
 
         Raises:
-            TaskError: If an argument is invalid.
+            TaskError: If an argument is invalid, or ``gym.make`` was given a ``max_episode_steps``
+                beyond the task's.
             MorphgenError: As ``make_batch``.
         """
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            hint = nearest(render_mode, RENDER_MODES)
-            raise TaskError(f"unknown render mode {render_mode!r}{hint}")
+        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         sim = sim or DEFAULT_SIMULATOR
+        task_kind = TASKS[task]
+        observe = _from_mapping("observe", ObservationConfig, observe)
+        contacts = _from_mapping("contacts", Contacts, contacts)
+        config = _from_mapping("config", partial(_task_config, task), config)
         self._self_collision = (contacts or Contacts()).self_collision
         self._self_collision &= SIMULATORS[sim].simulates_contacts
-        config_type = TASKS[task].config_type
+        config_type = task_kind.config_type
         if config is not None and not isinstance(config, config_type):
             raise TaskError(
                 f"{type(config).__name__} is not the config of {task}: expected "
                 f"{config_type.__name__}"
             )
+        limit = (config or config_type()).max_episode_steps
+        require_limit(_limit_for_make(), limit)
+        if goal_env and not task_kind.goal_field:
+            raise TaskError(
+                f"goal_env: task {task} has no goals for hindsight replay; see Task.goal_field"
+            )
         self.task = task
-        try:
-            width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
-        except (TypeError, ValueError) as error:
-            raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
-        self.render_mode, self._size = render_mode, (width, height)
+        self._spec: EnvSpec | None = None
+        self._goal_env = goal_env
+        if goal_env:  # others take an environment with this method for one with goals
+            self.compute_reward = self._reward_of_goals
         self._renderer: Renderer | None = None
         self.batch = make_batch(
             self.task,
@@ -158,39 +185,52 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         )
         self.env_spec = self.batch.specs[0]
         robot_links = self.env_spec.robot.joints
-        other_fields = set(STANDARD_FIELDS) - set(TASKS[task].fields)
+        other_fields = set(STANDARD_FIELDS) - set(task_kind.fields)
         self._hidden = {field.name for field in other_fields}
         self.action_links: tuple[int, ...] = tuple(
             torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
         )
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
         self._running = self._closed = self._was_reset = self._next_has_begun = False
+        self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
         self._final_state: RenderState | None = None
         self._stepper = numpy_stepper(self.batch, self._without_padding)
-        first = self._without_padding(self.batch.observe())
+        first = self._in_goal_form(self._without_padding(self.batch.observe()))
         self.observation_space = cast(
             gym.Space[NumpyObservation],
-            observation_space({k: v[None] for k, v in first.items()}, TASKS[task].fields),
+            observation_space({k: v[None] for k, v in first.items()}, task_kind.fields),
         )
         self.action_space = action_space(kind, len(self.action_links))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NumpyObservation, dict[str, Any]]:
-        """Begin an episode: the next one, or with a seed the first; the very first is random."""
+        """Begin an episode: the next one, or with a seed the first; the very first is random.
+
+        Args:
+            seed: Seed of the episodes from now on.
+            options: Where this episode begins: joint positions ``q``, for reach a ``goal`` of the
+                tool (a position, or a pose with a quaternion wxyz), for push the position or pose
+                of the ``block``; all in the root frame. The rest is drawn as always.
+
+        Raises:
+            TaskError: If the seed is out of range, or an option is unknown, malformed, out of
+                limits or reach, or collides.
+        """
         self._require_open()
         super().reset(seed=seed)
         if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))
-        next_has_begun = self._next_has_begun and seed is None
+        self._running = False
+        next_has_begun = self._next_has_begun and seed is None and not options
         observation = self._without_padding(
-            self.batch.observe() if next_has_begun else self.batch.reset(seed)
+            self.batch.observe() if next_has_begun else self.batch.reset(seed, options=options)
         )
         if self._stepper is not None:
             self._stepper.begin(observation)
         self._running = self._was_reset = True
-        self._next_has_begun, self._final_state = False, None
-        return observation, {"self_collision": self._self_collision}
+        self._next_has_begun, self._final_state, self._final_physics = False, None, None
+        return self._in_goal_form(observation), {"self_collision": self._self_collision}
 
     def step(
         self, action: NDArray[Any]
@@ -209,7 +249,65 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         observation, reward, terminated, truncated, info = step(action)
         self._running = not (terminated or truncated)
         info["self_collision"] = self._self_collision
+        if self._goal_env:
+            observation = self._in_goal_form(observation)
+            goals = observation["achieved_goal"], observation["desired_goal"]
+            reward = float(self._reward_of_goals(*goals, info))
         return observation, reward, terminated, truncated, info
+
+    def _reward_of_goals(
+        self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: object
+    ) -> NDArray[np.float32]:
+        """Return the reward of achieving a goal while another is desired, with ``goal_env=True``.
+
+        Args:
+            achieved_goal: Goals, shape (g,) or (..., g).
+            desired_goal: Goals of the same shape.
+            info: Unused: the reward depends on nothing else.
+
+        Returns:
+            Rewards, shape () or (...), such as those of ``step``.
+
+        Raises:
+            TaskError: If the shapes differ.
+        """
+        achieved, desired = (
+            np.ascontiguousarray(goals, np.float32) for goals in (achieved_goal, desired_goal)
+        )
+        size = self.observation_space["desired_goal"].shape  # type: ignore[index]  # a Dict
+        if achieved.shape != desired.shape or achieved.shape[-1:] != size:
+            raise TaskError(
+                f"compute_reward: goals of shapes {achieved.shape} and {desired.shape}; expected "
+                f"(..., {size[0]}) both"
+            )
+        rows = (torch.from_numpy(goals.reshape(-1, *size)) for goals in (achieved, desired))
+        rewards = TASKS[self.task].goal_reward(self.env_spec.config, *rows)
+        return rewards.numpy().reshape(achieved.shape[:-1])
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = text_spec(spec, self.env_spec.config.max_episode_steps)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which makes stepper and renderer anew.
+
+        Raises:
+            TaskError: If the environment is closed.
+        """
+        self._require_open()
+        return vars(self) | {"_stepper": None, "_renderer": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy: views of tensors must be of its own tensors."""
+        vars(self).update(state)
+        self._stepper = numpy_stepper(self.batch, self._without_padding)
+        if self._stepper is not None and self._was_reset:
+            self._stepper.begin(self._without_padding(self.batch.observe()))
 
     def render(self) -> Frame | None:
         """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
@@ -249,12 +347,12 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         step = self.batch.step(pad_action(self.batch, action))
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
-            if before is not None:  # the state to render comes from the step
-                block = None if before.block is None else step.block_pose[0].cpu().numpy()
-                q = step.q[0, : len(before.q)].cpu().numpy()
-                self._final_state = replace(before, q=q, block=block)
+            self._final_physics = step.q, step.block_pose
+            if before is not None:
+                self._final_state = final_state(before, step)
         info = {
             "success": bool(step.success[0]),
+            "is_success": bool(step.success[0]),
             "distance": float(step.distance[0]),
             "score": float(step.score[0]),
             "diverged": bool(step.diverged[0]),
@@ -265,13 +363,65 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         observation, ended = self._without_padding(step.final_observation), step.terminated
         return observation, float(step.reward[0]), bool(ended[0]), bool(step.truncated[0]), info
 
+    def _in_goal_form(self, observation: NumpyObservation) -> NumpyObservation:
+        """Return an observation of the current state as ``goal_env`` asks for it."""
+        if not self._goal_env:
+            return observation
+        task, batch = TASKS[self.task], self.batch
+        q, block_pose = self._final_physics or (batch.q, batch.simulation.block_pose)
+        chain = batch.robot_tables.tool_chain
+        tool = Pose.from_matrix(frame_pose(chain, batch.env_robot_index, q)[0].double().numpy())
+        achieved = task.achieved_goal(
+            self.env_spec.config,
+            np.array([*tool.position, *tool.quaternion], np.float32),
+            block_pose[0].clone().numpy(),
+        )
+        rest = {name: value for name, value in observation.items() if name != task.goal_field}
+        return {
+            "achieved_goal": achieved,
+            "desired_goal": observation[task.goal_field][: len(achieved)],
+            "observation": np.concatenate([rest[name].ravel() for name in sorted(rest)]),
+        }
+
     def _without_padding(self, observation: Observation) -> NumpyObservation:
         """Return the observation of a batch of one without padding, masks and foreign fields."""
         links = slice(len(self.env_spec.robot.links))
-        rows: dict[str, Any] = dict.fromkeys(_LINK_ENTRIES, links)
+        rows: dict[str, Any] = dict.fromkeys(LINK_ENTRIES, links)
         rows["previous_action"] = list(self.action_links)
         return {
             name: np.array(values[0][rows.get(name, slice(None))])
             for name, values in numpy_observation(observation).items()
             if values.dtype == np.float32 and name not in self._hidden
         }
+
+
+def _from_mapping(
+    name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
+) -> T | None:
+    """Return an argument that may be a dictionary, as in JSON, as the object that it describes.
+
+    Raises:
+        TaskError: If the dictionary has an unknown key.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    try:
+        return make(**value)
+    except TypeError as error:
+        raise TaskError(f"{name} {dict(value)}: {error}") from error
+
+
+def _task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of the task's types
+    return task_configs({task: constants})[0]
+
+
+def _limit_for_make() -> int | None:
+    """Return the ``max_episode_steps`` that ``gym.make`` was called with, if it was.
+
+    It gives them to a wrapper alone, which would be without effect beyond the task's limit; so they
+    are looked up in its frame.
+    """
+    frame = currentframe()
+    while frame is not None and frame.f_code is not gym.make.__code__:
+        frame = frame.f_back
+    return None if frame is None else frame.f_locals.get("max_episode_steps")

@@ -150,6 +150,7 @@ class NumpyStepper:
         terminated = bool(result.terminated)
         info = {
             "success": bool(result.success),
+            "is_success": bool(result.success),
             "distance": float(result.distance),
             "score": float(result.score),
             "diverged": diverged,

@@ -8,6 +8,7 @@ Thus the episodes of an environment do not depend on its batch, and are the same
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -57,8 +58,9 @@ class EpisodeRandom:
     The numbers of an environment depend on the seed and on its row of the two tensors.
     """
 
-    seed: int
-    """Seed, 0 to ``MAX_SEED``."""
+    key: int | torch.Tensor
+    """Seed of all environments, 0 to ``MAX_SEED``, or the low and high words of the seed of each,
+    shape (k, 2), int64."""
     env_number: torch.Tensor
     """Number of each environment, shape (k,), int64, 0 to 2^32 - 1."""
     episode: torch.Tensor
@@ -69,7 +71,8 @@ class EpisodeRandom:
     def select(self, rows: torch.Tensor) -> EpisodeRandom:
         """Return the numbers of some of the environments, by their rows (m,), int64."""
         words = None if self.words is None else self.words[rows]
-        return EpisodeRandom(self.seed, self.env_number[rows], self.episode[rows], words)
+        key = self.key if isinstance(self.key, int) else self.key[rows]
+        return EpisodeRandom(key, self.env_number[rows], self.episode[rows], words)
 
     def uniform(self, stream: int, count: int) -> torch.Tensor:
         """Return numbers that are uniform in [0, 1), multiples of 2^-24.
@@ -108,7 +111,7 @@ class EpisodeRandom:
         counter[0], counter[1] = self.env_number[:, None], self.episode[:, None]
         counter[2].fill_(stream)
         counter[3] = torch.arange(num_blocks, device=counter.device)
-        words = philox(counter.flatten(1), self.seed)
+        words = philox(counter.flatten(1), _repeated(self.key, num_blocks))
         return words.T.reshape(k, 4 * num_blocks)[:, :count]
 
 
@@ -116,10 +119,12 @@ class EpisodeSequence:
     """The episodes of n environments, one after the other.
 
     Attributes:
-        seed: Seed of the random numbers, 0 to ``MAX_SEED``.
-        env_number: Number of each environment, shape (n,), int64.
+        seed: Seed of the random numbers, 0 to ``MAX_SEED``, or a seed of each environment.
+        env_number: Number of each environment, shape (n,), int64; 0 where each has its own seed.
         next_episode: Number of the next episode of each environment, shape (n,), int64.
     """
+
+    seed: int | tuple[int, ...]
 
     def __init__(self, seed: int, env_number: torch.Tensor, next_episode: torch.Tensor) -> None:
         """Set up; for the arguments see the attributes.
@@ -127,19 +132,30 @@ class EpisodeSequence:
         Raises:
             TaskError: If the seed is out of range.
         """
-        self.env_number, self.next_episode = env_number, next_episode.clone()
+        self._numbers, self.next_episode = env_number, next_episode.clone()
         self.restart(seed, next_episode)
         # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
         self._first_row = AHEAD * torch.arange(len(env_number), device=env_number.device)
 
-    def restart(self, seed: int, next_episode: torch.Tensor) -> None:
+    def restart(self, seed: int | Sequence[int], next_episode: torch.Tensor) -> None:
         """Go on with another seed and other episodes; see the attributes.
 
         Raises:
-            TaskError: If the seed is out of range.
+            TaskError: If a seed is out of range, or there are too few or too many.
         """
-        require_seed(seed)
-        self.seed, self._uses_left = seed, 0
+        self._key: int | torch.Tensor
+        if isinstance(seed, int):
+            require_seed(seed)
+            self.seed, self._key, self.env_number = seed, seed, self._numbers
+        else:
+            if len(seed) != len(self._numbers):
+                raise TaskError(f"{len(seed)} seeds for {len(self._numbers)} environments")
+            for env_seed in seed:
+                require_seed(env_seed)
+            words = [divmod(env_seed, WORD)[::-1] for env_seed in seed]
+            self._key = torch.tensor(words, device=self._numbers.device)
+            self.seed, self.env_number = tuple(seed), torch.zeros_like(self._numbers)
+        self._uses_left = 0
         self.next_episode.copy_(next_episode)
 
     def begin(self, mask: torch.Tensor) -> EpisodeRandom:
@@ -153,7 +169,7 @@ class EpisodeSequence:
             too.
         """
         if not is_host(mask.device):  # in place and without counting, as a CUDA graph has to
-            random = EpisodeRandom(self.seed, self.env_number, self.next_episode.clone())
+            random = EpisodeRandom(self._key, self.env_number, self.next_episode.clone())
             self.next_episode += mask
             return random
         if not self._uses_left:
@@ -161,7 +177,7 @@ class EpisodeSequence:
         self._uses_left -= 1
         row = self._first_row + (self.next_episode - self._first_ahead)
         words = self._ahead.index_select(0, row).view(-1, STREAMS_AHEAD, 4)
-        random = EpisodeRandom(self.seed, self.env_number, self.next_episode, words)
+        random = EpisodeRandom(self._key, self.env_number, self.next_episode, words)
         self.next_episode = self.next_episode + mask
         return random
 
@@ -176,7 +192,7 @@ class EpisodeSequence:
         counter[0] = self.env_number[:, None, None]
         counter[1] = (self.next_episode[:, None] + torch.arange(AHEAD, device=device))[..., None]
         counter[2] = torch.arange(STREAMS_AHEAD, device=device)
-        words = philox(counter.flatten(1), self.seed)
+        words = philox(counter.flatten(1), _repeated(self._key, AHEAD * STREAMS_AHEAD))
         self._ahead = words.T.reshape(n * AHEAD, 4 * STREAMS_AHEAD)
 
 
@@ -190,19 +206,19 @@ def require_seed(seed: int) -> None:
         raise TaskError(f"seed {seed}: expected 0 to 2^64 - 1")
 
 
-def philox(counter: torch.Tensor, seed: int) -> torch.Tensor:
+def philox(counter: torch.Tensor, seed: int | torch.Tensor) -> torch.Tensor:
     """Return the random words of counters by Philox4x32-10.
 
     Args:
         counter: Words of m counters, the lowest first, shape (4, m), int64.
-        seed: The key, 0 to ``MAX_SEED``.
+        seed: The key, 0 to ``MAX_SEED``, or low and high words of each counter's key, shape (m, 2).
 
     Returns:
         Random words, shape (4, m), int64.
     """
     # A round multiplies the third and the first word, in this order, and mixes in the others.
     factors, others = counter[::2].flip(0), counter[1::2]
-    low_key, high_key = seed % WORD, seed // WORD
+    low_key, high_key = (seed % WORD, seed // WORD) if isinstance(seed, int) else seed.T
     multipliers = _column(_MULTIPLIERS, counter)
     for k in range(ROUNDS):
         keys = (low_key + k * _KEY_STEPS[0]) % WORD, (high_key + k * _KEY_STEPS[1]) % WORD
@@ -213,8 +229,17 @@ def philox(counter: torch.Tensor, seed: int) -> torch.Tensor:
     return torch.stack([factors[1], others[0], factors[0], others[1]])
 
 
-def _column(numbers: tuple[int, int], like: torch.Tensor) -> torch.Tensor:
-    """Return two numbers as a column, shape (2, 1), without a copy from the CPU."""
+def _repeated(key: int | torch.Tensor, times: int) -> int | torch.Tensor:
+    """Return a key for each of several counters of an environment, one after the other."""
+    return key if isinstance(key, int) else key.repeat_interleave(times, dim=0)
+
+
+def _column(
+    numbers: tuple[int | torch.Tensor, int | torch.Tensor], like: torch.Tensor
+) -> torch.Tensor:
+    """Return two numbers as a column, shape (2, 1), without a copy from the CPU; or two rows."""
+    if isinstance(numbers[0], torch.Tensor):
+        return torch.stack(numbers)  # type: ignore[arg-type]  # then the other is a tensor, too
     column = like.new_empty(2, 1)
     column[0].fill_(numbers[0])
     column[1].fill_(numbers[1])

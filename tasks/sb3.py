@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, TaskError
@@ -40,8 +41,11 @@ class SB3Vector(VecEnv):
 
     def __init__(self, vector: TaskVector) -> None:
         """Wrap environments; ``reset`` begins new episodes."""
+        if vector.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise TaskError("stable-baselines3 needs a vector with autoreset_mode SAME_STEP")
         self.vector = vector
         self._actions: NDArray[Any] = np.zeros(0)
+        self.render_mode = vector.render_mode
         super().__init__(
             vector.num_envs, vector.single_observation_space, vector.single_action_space
         )
@@ -117,8 +121,8 @@ class SB3Vector(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return None for each environment: a batch is not rendered."""
-        return [None] * self.num_envs
+        """Return a picture of each environment; None without ``render_mode``."""
+        return self.vector.render() or [None] * self.num_envs
 
     def _require_all(self, name: str, indices: Indices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):

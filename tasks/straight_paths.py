@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -39,7 +41,7 @@ class StraightPaths:
             start: Configuration, shape (J,) [rad or m], with padding.
             ends: Configurations in the order of preference, shape (k, J).
         """
-        space = self._space(env)
+        space = self.space(env)
         dof = space.scene.robot.dof
         tested: list[Array] = []
         for i, end in enumerate(ends[:, :dof]):
@@ -52,7 +54,11 @@ class StraightPaths:
                 break
         return None
 
-    def _space(self, env: int) -> FreeSpace:
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which compiles the scenes again."""
+        return vars(self) | {"_spaces": {}}
+
+    def space(self, env: int) -> FreeSpace:
         """Return the scene of an environment, with its obstacles at their current poses."""
         robot = self._robots[env]
         if robot not in self._spaces:

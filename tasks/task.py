@@ -26,6 +26,7 @@ from morphgen.typing import Array
 if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
     import torch
 
+    from morphgen.tasks.free_space import FreeSpace
     from morphgen.tasks.random_numbers import EpisodeRandom
 
 
@@ -216,6 +217,28 @@ class TaskEnvs(ABC):
         """
         return block_pose.new_zeros(len(block_pose), 0, 3)
 
+    def place(
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+    ) -> tuple[Array, Array]:
+        """Begin an episode that ``begin`` has drawn as ``reset(options=...)`` asks for.
+
+        The caller requires afterwards that the start is free of collisions.
+
+        Args:
+            row: The environment.
+            options: Vectors of finite numbers: of ``Task.reset_options``, and perhaps ``q``.
+            space: The robot in the scene of the episode, for tests of collisions.
+            q: Joint positions at the start: those of the option ``q``, or drawn; shape (dof,).
+            block_pose: Pose of the block at the start, shape (7,); zeros without one.
+
+        Returns:
+            Joint positions and pose of the block at the start.
+
+        Raises:
+            TaskError: If an option cannot be met; the message says why.
+        """
+        return q, block_pose
+
     def target_rotations(self) -> torch.Tensor | None:
         """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
         return None
@@ -272,6 +295,12 @@ class Task(ABC, Generic[C, G]):
     """Whether the reported score is the difference from the random policy's score."""
     relative_distance: bool = True
     """Whether the final distance is also reported relative to the robot's reach."""
+    reset_options: Mapping[str, tuple[int, ...]] = {}
+    """Options of ``reset`` besides ``q``, which ``TaskEnvs.place`` obeys, with the lengths that
+    their vectors may have."""
+    goal_field: str = ""
+    """Observation field that begins with the desired goal of ``goal_env=True``; empty for a task
+    without that form."""
     target: str = "goal"
     """Noun for the thing that ``StepResult.distance`` is measured from."""
     goal_files_readme: str = ""
@@ -340,6 +369,28 @@ class Task(ABC, Generic[C, G]):
     def scene(self, robot: Robot, goals: G, ground: float) -> Scene:
         """Return the scene of an environment."""
         return Scene(robot, obstacles=goals.obstacles, ground=ground)
+
+    def achieved_goal(
+        self, config: C, tool_pose: NDArray[np.float32], block_pose: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the goal that a state achieves, shape (g,), for a task with a ``goal_field``.
+
+        Args:
+            config: Constants of the task.
+            tool_pose: Pose of the tool in the root frame, shape (7,).
+            block_pose: Pose of the block, shape (7,).
+        """
+        raise NotImplementedError
+
+    def goal_reward(self, config: C, achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+        """Return the reward terms that depend on the goal alone, summed, shape (k,).
+
+        Args:
+            config: Constants of the task.
+            achieved: Goals that states achieve, shape (k, g).
+            desired: Goals that they should achieve, shape (k, g).
+        """
+        raise NotImplementedError
 
     def episode_score(self, total: float, last: float, steps: int) -> float:
         """Return the score of an episode: the mean of its steps' scores.

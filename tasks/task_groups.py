@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.random_numbers import EpisodeRandom
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.step_result import StepResult, TaskState
@@ -27,6 +28,7 @@ from morphgen.tasks.task_checks import (
     require_start,
 )
 from morphgen.tasks.tool_targets import ToolTargets
+from morphgen.typing import Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,6 +150,22 @@ class TaskGroups:
         require_start(group.task.name, start, len(group.rows), self._num_joints)
         return start
 
+    @property
+    def reset_options(self) -> dict[str, tuple[int, ...]]:
+        """Options of ``reset`` that all tasks of the batch have; see ``Task.reset_options``."""
+        first, *others = [group.task.reset_options for group in self._groups.values()]
+        return {
+            name: sizes
+            for name, sizes in first.items()
+            if all(other.get(name) == sizes for other in others)
+        }
+
+    def place(
+        self, env: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+    ) -> tuple[Array, Array]:
+        """Begin an episode as options ask for; see ``TaskEnvs.place``."""
+        return self._group_of(env).envs.place(int(self._row[env]), options, space, q, block_pose)
+
     def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""
         results = []
@@ -230,8 +248,10 @@ class TaskGroups:
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of each marker of an environment's task, shape (7,) each."""
-        group = next(group for group in self._groups.values() if bool((group.rows == env).any()))
-        return group.envs.marker_poses(int(self._row[env]))
+        return self._group_of(env).envs.marker_poses(int(self._row[env]))
+
+    def _group_of(self, env: int) -> _Group:
+        return next(group for group in self._groups.values() if bool((group.rows == env).any()))
 
     def advance(self, progress: float) -> None:
         """Advance the curricula; the progress of the training is from 0 to 1."""

@@ -293,8 +293,8 @@ def test_vector_environments_of_one_keep_their_axis():
             "number of environments '2': expected a",
         ),
         (
-            lambda: morphgen.make_env("reach", "prims", num_envs=1, seed=None),
-            "seed None: expected a whole numb",
+            lambda: morphgen.make_env("reach", "prims", num_envs=1, seed="x"),
+            "seed 'x': expected a whole numb",
         ),
         (
             lambda: morphgen.make_env("reach", "prims", num_envs=1, configs=3),
@@ -324,7 +324,11 @@ def test_vector_environments_of_one_keep_their_axis():
         (lambda: morphgen.make_env("reach", workers=2), "unknown option 'workers'"),
         (lambda: morphgen.make_env("reach", ["prims"]), "name several with num_envs"),
         (lambda: morphgen.make_env("reach", [], num_envs=2), "expected at least one robot"),
-        (lambda: morphgen.make_env("reach", num_envs=2, size=(1, 1)), "unknown option 'size'"),
+        (lambda: morphgen.make_env("reach", num_envs=2, config=3), "unknown option 'config'"),
+        (
+            lambda: morphgen.make_env("reach", num_envs=2, autoreset_mode="Disabled"),
+            "autoreset_mode Disabled: expected SAME_STEP or NEXT_STEP",
+        ),
         (lambda: morphgen.make_env("reach", "prims", num_envs=0), "0 environments"),
     ],
 )

@@ -38,6 +38,8 @@ class SharedOptions(TypedDict, total=False):
     library: LibraryFolders
     max_links: int | None
     progress: Progress
+    render_mode: str | None
+    size: tuple[int, int]
 
 
 class EnvOptions(SharedOptions, total=False):
@@ -45,16 +47,16 @@ class EnvOptions(SharedOptions, total=False):
 
     obstacles: bool
     config: TaskConfig | None
-    render_mode: str | None
-    size: tuple[int, int]
+    goal_env: bool
 
 
 class VectorOptions(SharedOptions, total=False):
-    """Keyword arguments of vector environments; ``make_batch`` explains them."""
+    """Keyword arguments of vector environments; ``make_batch`` and ``TaskVector`` explain them."""
 
     obstacles: bool | Sequence[bool]
     configs: Sequence[TaskConfig]
-    seed: int
+    seed: int | None
+    autoreset_mode: str
     workers: int
     device: str
 
@@ -91,7 +93,7 @@ def make_env(
         >>> env.close()
         >>> envs = morphgen.make_env("reach", ["ur5-plane", "arm3-stick"], num_envs=4)
         >>> envs.reset(seed=0)[0]["tokens"].shape
-        (4, 23, 48)
+        (4, 10, 48)
         >>> envs.close()
 
     Args:

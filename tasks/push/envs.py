@@ -10,14 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goal_choices import GoalChoices
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.push.starts import PushStartSet, require_pushable
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
+from morphgen.tasks.reset_options import unit_quaternion
 from morphgen.tasks.rows import choose, padded_rows, positive_part, row_norms
 from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.tasks.task import EnvSpec, TaskEnvs
+from morphgen.typing import Array
 
 GAP = 0.05
 """Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""
@@ -58,6 +61,25 @@ class PushEnvs(TaskEnvs):
         number = random.integers(Stream.START, self._choices.count(layout))
         start = self._choices.goals(layout, number[:, None])[:, 0]
         return self._q[self._env_spec_index, start], self._blocks[self._env_spec_index, start]
+
+    def place(
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+    ) -> tuple[Array, Array]:
+        """Put the block where the option ``block`` says: a position, or a pose.
+
+        Unless ``q`` is given, too, a drawn start that the block would touch gives way to another.
+        """
+        if (wanted := options.get("block")) is None:
+            return q, block_pose
+        turn = block_pose[3:] if len(wanted) == 3 else unit_quaternion(wanted[3:], "block")
+        block = np.concatenate([wanted[:3], turn])
+        sets = self._env_spec_index[row]
+        require_pushable(space, block, float(self._final_line[row]))
+        if "q" in options or space.free(q[None], block[None])[0]:
+            return q, block
+        starts = self._q[sets, :, : len(q)].cpu().double().numpy()
+        free = space.free(starts, np.tile(block, (len(starts), 1)))
+        return starts[int(free.argmax())], block
 
     def evaluate(self, state: TaskState) -> StepResult:
         """Compare the block with the line; see ``evaluate_push``."""
@@ -152,6 +174,13 @@ def push_terms(
         "approach": -config.approach_weight * approach,
         "success": choose(success, config.success_weight),
     }
+
+
+def goal_terms(config: PushConfig, y: torch.Tensor, line: torch.Tensor) -> torch.Tensor:
+    """Return the sum of the terms that depend on y of block and line alone, shape (k,)."""
+    nothing = torch.zeros_like(y)
+    terms = push_terms(config, positive_part(line - y), nothing, nothing, y > line)
+    return torch.stack([*terms.values()]).sum(0)
 
 
 def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:

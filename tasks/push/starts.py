@@ -27,6 +27,8 @@ TRIES = 30
 RESTS = 1e-6
 """Largest height above the ground of a block that stands on it [m]."""
 
+_STANDS = 1e-3
+"""Tolerance of a block that stands upright on the ground [m, and of a quaternion]."""
 _CONFIGURATIONS = 1000
 """Free configurations to test for a start before giving up."""
 
@@ -179,6 +181,38 @@ def _feasible(
         f"({region.y[0]:.3g}, {region.y[1]:.3g}) are feasible (acceptance rate "
         f"{len(starts) / tried:.2g}), {needed} are needed; {reasons}"
     )
+
+
+def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
+    """Require a pose of the block from which the robot can push it, as ``sample_starts`` does.
+
+    Args:
+        space: The robot with its obstacles and block.
+        block: Pose of the block, shape (7,).
+        line: y that the block's centre must cross [m].
+
+    Raises:
+        TaskError: If it does not stand upright on the ground before the line, something is in its
+            way, or no configurations are found that push it.
+    """
+    assert space.scene.block is not None
+    edge, ground = space.scene.block.size[0], space.scene.ground or 0.0
+    x, y, z, _, qx, qy, _ = block.tolist()
+    what = f"option 'block' at ({x:g}, {y:g}, {z:g})"
+    if abs(z - ground - edge / 2) > _STANDS or abs(qx) > _STANDS or abs(qy) > _STANDS:
+        raise TaskError(
+            f"{what}: expected a block that stands upright on the ground, its centre at z = "
+            f"{ground + edge / 2:g}"
+        )
+    if y >= line:
+        raise TaskError(f"{what} is across the line, which is at y = {line:g}")
+    region = Region(edge, 1.0, (x, x), (y, y), line)
+    test = FeasibilityTest(space, region, np.random.default_rng(0))(block[None])
+    if not test.path_is_clear[0]:
+        raise TaskError(f"{what}: something stands in the block's way to the line")
+    for found, place in ((test.across, "to the line"), (test.behind, "behind the block")):
+        if not np.isfinite(found).all():
+            raise TaskError(f"{what}: no configuration was found that gets the tool {place}")
 
 
 def _feasible_starts(

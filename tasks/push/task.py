@@ -33,6 +33,8 @@ class Push(Task[PushConfig, PushStartSet]):
     cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
     moves_fingers = True
+    reset_options: Mapping[str, tuple[int, ...]] = {"block": (3, 7)}
+    goal_field = "line"
     relative_to_random = False
     relative_distance = False
     target = "line"
@@ -78,6 +80,20 @@ class Push(Task[PushConfig, PushStartSet]):
         from morphgen.tasks.push.envs import PushEnvs
 
         return PushEnvs(specs, env_spec_index, num_joints)
+
+    def achieved_goal(
+        self, config: PushConfig, tool_pose: NDArray[np.float32], block_pose: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the y of the block's centre."""
+        return block_pose[1:2]
+
+    def goal_reward(
+        self, config: PushConfig, achieved: torch.Tensor, desired: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the terms ``distance`` and ``success`` of blocks at y with lines at others."""
+        from morphgen.tasks.push.envs import goal_terms
+
+        return goal_terms(config, achieved[:, 0], desired[:, 0])
 
     def episode_score(self, total: float, last: float, steps: int) -> float:
         """Return 1 for success at the end, else 0."""

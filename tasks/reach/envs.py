@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import cast
 
@@ -10,13 +10,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.errors import TaskError
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import frame_pose
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goal_choices import GoalChoices
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.goals import reachable_configuration
+from morphgen.tasks.reset_options import unit_quaternion
 from morphgen.tasks.rows import choose, padded_rows, row_norms
 from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.tasks.task import EnvSpec, TaskEnvs
+from morphgen.typing import Array
 
 
 class ReachEnvs(TaskEnvs):
@@ -68,6 +75,38 @@ class ReachEnvs(TaskEnvs):
     def evaluate(self, state: TaskState) -> StepResult:
         """Compare the tool with its goal; see ``evaluate_reach``."""
         return evaluate_reach(self._config, self.goal, state, self._angle(state))
+
+    def place(
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+    ) -> tuple[Array, Array]:
+        """Set the goal of the option ``goal``: a position, or a pose, that the tool can reach."""
+        if (wanted := options.get("goal")) is None:
+            return q, block_pose
+        if len(wanted) == 3 and self.needs_tool_rotation:
+            raise TaskError("option 'goal' has shape (3,); a goal that is a pose needs (7,)")
+        if len(wanted) == 7:
+            wanted = np.concatenate([wanted[:3], unit_quaternion(wanted[3:], "goal")])
+        robot = space.scene.robot
+        found = reachable_configuration(
+            space,
+            wanted,
+            self._q[self._env_spec_index[row], :, : robot.dof].cpu().double().numpy(),
+            with_rotation=self.needs_tool_rotation,
+        )
+        if found is None:
+            x, y, z = wanted[:3]
+            what = "pose" if self.needs_tool_rotation else "position"
+            raise TaskError(
+                f"option 'goal' at ({x:g}, {y:g}, {z:g}): no configuration that is free of "
+                f"collisions with the tool at this {what} was found"
+            )
+        if len(wanted) == 3:  # any orientation does: that of the configuration
+            pose = Pose.from_matrix(frame_pose(robot, found[None])[0])
+            wanted = np.concatenate([wanted, pose.quaternion])
+        self.goal[row] = torch.from_numpy(wanted)
+        self.goal_configuration[row, : robot.dof] = torch.from_numpy(found)
+        self._goal_rotation[row] = matrix_from_quaternion(self.goal[row, 3:])
+        return q, block_pose
 
     def _angle(self, state: TaskState) -> torch.Tensor | None:
         """Return the angles between tools and goals, shape (k,); None for goals of positions."""
@@ -162,6 +201,17 @@ def reach_terms(
     if angle is not None:
         terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle
     return terms
+
+
+def goal_terms(config: ReachConfig, achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+    """Return the sum of the terms that depend on the goal alone; see ``Task.goal_reward``."""
+    angle = None
+    if config.goal == "pose":
+        rotations = (matrix_from_quaternion(poses[:, 3:]) for poses in (achieved, desired))
+        angle = angle_between(*rotations)
+    distance = row_norms(achieved[:, :3] - desired[:, :3])
+    nothing = torch.zeros_like(distance)
+    return torch.stack([*reach_terms(config, distance, nothing, nothing, angle).values()]).sum(0)
 
 
 def anybody_score(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
+from morphgen.model.inverse_kinematics import solve_pose_ik, solve_position_ik
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.cspace_components import cspace_components, in_other_component
@@ -24,6 +25,10 @@ from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 
+_STARTS, _ITERATIONS = 32, 60
+"""Number of configurations from which inverse kinematics starts, and of its iterations."""
+_ARRIVED = 1e-3
+"""Largest distance of a tool from a goal that it reaches [m, and of rotation matrices]."""
 EXACT = 1e-6
 """Tolerance between a goal and the tool pose of its configuration [m, and of quaternions]."""
 
@@ -121,6 +126,34 @@ def sample_goals(
         accepted=len(q),
         **identity,
     )
+
+
+def reachable_configuration(
+    space: FreeSpace, goal: Array, starts: Array, *, with_rotation: bool
+) -> Array | None:
+    """Return a free configuration that brings the tool to a goal, or None if none was found.
+
+    Args:
+        space: The robot in its scene.
+        goal: Position, shape (3,), or pose, shape (7,).
+        starts: Configurations from which inverse kinematics starts, shape (n, dof).
+        with_rotation: Whether the tool needs the orientation of the goal.
+    """
+    robot = space.scene.robot
+    tools = frame_pose(robot, starts, TOOL)[:, :3, 3]
+    nearest = np.argsort(np.linalg.norm(tools - goal[:3], axis=1), kind="stable")[:_STARTS]
+    if with_rotation:
+        T_root_goal = Pose(tuple(goal[:3]), tuple(goal[3:])).matrix
+        q = np.array([solve_pose_ik(robot, T_root_goal, start) for start in starts[nearest]])
+        error = np.abs(frame_pose(robot, q, TOOL) - T_root_goal).max(axis=(1, 2))
+    else:
+        q, errors = solve_position_ik(
+            robot, starts[nearest], np.tile(goal[:3], (len(nearest), 1)), iterations=_ITERATIONS
+        )
+        error = np.linalg.norm(errors, axis=1)
+    arrived = np.flatnonzero(error < _ARRIVED)
+    free = arrived[space.free(q[arrived])]
+    return q[free[0]] if len(free) else None
 
 
 def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -160,6 +161,10 @@ class KinematicSimulation:
     def close(self) -> None:
         """End the simulation; a second call does nothing."""
         self._closed = True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy: nothing of it is elsewhere."""
+        return vars(self)
 
     def _require_open(self) -> None:
         if self._closed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,6 +30,10 @@ from morphgen.typing import Array
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 """Environment with its model and data; views of its actuator controls in the data and in the batch,
 and of its applied forces in the data and in ``PositionControl``."""
+
+
+_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_view", "_pool"}
+"""Attributes that ``_view_data`` makes."""
 
 
 class MujocoSimulation:
@@ -68,20 +73,15 @@ class MujocoSimulation:
         self.device = torch.device("cpu")
         self._worlds = worlds(self.scenes, contacts or Contacts())
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
-        self._state = state = MujocoState(self._worlds, self._data)
-        self.q, self.qd = state.q, state.qd
-        self.block_pose = state.block_pose
-        shape = self.q.shape
-        self._control = PositionControl(self._worlds, self._data, shape[1])
+        shape = len(scenes), max(world.robot.dof for world in self._worlds)
         self._controls, self._targets = np.zeros(shape), np.zeros(shape)
         self._has_target = np.zeros(shape, dtype=bool)
-        self._work: list[Work] = []
-        for i, (world, data) in enumerate(zip(self._worlds, self._data, strict=True)):
+        self._faults: dict[int, str] = {}
+        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
+        self._helpers = threads - 1
+        self._view_data()
+        for i, world in enumerate(self._worlds):
             self._has_target[i, : world.robot.dof] = True
-            controls, applied = self._controls[i, : world.robot.dof], self._control.applied_to(i)
-            self._work.append(
-                (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
-            )
             block = self.scenes[i].block
             pose = (*block.pose.position, *block.pose.quaternion) if block is not None else ()
             # In float32, as a reset to the values of the tensors would do.
@@ -91,11 +91,32 @@ class MujocoSimulation:
             poses = [(*o.pose.position, *o.pose.quaternion) for o in self.scenes[i].obstacles]
             self._put_obstacles(i, poses)
         self._state.read()
+
+    def _view_data(self) -> None:
+        """Make everything that has views of the data, and the threads."""
+        self._state = MujocoState(self._worlds, self._data)
+        self.q, self.qd = self._state.q, self._state.qd
+        self.block_pose = self._state.block_pose
+        self._control = PositionControl(self._worlds, self._data, self._targets.shape[1])
+        self._work: list[Work] = []
+        for i, (world, data) in enumerate(zip(self._worlds, self._data, strict=True)):
+            controls, applied = self._controls[i, : world.robot.dof], self._control.applied_to(i)
+            self._work.append(
+                (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
+            )
         self._view = TensorView()
-        self._faults: dict[int, str] = {}
-        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
-        self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which goes on as this simulation does."""
+        self._require_open()
+        return {name: value for name, value in vars(self).items() if name not in _VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy: views of the data must be of its own data."""
+        vars(self).update(state)
+        self._view_data()
+        self._state.read()
 
     @property
     def block_velocity(self) -> torch.Tensor:

@@ -243,7 +243,8 @@ def test_last_observation_of_an_episode_is_returned(make):
         seen, _, terminated, truncated, info = env.step(np.ones(5, dtype=np.float32))
         assert (terminated, truncated) == (False, k == STEPS - 1)
     assert np.abs(seen["velocity"]).max() > 0
-    assert set(info) == {"success", "distance", "score", "diverged", "terms", "self_collision"}
+    names = {"success", "is_success", "distance", "score", "diverged", "terms", "self_collision"}
+    assert set(info) == names
     assert info["terms"]["distance"] == pytest.approx(-info["distance"])
     with pytest.raises(TaskError, match="no episode is running; call reset"):
         env.step(np.ones(5, dtype=np.float32))
