@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from inspect import currentframe
 from os import PathLike
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +21,6 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.env_specs import task_configs
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.numpy_step import EnvStep, numpy_stepper, pad_action
 from morphgen.tasks.observation import Observation, ObservationConfig
@@ -36,14 +35,14 @@ from morphgen.tasks.vector import (
     NumpyObservation,
     action_space,
     final_state,
+    from_mapping,
     numpy_observation,
     observation_space,
     render_arguments,
     require_limit,
+    task_config,
     text_spec,
 )
-
-T = TypeVar("T")
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
@@ -143,9 +142,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         sim = sim or DEFAULT_SIMULATOR
         task_kind = TASKS[task]
-        observe = _from_mapping("observe", ObservationConfig, observe)
-        contacts = _from_mapping("contacts", Contacts, contacts)
-        config = _from_mapping("config", partial(_task_config, task), config)
+        observe = from_mapping("observe", ObservationConfig, observe)
+        contacts = from_mapping("contacts", Contacts, contacts)
+        config = from_mapping("config", partial(task_config, task), config)
         self._self_collision = (contacts or Contacts()).self_collision
         self._self_collision &= SIMULATORS[sim].simulates_contacts
         config_type = task_kind.config_type
@@ -393,26 +392,6 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             for name, values in numpy_observation(observation).items()
             if values.dtype == np.float32 and name not in self._hidden
         }
-
-
-def _from_mapping(
-    name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
-) -> T | None:
-    """Return an argument that may be a dictionary, as in JSON, as the object that it describes.
-
-    Raises:
-        TaskError: If the dictionary has an unknown key.
-    """
-    if not isinstance(value, Mapping):
-        return value
-    try:
-        return make(**value)
-    except TypeError as error:
-        raise TaskError(f"{name} {dict(value)}: {error}") from error
-
-
-def _task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of the task's types
-    return task_configs({task: constants})[0]
 
 
 def _limit_for_make() -> int | None:

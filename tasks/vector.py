@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
+from functools import partial
 from inspect import signature
 from os import PathLike
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -24,15 +25,17 @@ from morphgen.model.robot import Robot
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.channels import KINEMATIC_CHANNELS
+from morphgen.tasks.env_specs import task_configs
 from morphgen.tasks.make import BatchOptions, make_batch
-from morphgen.tasks.observation import Observation
+from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.registry import register_gym_envs
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
-from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import BOUND, ObservationField, TaskConfig
 
 register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
 
+T = TypeVar("T")
 RENDER_MODES = ("rgb_array",)
 LINK_ENTRIES = ("tokens", "velocity", *KINEMATIC_CHANNELS)
 """Entries of observations with a row for each link."""
@@ -114,6 +117,27 @@ def require_limit(given: int | None, limit: int) -> None:
             f"max_episode_steps {given}: episodes end after {limit} control steps; for longer ones "
             f"pass a config of the task with max_episode_steps={given}"
         )
+
+
+def from_mapping(
+    name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
+) -> T | None:
+    """Return an argument that may be a dictionary, as in JSON, as the object that it describes.
+
+    Raises:
+        TaskError: If the dictionary has an unknown key.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    try:
+        return make(**value)
+    except TypeError as error:
+        raise TaskError(f"{name} {dict(value)}: {error}") from error
+
+
+def task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of the task's types
+    """Return the config of a task from its constants as JSON data."""
+    return task_configs({task: constants})[0]
 
 
 class TextSpec(EnvSpec):
@@ -383,7 +407,7 @@ def task_vector(
     task: str,
     robot: RobotLike = "ur5-plane",
     robots: Sequence[RobotLike] = (),
-    config: TaskConfig | None = None,
+    config: TaskConfig | Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     render_mode: str | None = None,
@@ -397,7 +421,8 @@ def task_vector(
         task: Name of the task.
         robot: The robot of all environments, if ``robots`` is empty.
         robots: Robots; environment i has robot i modulo their number.
-        config: Constants of the task, instead of ``configs``.
+        config: Constants of the task, instead of ``configs``. Like ``observe`` and ``contacts`` it
+            may be a dictionary, as in the JSON of ``spec.to_json()``.
         max_episode_steps: Time limit of episodes [control steps], at most the task's.
         autoreset_mode: As of ``TaskVector``, like the next two.
         render_mode: Whether ``render`` returns pictures.
@@ -410,8 +435,11 @@ def task_vector(
     for name in options:
         if name not in (valid := _batch_options()):
             raise TaskError(f"vector environments: unknown option {name!r}{nearest(name, valid)}")
+    for name, kind in (("observe", ObservationConfig), ("contacts", Contacts)):
+        if name in options:
+            options[name] = from_mapping(name, kind, options[name])
     if config is not None:
-        options["configs"] = (config,)
+        options["configs"] = (from_mapping("config", partial(task_config, task), config),)
     if options.get("seed") is None:
         options["seed"] = int(np.random.default_rng().integers(2**63))
     autoreset_mode = _autoreset_mode(autoreset_mode)

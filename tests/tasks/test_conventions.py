@@ -374,6 +374,12 @@ def test_the_spec_of_a_robot_without_a_name_is_json(tmp_path):
         assert gym.make(env.spec).unwrapped.env_spec.robot.name == robot.name
     with pytest.raises(MorphgenError, match="<Robot"):
         gym.make(EnvSpec.from_json(text))
+    options = {"config": {"max_episode_steps": 5}, "observe": {"velocity": True}}
+    with closing(make_vec(**options)) as envs:
+        spec = EnvSpec.from_json(envs.spec.to_json())
+        with closing(gym.make_vec(spec)) as again:
+            assert again.observation_space == envs.observation_space
+            assert again.max_episode_steps == envs.max_episode_steps == 5
     with closing(make_vec(robots=[robot], num_envs=2)) as envs:
         assert "<Robot" in envs.spec.to_json()
 
