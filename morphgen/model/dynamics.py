@@ -31,6 +31,16 @@ turn the wrist that pushes it. MuJoCo Menagerie (SO-ARM100, UR10e) has 0.1 in ev
 """
 MIN_SLIDING_MASS = 1e-5
 """Smallest inertia of a prismatic joint [kg]."""
+COUPLED_INERTIA = 0.5
+"""Smallest inertia of a leader, relative to that of its followers and itself, and smallest armature
+of a follower, relative to the inertia that it carries.
+
+MuJoCo solves constraints as if damping were explicit, and then integrates it implicitly. A motor's
+damping over a step, 0.43 of the inertia in the environments, must not throw what it pushes against:
+the link between a rod and the motor on it, or a leader that its followers outweigh. With less
+inertia there the equality of a mimic joint and the motor work against each other, and the joint
+comes off by radians. Rods and gears of real linkages carry that reaction to the frame.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,21 @@ class Actuation:
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Return the joint-space inertia at one configuration, the sum of J^T I J over all links.
+    """Return the joint-space inertia of the independent joints at one configuration.
+
+    Args:
+        robot: The robot, its root fixed in the world.
+        q: Independent joint positions, shape (dof,) [rad or m].
+
+    Returns:
+        Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
+    """
+    matrix, _ = robot.mimic_map
+    return np.asarray(matrix.T @ movable_mass_matrix(robot, q) @ matrix)
+
+
+def movable_mass_matrix(robot: Robot, q: ArrayLike) -> Array:
+    """Return the joint-space inertia as if mimic joints were free, the sum of J^T I J over links.
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1.
 
@@ -61,7 +85,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
         q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
-        Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
+        Symmetric matrix, shape (n_movable, n_movable).
     """
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
     J_root_link = link_jacobians(robot, T_root_link)
@@ -75,8 +99,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
         linear = J_root_link[i, :3] + np.cross(angular, com, axis=0)
         M += link.inertial.mass * linear.T @ linear
         M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
-    matrix, _ = robot.mimic_map
-    return np.asarray(matrix.T @ M @ matrix)
+    return M
 
 
 def gravity_load(robot: Robot, q: ArrayLike) -> Array:
@@ -102,21 +125,27 @@ def gravity_load(robot: Robot, q: ArrayLike) -> Array:
     return forces
 
 
+def armature(robot: Robot) -> Array:
+    """Return the inertia that motors and linkages add to joints; see ``actuation``.
+
+    Returns:
+        Array of shape (n_movable,) [kg m^2 or kg].
+    """
+    return _inertias(robot)[1]
+
+
 def actuation(robot: Robot) -> tuple[Actuation, ...]:
     """Return the position-control gains of every independent joint, from the inertia at home.
 
     A joint with inertia I is critically damped at the frequency omega = ``BANDWIDTH`` by the
     stiffness omega^2 I and the damping 2 omega I. I is the joint's diagonal entry of the
     joint-space inertia, raised by an armature to ``MIN_RELATIVE_INERTIA`` and
-    ``MIN_ROTATIONAL_INERTIA`` or ``MIN_SLIDING_MASS``.
+    ``MIN_ROTATIONAL_INERTIA`` or ``MIN_SLIDING_MASS``. The joint and the mimic joints that follow
+    it share the armature; see ``COUPLED_INERTIA``.
     """
-    inertia = np.diag(mass_matrix(robot, robot.home))
+    inertias, armatures = _inertias(robot)
     joints = [robot.joints[k] for k in robot.independent_joints]
-    prismatic = np.array([joint.kind == "prismatic" for joint in joints], dtype=bool)
-    least = np.zeros(robot.dof)
-    for kind, floor in ((prismatic, MIN_SLIDING_MASS), (~prismatic, MIN_ROTATIONAL_INERTIA)):
-        least[kind] = max(MIN_RELATIVE_INERTIA * inertia[kind].max(initial=0.0), floor)
-    total = np.maximum(inertia, least)
+    rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
     return tuple(
         Actuation(
             joint.name,
@@ -127,6 +156,32 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
             velocity=joint.velocity,
         )
         for joint, value, added in zip(
-            joints, total.tolist(), (total - inertia).tolist(), strict=True
+            joints, inertias.tolist(), armatures[rows].tolist(), strict=True
         )
     )
+
+
+def _inertias(robot: Robot) -> tuple[Array, Array]:
+    """Return the inertias that gains assume, (dof,), and the armatures in them, (n_movable,)."""
+    matrix, _ = robot.mimic_map
+    carried = np.diag(movable_mass_matrix(robot, robot.home))
+    rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
+    follows = matrix**2
+    follows[rows] = 0
+    armatures = COUPLED_INERTIA * carried
+    armatures[rows] = 0
+    inertia = np.diag(mass_matrix(robot, robot.home)) + follows.T @ armatures
+    prismatic = np.array(
+        [robot.joints[k].kind == "prismatic" for k in robot.independent_joints], dtype=bool
+    )
+    least = np.zeros(robot.dof)
+    for kind, floor in ((prismatic, MIN_SLIDING_MASS), (~prismatic, MIN_ROTATIONAL_INERTIA)):
+        least[kind] = max(MIN_RELATIVE_INERTIA * inertia[kind].max(initial=0.0), floor)
+    of_followers = inertia - carried[rows]
+    total = np.maximum(np.maximum(inertia, least), of_followers / (1 - COUPLED_INERTIA))
+    added = total - inertia
+    ratio = follows.sum(axis=0)
+    motor = np.where(ratio > 0, np.clip(COUPLED_INERTIA * total - carried[rows], 0, added), added)
+    armatures[rows] = motor
+    share = np.divide(added - motor, ratio, out=np.zeros(robot.dof), where=ratio > 0)
+    return total, armatures + (follows > 0) @ share

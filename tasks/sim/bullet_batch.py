@@ -15,7 +15,7 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
-from morphgen.tasks.sim.motor_law import MotorForces
+from morphgen.tasks.sim.motor_law import MotorForces, limited_speeds
 from morphgen.tasks.sim.short_arrays import clamp, consecutive, is_within
 
 MAX_VELOCITY = 1e4
@@ -111,6 +111,7 @@ class BulletBatch:
         gain: list[float] = []
         offset: list[float] = []
         fastest: list[float] = []
+        leaders: list[int] = []
         independent: list[int] = []
         sink: list[int] = []
         self._spans: list[slice] = []
@@ -122,8 +123,10 @@ class BulletBatch:
                 leader = np.abs(matrix).argmax(axis=1)
                 source.extend((env * width + leader).tolist())
                 gain.extend(matrix[np.arange(len(matrix)), leader].tolist())
+                rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
+                leaders.extend(start + row for row in np.array(rows)[leader].tolist())
             offset.extend(shift.tolist())
-            fastest.extend(robot.joints[k].velocity or np.inf for k in robot.movable_joints)
+            fastest.extend(limited_speeds(robot))
             independent.extend(
                 start + robot.movable_joints.index(k) for k in robot.independent_joints
             )
@@ -131,6 +134,7 @@ class BulletBatch:
         self._source = consecutive(np.array(source, np.intp))
         self._sink = consecutive(np.array(sink, np.intp))
         self._gain, self._offset = np.array(gain), np.array(offset)
+        self._leaders = np.array(leaders, np.intp)
         self._fastest = np.array(fastest)
         self._independent = consecutive(np.array(independent, np.intp))
         self._positions, self._velocities = np.zeros(len(offset)), np.zeros(len(offset))
@@ -226,7 +230,8 @@ class BulletBatch:
 
         Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps.
         Effort limits and contacts are not modelled: they show in the velocity that is measured
-        afterwards, and carry over to the next step.
+        afterwards, and carry over to the next step. Mimic joints follow where their leaders are,
+        not the leaders' targets: a leader at its effort limit is late.
         """
         q, v = self._positions, self._velocities
         fastest, slowest = self._fastest, -self._fastest
@@ -234,7 +239,7 @@ class BulletBatch:
             v = v + TIMESTEP * BANDWIDTH * (BANDWIDTH * (desired - q) - 2 * v)
             v = np.minimum(np.maximum(v, slowest), fastest)
             q = q + TIMESTEP * v
-        return q, v
+        return q[self._leaders] * self._gain + self._offset, v[self._leaders] * self._gain
 
     def _find_diverged(self) -> None:
         """Record the environments that diverged, with their state as the reason."""

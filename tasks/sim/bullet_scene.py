@@ -13,6 +13,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.motor_law import limited_speeds
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 try:
@@ -57,8 +58,8 @@ class BulletScene:
     ``BulletBatch`` computes the velocity, ``MotorForces`` the force. The robot carries its own
     weight: the world has no gravity, and the block's weight is an external force. One call makes
     all substeps; the motors act in each, but PyBullet computes their impulse limits with the time
-    of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor with its
-    leader's target.
+    of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor that
+    follows its leader.
 
     Solver. It needs many iterations because motors of one arm pull against each other. Dantzig's
     direct method does not, and is faster, but has no friction cone; so it is used without a block.
@@ -142,9 +143,7 @@ class BulletScene:
         links = {merged.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[merged.joints[k].name] for k in merged.movable_joints]
         self.efforts = [_effort(merged, k) for k in merged.movable_joints]
-        fastest = max(
-            (merged.joints[k].velocity or math.inf for k in merged.movable_joints), default=math.inf
-        )
+        fastest = max(limited_speeds(merged), default=math.inf)
         if math.isfinite(fastest):
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
@@ -311,8 +310,6 @@ def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, f
 
 
 def _effort(robot: Robot, k: int) -> float:
-    """Return the effort limit of a movable joint; a mimic joint without one has its leader's."""
+    """Return the effort limit of a movable joint; a linkage that moves a mimic joint has none."""
     joint = robot.joints[k]
-    while not joint.effort and joint.mimic is not None:
-        joint = robot.joints[robot.joint_index[joint.mimic.joint]]
-    return joint.effort or UNLIMITED
+    return (joint.effort if joint.mimic is None else None) or UNLIMITED

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
+from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix, movable_mass_matrix
 from morphgen.model.robot import Joint, Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.tasks.sim.short_arrays import clamp
@@ -48,6 +48,19 @@ follow the exact solution of the differential equation are several times as far 
 def speed_limit(joint: Joint) -> float:
     """Return the largest speed of a joint [rad/s or m/s]."""
     return joint.velocity or (FASTEST_SLIDE if joint.kind == "prismatic" else FASTEST_TURN)
+
+
+def limited_speeds(robot: Robot) -> list[float]:
+    """Return the speed limits of the movable joints, infinite without one [rad/s or m/s].
+
+    A mimic joint has that of its leader: its own would part them.
+    """
+    matrix, _ = robot.mimic_map
+    leaders = [robot.joints[k].velocity or np.inf for k in robot.independent_joints]
+    return [
+        max((abs(gain) * v for gain, v in zip(row, leaders, strict=True) if gain), default=0.0)
+        for row in matrix.tolist()
+    ]
 
 
 def farthest_targets(robot: Robot, joints: Sequence[int]) -> list[float]:
@@ -109,8 +122,16 @@ class MotorForces:
 
 
 def _inertia(robot: Robot) -> Array:
-    """Return forces on movable joints per acceleration of independent joints, (dof, movable)."""
-    armatures = np.diag([motor.armature for motor in actuation(robot)])
+    """Return forces on movable joints per acceleration of independent joints, (dof, movable).
+
+    Joints of a mimic group also carry what others do to a part of the group alone, such as the
+    reaction of a motor on the rod of a parallelogram: up to sqrt(M_jj M_kk), which bounds M_jk.
+    """
     matrix, _ = robot.mimic_map
+    gains = np.abs(matrix)
+    armatures = np.diag([motor.armature for motor in actuation(robot)])
     inertia = np.abs(mass_matrix(robot, robot.home)) + armatures
-    return np.asarray(inertia @ np.abs(matrix).T)
+    carried = np.abs(np.diag(movable_mass_matrix(robot, robot.home)))
+    is_grouped = (gains > 0) @ ((gains > 0).sum(axis=0) > 1)
+    bound = np.sqrt(np.outer(np.diag(inertia), carried))
+    return np.asarray(np.maximum(inertia @ gains.T, np.where(is_grouped, bound, 0.0)))

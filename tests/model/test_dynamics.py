@@ -13,6 +13,7 @@ from morphgen.model.dynamics import (
     MIN_ROTATIONAL_INERTIA,
     MIN_SLIDING_MASS,
     actuation,
+    armature,
     gravity_load,
     mass_matrix,
 )
@@ -93,11 +94,10 @@ def test_gravity_load_equals_that_of_mujoco(seed):
 
 def test_gains_are_critically_damped():
     robot = arm()
-    inertia = np.diag(mass_matrix(robot, robot.home))
+    inertia, (matrix, _) = np.diag(mass_matrix(robot, robot.home)), robot.mimic_map
     gains = actuation(robot)
     assert [gain.joint for gain in gains] == ["shoulder", "elbow", "extend", "left"]
-    for gain, value in zip(gains, inertia, strict=True):
-        total = value + gain.armature
+    for gain, total in zip(gains, inertia + armature(robot) @ matrix**2, strict=True):
         assert gain.stiffness == pytest.approx(BANDWIDTH**2 * total)
         ratio = gain.damping / (2 * np.sqrt(gain.stiffness * total))
         assert ratio == pytest.approx(1.0)
