@@ -304,9 +304,7 @@ def evaluate(
     return scores
 
 
-def _specs(
-    source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None
-) -> list[EnvSpec]:
+def _specs(source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None) -> list[EnvSpec]:
     specs = specs_of(source, GoalConfig(tasks=config.tasks))
     return [spec for spec in specs if tasks is None or spec.task in tasks]
 

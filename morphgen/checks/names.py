@@ -11,21 +11,26 @@ from morphgen.model.tree import take_name
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.\-]")
 _WORLD = "world"
+MAX_ROBOT_NAME = 200
+"""Longest name of a robot [characters]."""
 
 
 def check_names(robot: Robot) -> Iterator[Finding]:
     """Find empty names and names with characters that loaders misinterpret."""
     for element, names in all_names(robot).items():
         for name in names:
-            if is_name_safe(name):
+            if name == safe_robot_name(name) if element == "robot" else is_name_safe(name):
                 continue
             characters = " ".join(repr(c) for c in dict.fromkeys(_UNSAFE.findall(name)))
             yield Finding(
                 "name-characters",
                 "warning",
                 f"{element} {name}",
-                f"its name contains {characters or 'nothing'}, invalid in paths, scopes and USD",
-                "use letters, digits, '_', '-' and '.'; the repair writes '_'",
+                f"its name contains {characters or 'nothing'}, invalid in paths, scopes and USD"
+                if characters or not name
+                else "a bundle's folder cannot have its name",
+                "use letters, digits, '_', '-' and '.', in a robot's name not first and at most "
+                f"{MAX_ROBOT_NAME}; the repair writes '_'",
                 repair="its name was rewritten with '_' for what loaders dislike",
             )
 
@@ -96,6 +101,11 @@ def all_names(robot: Robot) -> dict[str, tuple[str, ...]]:
         "joint": tuple(joint.name for joint in robot.joints),
         "frame": tuple(frame.name for frame in robot.frames),
     }
+
+
+def safe_robot_name(name: str) -> str:
+    """Return a safe name that a bundle can have: a letter or digit is first."""
+    return _UNSAFE.sub("_", name).lstrip("_.-")[:MAX_ROBOT_NAME] or "robot"
 
 
 def safe_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, str]:

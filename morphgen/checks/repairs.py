@@ -22,7 +22,7 @@ from morphgen.checks.joints import (
     is_positive,
     position_range,
 )
-from morphgen.checks.names import all_names, safe_names
+from morphgen.checks.names import all_names, safe_names, safe_robot_name
 from morphgen.checks.shapes import unit_density_inertial
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import (
@@ -102,6 +102,6 @@ def _repair_names(robot: Robot) -> Robot:
     safe = rename(robot, safe_names(names["link"], reserved), safe_names(names["joint"]))
     return replace(
         safe,
-        name=safe_names(names["robot"])[robot.name],
+        name=safe_robot_name(robot.name),
         frames=tuple(replace(frame, name=frame_names[frame.name]) for frame in safe.frames),
     )

@@ -160,6 +160,7 @@ def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict
         for file, description in found.items()
         if not isinstance(description, MorphgenError)
     }
+    names = {file: name.lstrip("_") or name for file, name in names.items()}
     for file, name in names.items():
         try:
             bundle_folder(Path(), name)

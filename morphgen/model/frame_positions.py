@@ -14,7 +14,7 @@ import numpy as np
 
 from morphgen.model import rotation
 from morphgen.model.geometry import Pose
-from morphgen.model.robot import TOOL, Robot
+from morphgen.model.robot import TOOL, Joint, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
@@ -42,7 +42,9 @@ def _aligned_joints(robot: Robot, frame: str) -> tuple[list[_AlignedJoint], Pose
     T_joint_next = target.T_link_frame
     for k in reversed(robot.joint_chain(target.link)):
         joint = robot.joints[k]
-        if joint.is_movable:
+        if joint.is_movable and not gains[row[k]].any():  # it follows a fixed joint, and stays
+            T_joint_next = _displacement(joint, float(offsets[row[k]])) @ T_joint_next
+        elif joint.is_movable:
             leader = int(np.abs(gains[row[k]]).argmax())
             gain, offset = float(gains[row[k], leader]), float(offsets[row[k]])
             T_joint_axis = Pose(quaternion=rotation.from_z(joint.unit_axis))
@@ -52,6 +54,14 @@ def _aligned_joints(robot: Robot, frame: str) -> tuple[list[_AlignedJoint], Pose
             T_joint_next = T_joint_axis
         T_joint_next = joint.T_parent_joint @ T_joint_next
     return joints, T_joint_next
+
+
+def _displacement(joint: Joint, position: float) -> Pose:
+    x, y, z = joint.unit_axis
+    if joint.kind == "prismatic":
+        return Pose((position * x, position * y, position * z))
+    s = math.sin(position / 2)
+    return Pose(quaternion=rotation.normalize((math.cos(position / 2), s * x, s * y, s * z)))
 
 
 def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:

@@ -22,7 +22,8 @@ INERTIAL = (
 )
 BALL = '<geometry><sphere radius="0.05"/></geometry>'
 S = 0.7071067811865476
-STL = b"solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
+TRIANGLE = b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+STL = b"solid\nfacet\nouter loop\n" + TRIANGLE + b"endloop\nendfacet\nendsolid\n"
 
 
 def urdf(base: str = "", tip: str = "", more: str = "", origin: str = "", com: str = "") -> str:
@@ -369,3 +370,26 @@ def test_the_findings_of_a_bundle_do_not_name_what_morphgen_wrote(tmp_path):
     path.write_text(urdf(tip=f"<visual>{BALL}</visual>"))
     assert main(["import", str(path), "--out", str(tmp_path), "--no-picture"]) in (0, 1)
     assert read_urdf(tmp_path / "r" / "robot.urdf").source_findings == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("&lt;x&gt;", "x_"),
+        ("_arm", "arm"),
+        ("../../up", "up"),
+        ("a" * 300, "a" * 200),
+        ("\u673a\u5668", "robot"),
+        ("my arm", "my_arm"),
+    ],
+)
+def test_the_name_of_an_imported_robot_is_one_that_a_bundle_can_have(tmp_path, name, written):
+    file = tmp_path / "<x>.urdf"
+    file.write_text(urdf().replace('name="r"', f'name="{name}"'))
+    (tmp_path / "_y.urdf").write_text(urdf())
+    out = tmp_path / "out"
+    assert main(["import", str(file), "--out", str(out), "--no-picture"]) in (0, 1)
+    assert read(out / written).name == written
+    words = [str(file), str(tmp_path / "_y.urdf"), "--out", str(out), "--no-picture"]
+    assert main(["import", *words]) in (0, 1)
+    assert {"x_", "y"} <= {folder.name for folder in out.iterdir()}

@@ -12,6 +12,8 @@ from helpers.kinematic_backends import BACKENDS, TorchBackend, backend
 from helpers.robots import arm
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.formats.urdf_text import urdf_text
+from morphgen.model import kinematics_torch
+from morphgen.model.frame_positions import FramePosition, frame_positions
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.kinematics_torch import (
@@ -20,7 +22,7 @@ from morphgen.model.kinematics_torch import (
     forward_kinematics,
     frame_jacobian,
 )
-from morphgen.model.robot import Frame, Link, Mimic, Robot
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 
 WORDS = (
     "arm=ur5 ee=plane",
@@ -210,3 +212,24 @@ def test_a_robot_with_one_link():
     T = forward_kinematics(compile_tree([robot]), torch.tensor([0, 0]), torch.zeros(2, 0))
     assert (torch.eye(4) == T).all()
     assert T.shape == (2, 1, 4, 4)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous"])
+def test_a_tool_whose_only_movable_joint_mimics_a_fixed_one(kind):
+    follower = Joint("g", kind, "b", "c", axis=(0, 0.6, 0.8), mimic=Mimic("f", -2.0, 0.3))
+    if kind != "continuous":
+        follower = replace(follower, limits=(-1.0, 1.0))
+    robot = Robot(
+        "still",
+        (Link("a"), Link("b"), Link("c")),
+        (Joint("f", "fixed", "a", "b", Pose((0.1, 0, 0))), follower),
+        (Frame("tool", "c", Pose((0.1, 0.2, 0.3))),),
+    )
+    expected = frame_pose(robot, np.zeros((4, 0)))[:, :3, 3]
+    assert abs(expected - (0.2, 0.2, 0.3)).max() > 0.01
+    np.testing.assert_allclose(frame_positions(robot, np.zeros((0, 4))).T, expected, atol=1e-12)
+    np.testing.assert_allclose(FramePosition(robot)([]), expected[0], atol=1e-12)
+    chain = compile_chain([robot], dtype=torch.float64)
+    index, q = torch.zeros(4, dtype=torch.long), torch.zeros((4, 0), dtype=torch.float64)
+    positions = kinematics_torch.frame_positions(chain, index, q)
+    np.testing.assert_allclose(positions, expected, atol=1e-12)
