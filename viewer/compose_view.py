@@ -9,7 +9,7 @@ import numpy as np
 
 from morphgen.formats.bundle import split_colours
 from morphgen.model.inertia import box_corners
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.population_pick import camera_view, project_points
@@ -54,7 +54,7 @@ class ComposeView:
 
 def robot_facts(robot: Robot) -> Facts:
     """Return the facts of a robot."""
-    return Facts(robot.dof, robot.mass, reach(robot) if has_tool(robot) and robot.dof else None)
+    return Facts(robot.dof, robot.mass, arm_reach(robot) if has_tool(robot) and robot.dof else None)
 
 
 def show(view: ComposeView, robot: Robot) -> str:

@@ -17,7 +17,7 @@ from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
 from morphgen.model.findings import Finding
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import comparison, markup, robot_tables, scene_robot, scene_stage
@@ -95,7 +95,7 @@ def show(session: Session) -> None:
 
 def summary(robot: Robot, links: str) -> str:
     """Return a robot's name and facts, followed by links as HTML."""
-    distance = reach(robot) if has_tool(robot) and robot.dof else None
+    distance = arm_reach(robot) if has_tool(robot) and robot.dof else None
     facts = robot_tables.summary(robot, distance)
     return markup.framed(f"<h3>{escape(robot.name)}</h3>", markup.dim(facts + links))
 

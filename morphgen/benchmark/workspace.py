@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.frame_positions import frame_positions
-from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,
     joint_axes,
     joint_limits,
     reach,
+    with_root_at,
 )
 from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation import Vec3
@@ -78,17 +78,7 @@ def _tool_points(robot: Robot, samples: int) -> tuple[Array, Vec3, float]:
     """Return tool positions from the shoulder, (3, n), the shoulder and the largest distance."""
     chain = _tool_chain(robot)
     centre = shoulder(robot)
-    T_shoulder_root = Pose(centre).inverse()
-    root = robot.root.name
-    centred = replace(
-        robot,
-        joints=tuple(
-            replace(joint, T_parent_joint=T_shoulder_root @ joint.T_parent_joint)
-            if joint.parent == root
-            else joint
-            for joint in robot.joints
-        ),
-    )
+    centred = with_root_at(robot, centre)
     points = frame_positions(centred, _configurations(centred, chain, samples))
     farthest = max(reach(centred, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
     if farthest < _IMMOBILE:

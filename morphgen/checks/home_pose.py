@@ -60,12 +60,13 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
             continue
         T_ancestor_link = np.linalg.inv(T_root_link[ancestor]) @ T_root_link[i]
         gap = _gap(visuals[ancestor], visuals[i], T_ancestor_link)
-        if gap > MAX_GAP:
+        millimetres = f"{1000 * gap:.3g}"
+        if float(millimetres) > 1000 * MAX_GAP:  # as it is printed: 5 mm are not more than 5 mm
             yield Finding(
                 "links-apart",
                 "warning",
                 f"links {robot.links[ancestor].name}, {link.name}",
-                f"at home their visual shapes are {1000 * gap:.3g} mm apart",
+                f"at home their visual shapes are {millimetres} mm apart",
                 "correct the origin of the joint between them or of a mesh, or a mesh's scale",
             )
 

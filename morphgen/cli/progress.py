@@ -6,6 +6,7 @@ import argparse
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NoReturn, TypeVar
@@ -190,14 +191,19 @@ class TrainingProgress:
             self._shown.enter_context(status(argparse.Namespace(), "preparing"))
 
     def __call__(self, subrun: Subrun) -> ShowMetrics:
-        """Begin with a subrun; return the function that shows its metrics."""
+        """Begin with a subrun; return the function that shows its metrics.
+
+        A line at its end says how many of its episodes diverged, if any did.
+        """
         from tqdm import tqdm
 
         raise_if_interrupted()
         self.close()
         name = subrun.config.source.member or subrun.config.source.name
+        diverged = Counter[str]()
+        self._shown.callback(_print_divergence, name, diverged)
         if not sys.stderr.isatty():
-            return lambda report, num_updates: _print_update(name, report, num_updates)
+            return lambda report, total: _print_update(name, _counted(report, diverged), total)
         shown = tqdm(
             desc=name,
             total=subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs,
@@ -207,7 +213,7 @@ class TrainingProgress:
             dynamic_ncols=True,
         )
         self._shown.callback(shown.close)
-        return lambda report, num_updates: _draw_update(shown, report)
+        return lambda report, total: _draw_update(shown, _counted(report, diverged))
 
     def evaluation(self, name: str) -> Progress:
         """Begin with an evaluation; return the function that shows how many episodes ended."""
@@ -232,13 +238,9 @@ def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics) -> None:
         shown.n = shown.initial
     shown.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
     shown.update(report.transitions - shown.n)
-    if report.unstable:
-        shown.write(_divergence(shown.desc, report), file=sys.stderr)
 
 
 def _print_update(name: str, report: UpdateMetrics, num_updates: int) -> None:
-    if report.unstable:
-        print(_divergence(name, report), file=sys.stderr, flush=True)
     if report.update % max(num_updates // TRAINING_LINES, 1) and report.update < num_updates:
         return
     updates_left = num_updates - report.update
@@ -264,11 +266,20 @@ def _print_each_minute(name: str) -> Progress:
     return update
 
 
-def _divergence(name: str, report: UpdateMetrics) -> str:
-    return (
-        f"{name}: update {report.update}: {report.unstable} of {report.episodes} episodes ended "
-        "because their simulation diverged"
-    )
+def _counted(report: UpdateMetrics, diverged: Counter[str]) -> UpdateMetrics:
+    """Add the episodes of an update, and those that diverged, to the counts of its training."""
+    diverged.update(episodes=report.episodes, diverged=report.unstable)
+    return report
+
+
+def _print_divergence(name: str, counts: Counter[str]) -> None:
+    if counts["diverged"]:
+        print(
+            f"{name}: {counts['diverged']} of {counts['episodes']} episodes ended because their "
+            "simulation diverged",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def _success(report: UpdateMetrics) -> str:

@@ -15,7 +15,7 @@ from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf import with_frames
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 
 CARD_FORMAT = 1
@@ -80,7 +80,7 @@ def robot_card(
         "movable": len(robot.movable_joints),
         "dof": robot.dof,
         "mass": round_number(robot.mass),
-        "reach": round_number(reach(robot)) if has_tool and robot.dof else None,
+        "reach": round_number(arm_reach(robot)) if has_tool and robot.dof else None,
         "home": {joint.name: round_number(q) for joint, q in zip(joints, robot.home, strict=True)},
         "frames": {
             frame.name: {

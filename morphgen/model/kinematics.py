@@ -7,10 +7,12 @@ positions ``q`` have shape (..., dof) [rad or m]; poses are homogeneous matrices
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
@@ -268,6 +270,39 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
         q = np.where(improved[:, None], candidates[rows, best], q)
         distance = np.where(improved, distances[rows, best], distance)
     return float(distance.max())
+
+
+def arm_reach(robot: Robot) -> float:
+    """Return the largest distance between the tool and the origin of the first joint that moves it.
+
+    Unlike ``reach``, it does not depend on where the robot is mounted [m].
+
+    Raises:
+        RobotError: If the robot has no tool.
+    """
+    T_root_joint = IDENTITY
+    for k in robot.joint_chain(robot.frame(TOOL).link):
+        T_root_joint = T_root_joint @ robot.joints[k].T_parent_joint
+        if robot.joints[k].is_movable:
+            return reach(with_root_at(robot, T_root_joint.position))
+    return reach(robot)
+
+
+def with_root_at(robot: Robot, point: Vec3) -> Robot:
+    """Return the robot with the origin of its root frame at a point of it, for distances from it.
+
+    Shapes and inertia of the root stay where they are in its frame.
+    """
+    T_point_root = Pose(point).inverse()
+    return replace(
+        robot,
+        joints=tuple(
+            replace(joint, T_parent_joint=T_point_root @ joint.T_parent_joint)
+            if joint.parent == robot.root.name
+            else joint
+            for joint in robot.joints
+        ),
+    )
 
 
 def _distance(robot: Robot, q: Array, frame: str) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import IDENTITY
-from morphgen.model.robot import Robot, sorted_pair
+from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links, merge_rigid_links
@@ -140,7 +140,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
 
     Joints have no friction and damping of their own: the law of position control moves them.
     """
-    robot = _with_own_root(merge_rigid_links(robot))
+    robot = merge_rigid_links(robot)
     bare = replace(
         robot,
         joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints),
@@ -165,28 +165,6 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return robot, spec
-
-
-def _with_own_root(robot: Robot) -> Robot:
-    """Return the robot with a root named ``world`` renamed: MuJoCo reserves that name."""
-    if robot.root.name != "world":
-        return robot
-    root = "world_"
-    while root in robot.link_index:
-        root += "_"
-
-    def renamed(name: str) -> str:
-        return root if name == "world" else name
-
-    return replace(
-        robot,
-        links=(replace(robot.root, name=root), *robot.links[1:]),
-        joints=tuple(replace(joint, parent=renamed(joint.parent)) for joint in robot.joints),
-        frames=tuple(replace(frame, link=renamed(frame.link)) for frame in robot.frames),
-        ignore_pairs=tuple(
-            sorted(sorted_pair(renamed(a), renamed(b)) for a, b in robot.ignore_pairs)
-        ),
-    )
 
 
 def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:

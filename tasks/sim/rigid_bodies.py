@@ -22,8 +22,9 @@ def merge_rigid_links(robot: Robot) -> Robot:
     """Merge links that fixed joints connect, since simulators take time for every link.
 
     Motion and contacts stay the same. Joints keep their names, order and home; a merged link has
-    the name of its first link. Visual shapes and frames are dropped. Links with collision shapes
-    are merged only if they ignore the same other links; otherwise the fixed joint stays.
+    the name of its first link, but a root named ``world`` is renamed. Visual shapes and frames are
+    dropped. Links with collision shapes are merged only if they ignore the same other links;
+    otherwise the fixed joint stays.
 
     Returns:
         A robot whose ``ignore_pairs`` also contain the pairs that no simulator should test: links
@@ -66,8 +67,33 @@ def merge_rigid_links(robot: Robot) -> Robot:
         if merged_name[a] != merged_name[b]
     }
     links = tuple(_merged_link(name, parts) for name, parts in pieces.items())
-    return Robot(
-        robot.name, links, tuple(joints), home=robot.home, ignore_pairs=tuple(sorted(pairs))
+    return _with_own_root(
+        Robot(robot.name, links, tuple(joints), home=robot.home, ignore_pairs=tuple(sorted(pairs)))
+    )
+
+
+def _with_own_root(robot: Robot) -> Robot:
+    """Return the robot with a root named ``world`` renamed.
+
+    MuJoCo reserves that name, and an MJCF cannot give the link the mass of those welded to it.
+    """
+    if robot.root.name != "world":
+        return robot
+    root = "world_"
+    while root in robot.link_index:
+        root += "_"
+
+    def renamed(name: str) -> str:
+        return root if name == "world" else name
+
+    return replace(
+        robot,
+        links=(replace(robot.root, name=root), *robot.links[1:]),
+        joints=tuple(replace(joint, parent=renamed(joint.parent)) for joint in robot.joints),
+        frames=tuple(replace(frame, link=renamed(frame.link)) for frame in robot.frames),
+        ignore_pairs=tuple(
+            sorted(sorted_pair(renamed(a), renamed(b)) for a, b in robot.ignore_pairs)
+        ),
     )
 
 

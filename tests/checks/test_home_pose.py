@@ -42,10 +42,17 @@ def mesh(folder: Path, name: str, made: trimesh.Trimesh) -> Mesh:
     return Mesh(folder / name)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.05, 0.1, 0.1 + 0.9 * MAX_GAP])
-def test_links_that_touch_or_nearly_do_are_not_apart(offset):
-    box = Box((0.1, 0.1, 0.1))
-    assert gap_findings(pair(box, box, Pose((0, 0, offset)))) == []
+@pytest.mark.parametrize("offset", [0.0, 0.05, 0.1, 0.1 + 0.9 * MAX_GAP, 0.1 + MAX_GAP])
+@pytest.mark.parametrize("height", [0.0, 1 / 3, 1e3])
+def test_links_that_touch_or_nearly_do_are_not_apart(offset, height):
+    """Also where they are 5 mm apart but for rounding."""
+    box = (Shape(Box((0.1, 0.1, 0.1))),)
+    links = (Link("root"), Link("parent", visuals=box), Link("child", visuals=box))
+    joints = (
+        Joint("mount", "fixed", "root", "parent", Pose((0, 0, height))),
+        Joint("gap", "fixed", "parent", "child", Pose((0, 0, offset))),
+    )
+    assert gap_findings(Robot("boxes", links, joints)) == []
 
 
 def test_a_gap_is_reported_with_both_links_and_its_width():

@@ -24,20 +24,23 @@ REPORT = UpdateMetrics(
 )
 
 
-@pytest.fixture(params=[True, False], ids=["terminal", "file"])
-def show(request, monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: request.param)
-    display = TrainingProgress()
-    yield display(SimpleNamespace(config=small_config()))
-    display.close()
-
-
-def test_diverged_episodes_are_reported_when_they_occur(show, capsys):
-    show(replace(REPORT, update=99, transitions=99 * 32), 100)
-    assert "diverged" not in capsys.readouterr().err
-    show(replace(REPORT, update=99, transitions=99 * 32, unstable=2), 100)
-    message = "update 99: 2 of 7 episodes ended because their simulation diverged\n"
-    assert message in capsys.readouterr().err
+@pytest.mark.parametrize("on_terminal", [True, False])
+@pytest.mark.parametrize(
+    ("unstable", "line"),
+    [((0, 0, 0), ""), ((0, 2, 0), "2 of 21"), ((1, 0, 4), "5 of 21")],
+)
+def test_diverged_episodes_are_one_line_at_the_end(
+    on_terminal, unstable, line, capsys, monkeypatch
+):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: on_terminal)
+    with closing(TrainingProgress()) as display:
+        show = display(SimpleNamespace(config=small_config()))
+        for update, count in enumerate(unstable, start=1):
+            show(replace(REPORT, update=update, transitions=32 * update, unstable=count), 3)
+        assert "diverged" not in capsys.readouterr().err
+    lines = [text for text in capsys.readouterr().err.splitlines() if "diverged" in text]
+    expected = f"{line} episodes ended because their simulation diverged"
+    assert [text.partition(": ")[2] for text in lines] == ([expected] if line else [])
 
 
 def test_progress_is_printed_once_per_minute(capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """Forward kinematics: closed forms, batches, mimic joints and reach."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from helpers.robots import arm
 from morphgen.api.robots import compose
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
+    arm_reach,
     forward_kinematics,
     frame_jacobian,
     frame_pose,
@@ -78,6 +80,23 @@ def test_q_of_wrong_length_is_refused_with_both_shapes():
 
 def test_reach_of_a_planar_arm_is_its_length():
     assert reach(planar((0.5, 0.3, 0.2))) == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "mount",
+    [
+        Pose((0, 0, 1.5)),
+        Pose.from_xyz_rpy((0.3, 0.2, 2.0), (np.pi, 0, 0)),
+        Pose.from_xyz_rpy((1.0, 0, 0.4), (0, np.pi / 2, 0.3)),
+    ],
+    ids=["pedestal", "ceiling", "wall"],
+)
+def test_reach_of_an_arm_does_not_depend_on_its_mount(mount):
+    robot = planar((0.5, 0.3, 0.2))
+    stand = Joint("stand", "fixed", "floor", robot.root.name, mount)
+    mounted = replace(robot, links=(Link("floor"), *robot.links), joints=(stand, *robot.joints))
+    assert arm_reach(mounted) == pytest.approx(1.0, rel=1e-4)
+    assert reach(mounted) > 1.1
 
 
 def test_random_configurations_are_within_the_limits():

@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.dynamics import mass_matrix
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Inertial, Joint, Link
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
@@ -26,6 +30,21 @@ def test_merged_links_move_like_separate_ones(request_):
     assert sum(len(link.collisions) for link in merged.links) == shapes
     assert len(merged.links) <= len(body.links)
     assert merged.home == body.home
+
+
+@pytest.mark.parametrize("simulator", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("mass", [0.0, 5.0])
+@pytest.mark.parametrize("shifted", [False, True])
+def test_a_massive_link_may_be_welded_to_a_root_named_world(simulator, mass, shifted):
+    if simulator == "pybullet":
+        pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    body = arm()
+    world = Link("world", Inertial(mass) if mass else None)
+    weld = Joint("weld", "fixed", "world", body.root.name, Pose((0, 0, 0.5 * shifted)))
+    body = replace(body, links=(world, *body.links), joints=(weld, *body.joints))
+    simulation = SIMULATORS[simulator].load([Scene(body)], None, 1, torch.device("cpu"))
+    assert not simulation.step(simulation.q.clone()).any()
+    simulation.close()
 
 
 def test_links_with_different_ignored_pairs_are_not_merged():
