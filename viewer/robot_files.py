@@ -21,6 +21,7 @@ from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import framed_height, render
 from morphgen.formats.zip_files import write_entries
 from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.model.mesh_pieces import read_picture
 from morphgen.model.robot import Robot
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import FileAccess, content_hash, read_robot_uri
@@ -73,9 +74,8 @@ def measure_picture(uri: str, files: FileAccess) -> Thumbnail:
 def thumbnail_of_picture(path: Path) -> str:
     """Return a picture file as a small JPEG in a ``data:`` URL; empty if it is not a picture."""
     try:
-        with Image.open(path) as picture:
-            return _data_url(picture)
-    except (OSError, Image.DecompressionBombError):
+        return _data_url(read_picture(path))
+    except (OSError, ValueError):
         return ""
 
 

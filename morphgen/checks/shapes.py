@@ -11,7 +11,7 @@ from morphgen.errors import MeshError
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Geometry, Mesh, Shape, dimensions
 from morphgen.model.inertia import bounding_box, inertial_from_density
-from morphgen.model.mesh import MAX_STL_FACES, convex_hull, load_mesh
+from morphgen.model.mesh import MAX_STL_FACES, convex_hull, left_out, load_mesh
 from morphgen.model.robot import Inertial, Link, Robot
 
 EXTENT_RANGE = (1e-3, 10.0)
@@ -135,6 +135,14 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
     if fault is not None:
         yield Finding("mesh-unreadable", "error", where, fault, "export the mesh again")
         return
+    if parts := left_out(mesh.path):
+        yield Finding(
+            "mesh-left-out",
+            "warning",
+            where,
+            f"{mesh.path.name}: left out: {'; '.join(parts)}",
+            "export the mesh as triangles with its materials beside it",
+        )
     flat = mesh_fault(mesh, reader=convex_hull) if collides else None
     if flat is not None:
         yield Finding("mesh-flat", "error", where, flat, "collide with a thin box instead")

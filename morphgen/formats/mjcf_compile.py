@@ -12,7 +12,7 @@ from morphgen.formats.urdf_schema import MAX_NUMBER, MAX_TEXT
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh
 from morphgen.model.mesh import load_mesh
-from morphgen.model.mesh_files import MAX_FACES
+from morphgen.model.mesh_pieces import MAX_FACES
 
 _REFUSALS = (ValueError, mujoco.FatalError)
 """Exceptions by which MuJoCo refuses a document."""

@@ -22,7 +22,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.files import write_cache_file
 from morphgen.formats.mjcf_document import MjcfDocument
 from morphgen.model.geometry import Mesh
-from morphgen.model.mesh_files import MAX_COORDINATE
+from morphgen.model.mesh_pieces import MAX_COORDINATE
 from morphgen.model.rotation import Vec3
 
 ELLIPSOID_SUBDIVISIONS = 2

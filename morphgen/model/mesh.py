@@ -66,7 +66,16 @@ def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
     Raises:
         MeshError: If the file is missing, unreadable, empty or not finite.
     """
-    return tuple(group.part for group in _groups(str(path.absolute()), _stamp(path)))
+    return tuple(group.part for group in _content(str(path.absolute()), _stamp(path))[0])
+
+
+def left_out(path: Path) -> tuple[str, ...]:
+    """Return what a mesh file holds beside its triangles and was left out, each as a phrase.
+
+    Raises:
+        MeshError: If the file is missing, unreadable, empty or not finite.
+    """
+    return _content(str(path.absolute()), _stamp(path))[1]
 
 
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
@@ -107,7 +116,7 @@ def _scaled(
 
     if len(scale) != 3 or not all(math.isfinite(s) and s != 0 for s in scale):
         raise MeshError(f"{path}: scale {scale} is not three finite numbers other than zero")
-    groups = _groups(path, stamp)
+    groups, _ = _content(path, stamp)
     if part is not None:
         if not 0 <= part < len(groups):
             raise MeshError(f"{path}: no part {part}; valid: 0 to {len(groups) - 1}")
@@ -120,13 +129,14 @@ def _scaled(
 
 
 @lru_cache(maxsize=128)
-def _groups(path: str, stamp: tuple[int, int]) -> tuple[_Group, ...]:
-    """Return the file's triangles by colour; ``stamp`` invalidates the cache."""
+def _content(path: str, stamp: tuple[int, int]) -> tuple[tuple[_Group, ...], tuple[str, ...]]:
+    """Return a file's triangles by colour, and what is left out; ``stamp`` voids the cache."""
     from morphgen.model.mesh_files import read_mesh_file
 
     del stamp
+    content = read_mesh_file(Path(path))
     pieces: dict[Rgba | None, list[_Triangles]] = {}
-    for rgba, triangles in read_mesh_file(Path(path)):
+    for rgba, triangles in content.pieces:
         pieces.setdefault(rgba, []).append(triangles)
     groups = []
     for rgba, parts in pieces.items():
@@ -134,8 +144,9 @@ def _groups(path: str, stamp: tuple[int, int]) -> tuple[_Group, ...]:
         if len(faces):
             groups.append(_Group(MeshPart(rgba, len(faces)), vertices, faces))
     if not groups:
-        raise MeshError(f"{path}: holds no triangle with an area")
-    return tuple(groups)
+        count = sum(len(faces) for _, (_, faces) in content.pieces)
+        raise MeshError(f"{path}: none of its {count} triangles has an area")
+    return tuple(groups), content.left_out
 
 
 def _concatenate(parts: list[_Triangles]) -> _Triangles:

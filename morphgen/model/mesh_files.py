@@ -1,288 +1,455 @@
-"""Read mesh files from untrusted sources: bounded in size, and within their own folder.
+"""Read mesh files from untrusted sources: STL, OBJ and PLY here, other formats by other modules.
 
-COLLADA files declare two properties of their coordinates, and robot descriptions rely on the first:
-
-* ``<unit meter="...">`` is applied. All seven visuals of the KUKA KR210 are in inches by that
-  element, and only with it do they match the same links' collision STLs (mean overlap of the
-  bounding boxes 0.98, without it 0.00).
-* ``<up_axis>`` is ignored. Every file of rtb-data and example-robot-data that declares ``Y_UP`` and
-  can be compared with another mesh of the same part matches it without a rotation: PR2 (14 visuals
-  against collision STLs, mean overlap 0.94, rotated to z up 0.41), Kinova (7 against STLs, equal
-  bounds), Robotiq 2F-85 (3 against ``Z_UP`` files, equal bounds), Baxter's torso (0.99, rotated
-  0.14). None matches better when rotated. RViz, Pinocchio and PyBullet ignore the element too. For
-  the same reason, glTF files are not rotated from y up.
-
-trimesh applies neither; it applies the transforms of the scene graph, as does this module.
+Every count in a file is compared with the file's bytes before anything is allocated. What trimesh
+would lose or misread is rewritten before it reads the file, left out with a note, or refused.
 """
 
 from __future__ import annotations
 
 import io
-import json
-import logging
-import math
-import stat
+import re
 import struct
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import collada
 import numpy as np
 import trimesh
-from lxml import etree
 from numpy.typing import NDArray
-from PIL import Image
-from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MeshError
-from morphgen.model.geometry import MESH_SUFFIXES, Rgba
+from morphgen.model.geometry import MESH_SUFFIXES
+from morphgen.model.mesh_pieces import (
+    MAX_SETS,
+    UNREADABLE,
+    FolderResolver,
+    Piece,
+    note_missing,
+    parse_numbers,
+    require_faces,
+    scene_pieces,
+)
 from morphgen.model.msh_files import read_msh
+from morphgen.model.scene_files import read_dae, read_glb, read_gltf
 from morphgen.typing import Array
 
-MAX_FILE_SIZE = 128 * 2**20
-"""Size of the largest mesh, texture or material file that is read [bytes]."""
-MAX_FACES = 5_000_000
-"""Number of triangles of the largest mesh that is read, every instance counted."""
-MAX_PIXELS = 2**26
-"""Number of pixels of the largest texture that is read."""
-MAX_COORDINATE = 1e9
-"""Coordinate above which a mesh file counts as broken [m]."""
-_MAX_ACCESSOR_ENTRIES = 20_000_000
-"""Number of entries in all accessors of the largest glTF file that is read."""
-_MAX_NODES = 100_000
-"""Number of nodes of the largest COLLADA scene that is read, every instance counted."""
-_MAX_DEPTH = 100
-"""Largest nesting depth of nodes in a COLLADA scene."""
-
-_UNREADABLE = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    Image.DecompressionBombError,
-    LookupError,
-    MemoryError,
-    NameError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    collada.DaeError,
-    struct.error,
-    trimesh.exchange.stl.HeaderError,
-)
-"""Exceptions that the readers raise on malformed files."""
-
-# Without a handler, trimesh's warnings about a file would be printed on the terminal.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
+_MAX_TOKENS = 20_000_000
+"""Number of words in the largest OBJ file that is read."""
+_MAX_HEADER = 2**16
+"""Size of the longest header of a PLY file, and of the longest line of an OBJ file [bytes]."""
 
 
-def read_mesh_file(path: Path) -> list[tuple[Rgba | None, tuple[Array, NDArray[np.int64]]]]:
-    """Return the colour, vertices (n, 3) [m] and faces (m, 3) of every geometry in a mesh file.
+@dataclass(frozen=True)
+class MeshContent:
+    """The content of a mesh file."""
+
+    pieces: tuple[Piece, ...]
+    """Colour and triangles of every geometry."""
+    left_out: tuple[str, ...]
+    """What the file holds beside these, each a phrase with a count, such as ``3 line sets``."""
+
+
+def read_mesh_file(path: Path) -> MeshContent:
+    """Return the coloured triangles of a mesh file, and what was left out.
 
     Raises:
-        MeshError: If the file is unreadable, too large or not finite.
+        MeshError: If the file is unreadable, too large, without triangles or not finite.
     """
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         valid = ", ".join(MESH_SUFFIXES)
         raise MeshError(f"{path}: cannot read {path.suffix!r} meshes; valid: {valid}")
+    files = FolderResolver(path.parent)
     try:
-        require_readable(path)
-        require_bounded(path)
-        scene = _scene(path)
-        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-        faces = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in placed)
-        if faces > MAX_FACES:
-            raise ValueError(f"{faces} triangles; at most {MAX_FACES} are read")
-        return [
-            (_colour(geometry), _in_scene(geometry, T_scene_node))
-            for T_scene_node, name in placed
-            if isinstance(geometry := scene.geometry[name], trimesh.Trimesh)
-        ]
-    except _UNREADABLE as error:
+        data = files.get(path.name)
+        _require_mesh(data, suffix)
+        pieces = _READERS[suffix](data, files)
+    except UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
+    notes = Counter(files.left_out)
+    return MeshContent(
+        tuple(pieces), tuple(f"{note} ({n} times)" if n > 1 else note for note, n in notes.items())
+    )
 
 
-def _scene(path: Path) -> trimesh.Scene:
-    if path.suffix.lower() == ".msh":
-        return trimesh.Scene(trimesh.Trimesh(*read_msh(path.read_bytes()), process=False))
-    scene = trimesh.load_scene(path, process=False, resolver=FolderResolver(path.parent))
-    if path.suffix.lower() == ".dae" and not scene.geometry:
-        # pycollada drops a geometry whose material is broken, such as by an undeclared texture.
-        plain = io.BytesIO(without_materials(path))
-        scene = trimesh.load_scene(plain, file_type="dae", process=False)
-    return scene
+def _require_mesh(data: bytes, suffix: str) -> None:
+    """Raise ValueError with the true reason if a file is empty or no mesh of its suffix."""
+    start = data[:1000].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if not data:
+        raise ValueError("the file is empty")
+    if start.startswith(b"version https://git-lfs"):
+        raise ValueError("the file is a Git LFS pointer; run 'git lfs pull' to get the mesh")
+    if start.startswith((b"<!doctype html", b"<html")):
+        raise ValueError("the file is a web page; download the mesh itself")
+    kinds = {
+        ".dae": start.startswith(b"<") and b"<collada" in start,
+        ".glb": data.startswith(b"glTF"),
+        ".ply": re.match(rb"ply\s+format\s", data) is not None,
+        ".stl": re.match(rb"solid\b.*\s+facet\s+normal\s", start) is not None,
+        ".gltf": start.startswith(b"{") and b'"asset"' in start,
+    }
+    actual = next((kind for kind, matches in kinds.items() if matches and kind != suffix), None)
+    if actual is not None and not kinds.get(suffix):
+        raise ValueError(f"the file has the content of a {actual} file; rename it")
 
 
-def _in_scene(geometry: trimesh.Trimesh, T_scene_node: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return a geometry's vertices in the scene frame [m], and faces oriented outwards."""
-    faces = np.asarray(geometry.faces)
-    if geometry.vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        raise ValueError(f"vertices are {geometry.vertices.shape}, faces {faces.shape}")
-    if faces.size and faces.min() < 0:
-        raise ValueError(f"vertex index {faces.min()}")
-    unit = geometry.metadata.get("units", "meters")
-    metres_per_unit = float(trimesh.units.unit_conversion(unit, "meters"))
-    vertices = trimesh.transform_points(geometry.vertices, T_scene_node) * metres_per_unit
-    if not np.isfinite(vertices[faces]).all():
-        raise ValueError("a vertex is not finite")
-    if np.abs(vertices[faces]).max(initial=0.0) > MAX_COORDINATE:
-        raise ValueError(f"a vertex is beyond {MAX_COORDINATE:g} m")
-    mirrored = np.linalg.det(T_scene_node[:3, :3]) < 0
-    return vertices, faces[:, ::-1] if mirrored else faces
+def _read_msh(data: bytes, files: FolderResolver) -> list[Piece]:
+    del files
+    vertices, faces = read_msh(data)
+    require_faces(len(faces))
+    return scene_pieces(trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False)))
 
 
-def _colour(geometry: trimesh.Trimesh) -> Rgba | None:
-    """Return a geometry's mean colour, rounded to 8 bits; None if it has none."""
-    visual = geometry.visual
-    if visual is None or not visual.defined:
-        return None
-    if isinstance(visual, TextureVisuals):
-        material = visual.material
-        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        if visual.uv is None or image is None:
-            rgba = material.main_color
-        else:
-            if math.prod(image.size) > MAX_PIXELS:
-                raise ValueError(f"a texture of {image.size[0]} x {image.size[1]} pixels")
-            colours = material.to_color(visual.uv)
-            rgba = np.mean(colours, axis=0)
+_STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def _read_stl(data: bytes, files: FolderResolver) -> list[Piece]:
+    """Read all solids of an STL file, which may have been concatenated from several."""
+    if data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:1024]:
+        corners = _ascii_stl(data)
     else:
-        rgba = np.mean(visual.vertex_colors, axis=0)
-    red, green, blue, alpha = (round(float(channel)) / 255 for channel in rgba)
-    return (red, green, blue, alpha)
+        corners = _binary_stl(data, files)
+    if not len(corners):
+        raise ValueError("holds no triangle")
+    vertices = corners.reshape(-1, 3)
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    return scene_pieces(trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False)))
 
 
-class FolderResolver(trimesh.resolvers.Resolver):
-    """Resolves the file names in a mesh file, within the mesh's own folder only."""
-
-    def __init__(self, folder: Path) -> None:
-        """Restrict access to a folder and the folders below it."""
-        self._folder = folder.resolve()
-
-    def get(self, name: str) -> bytes:
-        """Return the content of a file.
-
-        Raises:
-            ValueError: If it is outside the folder, not a regular file or too large.
-        """
-        path = (self._folder / str(name).strip().replace("\\", "/")).resolve()
-        if not path.is_relative_to(self._folder):
-            raise ValueError(f"{name!r} is outside the mesh's folder")
-        require_readable(path)
-        return path.read_bytes()
-
-    def keys(self) -> list[str]:
-        """Return no names, so that trimesh reads only the files that the mesh names."""
-        return []
-
-    def namespaced(self, namespace: str) -> FolderResolver:
-        """Return this resolver, so that trimesh does not search other folders."""
-        del namespace
-        return self
-
-    def write(self, name: str, data: bytes) -> None:
-        """Refuse to write.
-
-        Raises:
-            ValueError: Always.
-        """
-        del data
-        raise ValueError(f"{name!r} is not written")
+def _ascii_stl(data: bytes) -> Array:
+    text = data.lower()
+    require_faces(text.count(b"endloop"))
+    vertices = re.findall(rb"\bvertex((?:\s+[-+.\dein]\S*){3})", text)
+    facets, ends = len(re.findall(rb"\bfacet\s+normal\b", text)), text.count(b"endloop")
+    if facets != ends or len(vertices) != 3 * ends:
+        raise ValueError(
+            f"{len(vertices)} vertices in {facets} facets, {ends} of which end; expected 3 each: "
+            "it is truncated or malformed"
+        )
+    return parse_numbers(b" ".join(vertices)).reshape(-1, 3, 3)
 
 
-def require_readable(path: Path) -> None:
-    """Require a regular file of at most ``MAX_FILE_SIZE`` bytes.
-
-    Raises:
-        OSError: If the file is missing or access is denied.
-        ValueError: If it is not a regular file, or larger.
-    """
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{path.name!r} is not a regular file")
-    if status.st_size > MAX_FILE_SIZE:
-        raise ValueError(f"{path.name!r} holds {status.st_size} bytes; at most {MAX_FILE_SIZE}")
-
-
-def require_bounded(path: Path) -> None:
-    """Require that a file's declared content is bounded, however small the file.
-
-    Raises:
-        ValueError: If the content is too large or malformed.
-        etree.XMLSyntaxError: If a COLLADA file is not XML.
-    """
-    match path.suffix.lower():
-        case ".dae":
-            _require_bounded_collada(path.read_bytes())
-        case ".glb":
-            _require_bounded_gltf(_json_chunk(path.read_bytes()))
-        case ".gltf":
-            _require_bounded_gltf(path.read_bytes())
+def _binary_stl(data: bytes, files: FolderResolver) -> Array:
+    solids: list[Array] = []
+    start = 0
+    while len(data) - start >= 84:
+        (count,) = struct.unpack_from("<I", data, start + 80)
+        end = start + 84 + count * _STL_ROW.itemsize
+        if end > len(data) and not start:
+            raise ValueError(
+                f"its header counts {count} triangles, which take {end} bytes, and the file has "
+                f"{len(data)}: it is truncated or not STL"
+            )
+        if end > len(data) or (start and not count):
+            break
+        require_faces(sum(map(len, solids)) + count)
+        solids.append(np.frombuffer(data, _STL_ROW, count, start + 84)["corners"])
+        start = end
+    if not solids:
+        raise ValueError(f"{len(data)} bytes; a binary STL file has at least 84: it is truncated")
+    if start < len(data):
+        files.left_out.append(f"{len(data) - start} bytes after the last triangle")
+    return np.concatenate(solids)
 
 
-def _json_chunk(data: bytes) -> bytes:
-    if len(data) < 20 or data[:4] != b"glTF":
-        raise ValueError("does not begin as a binary glTF file")
-    (length,) = struct.unpack("<I", data[12:16])
-    return data[20 : 20 + length]
+_PLY_TYPES = {
+    name: code
+    for code, names in {
+        "i1": "char int8",
+        "u1": "uchar uint8",
+        "i2": "short int16",
+        "u2": "ushort uint16",
+        "i4": "int int32",
+        "u4": "uint uint32",
+        "i8": "int64",
+        "u8": "uint64",
+        "f4": "float float32",
+        "f8": "double float64",
+    }.items()
+    for name in names.split()
+}
 
 
-def _require_bounded_gltf(text: bytes) -> None:
-    document = json.loads(text)
-    accessors = document.get("accessors", []) if isinstance(document, dict) else None
-    if not isinstance(accessors, list):
-        raise ValueError("does not contain a glTF document")
-    # An accessor without data is all zeros, so any count needs no bytes in the file.
-    count = sum(accessor["count"] for accessor in accessors)
-    if count > _MAX_ACCESSOR_ENTRIES:
-        raise ValueError(f"its accessors count {count} entries; at most {_MAX_ACCESSOR_ENTRIES}")
+def _read_ply(data: bytes, files: FolderResolver) -> list[Piece]:
+    end = data.find(b"end_header", 0, _MAX_HEADER)
+    if not data.startswith(b"ply") or end < 0:
+        raise ValueError(f"no PLY header of at most {_MAX_HEADER} bytes: it is truncated")
+    lines = [line.split() for line in data[:end].decode("latin-1").splitlines()]
+    order = next(line[1] for line in lines if line[:1] == ["format"])
+    body = data[data.index(b"\n", end) + 1 :]
+    byte_order = ">" if "big" in order else "<"
+    if order == "ascii":  # from here on as a binary file of doubles
+        body = parse_numbers(body).tobytes()
+    elements: list[tuple[str, int, list[tuple[str, ...]]]] = []
+    for line in lines:
+        match line:
+            case ["element", name, count]:
+                elements.append((name, int(count), []))
+            case ["property", *kinds, name] if elements:
+                codes = ["f8"] * 2 if order == "ascii" else [_PLY_TYPES[k] for k in kinds[-2:]]
+                codes = [byte_order + code for code in codes]
+                is_list = kinds[0] == "list"
+                elements[-1][2].append((name, *(codes if is_list else codes[-1:])))
+            case ["comment", word, *name] if word.lower() == "texturefile":
+                files.left_out.append(f"texture {' '.join(name)!r}")
+    columns: dict[str, dict[str, Any]] = {}
+    start = 0
+    for element, length, properties in elements:
+        columns[element], start = _ply_element(body, start, element, length, properties)
+    return _ply_pieces(columns, {name: count for name, count, _ in elements}, files)
 
 
-def without_materials(path: Path) -> bytes:
-    """Return the content of a COLLADA file, with the materials of its geometries removed."""
-    root = _collada(path.read_bytes())
-    for binding in [*root.iter("{*}bind_material")]:
-        parent = binding.getparent()
-        if parent is not None:
-            parent.remove(binding)
-    return etree.tostring(root)
+def _ply_element(
+    body: bytes, start: int, name: str, count: int, properties: list[tuple[str, ...]]
+) -> tuple[dict[str, Any], int]:
+    """Return the columns of an element, lists as one array or one per row, and where it ends."""
+    if count < 0:
+        raise ValueError(f"its header counts {count} of element {name!r}")
+    smallest = count * sum(np.dtype(codes[0]).itemsize for _, *codes in properties)
+    if smallest > len(body) - start:
+        raise ValueError(
+            f"its header counts {count} of element {name!r}, more than the file has bytes for: it "
+            "is truncated"
+        )
+    if not count or not properties:
+        return {}, start
+    rows = _uniform_rows(body, start, count, properties)
+    if rows is not None:
+        return {entry[0]: rows[f"c{i}"] for i, entry in enumerate(properties)}, start + rows.nbytes
+    require_faces(count)  # the rows have lists of different lengths, so they are read one by one
+    columns: dict[str, list[Any]] = {entry[0]: [] for entry in properties}
+    for _ in range(count):
+        for column, *codes in properties:
+            length = 1
+            if len(codes) == 2:
+                length = int(np.frombuffer(body, codes[0], 1, start)[0])
+                start += np.dtype(codes[0]).itemsize
+            columns[column].append(np.frombuffer(body, codes[-1], max(length, 0), start))
+            start += columns[column][-1].nbytes
+    return columns, start
 
 
-def _collada(data: bytes) -> etree._Element:
-    # Without a DOCTYPE, also in UTF-16, no entity can be defined.
-    if b"<!DOCTYPE" in data.replace(b"\0", b""):
-        raise ValueError("has a DOCTYPE; a mesh needs none, remove it")
-    # huge_tree, because coordinate arrays exceed libxml2's default limit on text.
-    parser = etree.XMLParser(
-        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=True
+def _uniform_rows(
+    body: bytes, start: int, count: int, properties: list[tuple[str, ...]]
+) -> NDArray[np.void] | None:
+    """Return rows of an element, with a field ``c0`` per property; None if list lengths differ."""
+    fields: list[Any] = []
+    for i, (_, *codes) in enumerate(properties):
+        if len(codes) == 2:
+            offset = start + np.dtype(fields).itemsize
+            length = int(np.frombuffer(body, codes[0], 1, offset)[0])
+            if not 0 <= length <= len(body):
+                raise ValueError(f"a list of {length} entries")
+            fields += [(f"n{i}", codes[0]), (f"c{i}", codes[1], (length,))]
+        else:
+            fields.append((f"c{i}", codes[0]))
+    if start + count * np.dtype(fields).itemsize > len(body):
+        return None
+    rows = np.frombuffer(body, np.dtype(fields), count, start)
+    lengths = [rows[field[0]] for field in fields if field[0].startswith("n")]
+    return rows if all((column == column[0]).all() for column in lengths) else None
+
+
+_Rows = NDArray[Any] | Sequence[NDArray[Any]]
+"""Lists of a PLY file: an array with a row for each, or an array for each."""
+
+
+def _ply_pieces(
+    columns: dict[str, dict[str, Any]], counts: dict[str, int], files: FolderResolver
+) -> list[Piece]:
+    vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    polygons: _Rows = face.get("vertex_indices", face.get("vertex_index", ()))
+    strips: _Rows = columns.get("tristrips", {}).get("vertex_indices", ())
+    for name, count in counts.items():
+        if count and name not in ("vertex", "face", "tristrips"):
+            files.left_out.append(f"{count} elements {name!r}")
+    if not {"x", "y", "z"} <= vertex.keys():
+        raise ValueError("holds no vertex with x, y and z")
+    vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
+    triangles = np.concatenate([*_fans(polygons, files), *_strips(strips)])
+    require_faces(len(triangles))
+    if not len(triangles):
+        raise ValueError(f"holds {len(vertices)} vertices and no triangle")
+    mesh = trimesh.Trimesh(
+        vertices,
+        triangles,
+        vertex_colors=_ply_colours(vertex, len(vertices)),
+        face_colors=_ply_colours(face, len(triangles)),
+        process=False,
     )
-    return etree.fromstring(data, parser)
+    return scene_pieces(trimesh.Scene(mesh))
 
 
-def _require_bounded_collada(data: bytes) -> None:
-    """Bound the number of nodes, counted as by a reader that copies every instance of a node."""
-    root = _collada(data)
-    nodes = {f"#{node.get('id')}": node for node in root.iter("{*}node")}
-    sizes: dict[Any, int] = {}
+def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:
+    channels = [columns[c] for c in ("red", "green", "blue", "alpha") if c in columns]
+    has_colours = len(channels) >= 3 and all(len(channel) == count for channel in channels)
+    return np.column_stack(channels) if has_colours else None
 
-    def size(node: etree._Element, depth: int) -> int:
-        if depth > _MAX_DEPTH:
-            raise ValueError(f"its nodes are nested deeper than {_MAX_DEPTH} levels")
-        if node not in sizes:
-            total = 1
-            for child in node.iterchildren("{*}node", "{*}instance_node"):
-                target = nodes.get(child.get("url", "")) if child.tag.endswith("e_node") else child
-                total += 0 if target is None else size(target, depth + 1)
-            sizes[node] = total
-        return sizes[node]
 
-    total = sum(
-        size(node, 0)
-        for scene in root.iter("{*}visual_scene")
-        for node in scene.iterchildren()
-        if isinstance(node.tag, str) and etree.QName(node).localname == "node"
+def _fans(polygons: _Rows, files: FolderResolver) -> Iterator[NDArray[np.int64]]:
+    """Yield the triangles of polygons: an array with a row for each, or a list of arrays."""
+    by_size: dict[int, list[Any]] = {}
+    if isinstance(polygons, np.ndarray):
+        by_size[polygons.shape[1]] = [polygons]
+    else:
+        for polygon in polygons:
+            by_size.setdefault(len(polygon), []).append(polygon)
+    for size, rows in by_size.items():
+        corners = np.vstack(rows).astype(np.int64)
+        require_faces(len(corners) * max(size - 2, 0))
+        yield from (corners[:, [0, k, k + 1]] for k in range(1, size - 1))
+        if size < 3:
+            files.left_out.append(f"{len(corners)} faces of {size} vertices")
+
+
+def _strips(strips: _Rows) -> Iterator[NDArray[np.int64]]:
+    """Yield the triangles of strips; in each, -1 begins another one."""
+    yield np.empty((0, 3), np.int64)
+    for strip in strips:
+        corners = np.asarray(strip, dtype=np.int64)
+        # A triangle is turned if its place in its own strip is odd.
+        places = np.arange(len(corners))
+        begins = np.maximum.accumulate(np.where(corners < 0, places + 1, 0))
+        triangles = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
+        odd = (places - begins)[:-2] % 2 == 1
+        triangles[odd] = triangles[odd, ::-1]
+        yield triangles[(triangles >= 0).all(axis=1)]
+
+
+def _read_obj(data: bytes, files: FolderResolver) -> list[Piece]:
+    """Read an OBJ file by trimesh, rewritten where trimesh misreads it."""
+    if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
+        raise ValueError(f"more than {_MAX_TOKENS} words")
+    text = data.decode("utf-8", "replace").replace("\r\n", "\n").replace("\\\n", " ")
+    require_faces(len(re.findall(r"^[ \t]*f[ \t]", text, re.M)))
+    _require_short_lines(text)
+    mixes_corners = re.search(r"^f[^\n]*//", text, re.M) and re.search(r"^f[^\n]*\d/\d", text, re.M)
+    if mixes_corners or _OBJ_ODD.search(text):
+        text = "\n".join(_plain_obj(text))
+    triangles = 0
+    vertices = text.count("\nv ") + text.startswith("v ")
+    for face in re.finditer(r"^f (.*)$", text, re.M):
+        triangles += max(len(face[1].split()) - 2, 0)
+    require_faces(triangles)
+    if not triangles:
+        raise ValueError(f"holds {vertices} vertices and no triangle")
+    for keyword, meaning in _OBJ_LEFT_OUT.items():
+        if count := len(re.findall(rf"^{keyword}[ \t]", text, re.M)):
+            files.left_out.append(f"{count} {meaning}")
+    materials = set(re.findall(r"^usemtl +(.*?) *$", text, re.M))
+    if len(materials) > MAX_SETS or len(materials) * vertices > _MAX_WORK:
+        raise ValueError(f"{len(materials)} materials for {vertices} vertices")
+    libraries = re.findall(r"^[ \t]*mtllib[ \t]+(.*?)[ \t]*$", text, re.M)
+    text = re.sub(r"^[ \t]*mtllib.*$", "", text, flags=re.M)
+    if libraries:
+        files.written["materials"] = _materials(libraries, materials, files).encode()
+        text = f"mtllib materials\n{text}"
+    scene = trimesh.load_scene(
+        io.BytesIO(text.encode()), file_type="obj", process=False, resolver=files
     )
-    if total > _MAX_NODES:
-        raise ValueError(f"its scene has {total} nodes; at most {_MAX_NODES}")
+    pieces = scene_pieces(scene)
+    note_missing(files, triangles, pieces)
+    return pieces
+
+
+_MAX_WORK = 500_000_000
+"""Largest number of materials times vertices of an OBJ file; trimesh masks all for each."""
+_OBJ_LEFT_OUT = {
+    "l": "lines",
+    "p": "points",
+    "(?:curv|curv2|surf)": "free-form curves and surfaces",
+}
+_OBJ_ODD = re.compile(
+    r"^[ \t]+[a-z]|^(?:v|vt|vn|f|usemtl)\t|^f[^\n]*#|^f[^\n]*[ /]-|^f[^\n]*[ /]0+(?![0-9])"
+    r"|^f(?: +\S+){5}|^f(?: +\S+){0,2} *$",
+    re.M,
+)
+"""Lines that trimesh skips or misreads: indented or with tabs, with comments, indices from the end
+or zero, more than four or fewer than three corners."""
+
+
+def _require_short_lines(text: str) -> None:
+    start = -1
+    while start + _MAX_HEADER < len(text):
+        end = text.rfind("\n", start + 1, start + 1 + _MAX_HEADER)
+        if end < 0:
+            raise ValueError(f"a line has more than {_MAX_HEADER} characters")
+        start = end
+
+
+def _plain_obj(text: str) -> Iterator[str]:
+    """Yield the lines of an OBJ file with triangles only, their indices counted from the start."""
+    counts = {"v": 0, "vt": 0, "vn": 0}
+    for line in text.split("\n"):
+        words = line.partition("#")[0].split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        if words[:1] != ["f"]:
+            yield " ".join(words)
+            continue
+        corners = [_plain_corner(word, counts) for word in words[1:]]
+        if len({corner.count("/") for corner in corners}) > 1:
+            corners = [corner.split("/")[0] for corner in corners]
+        if len(corners) < 3:
+            yield f"l {' '.join(corners)}"
+        for k in range(1, len(corners) - 1):
+            yield f"f {corners[0]} {corners[k]} {corners[k + 1]}"
+
+
+def _plain_corner(word: str, counts: dict[str, int]) -> str:
+    """Return a corner as ``v``, ``v/vt`` or ``v/vt/vn``, its indices counted from the first, 1."""
+    indices: list[str] = []
+    for kind, index in zip(counts, word.split("/"), strict=False):
+        if index and (kind != "vn" or len(indices) == 2):
+            number = int(index) + (counts[kind] + 1 if int(index) < 0 else 0)
+            if number < 1:
+                raise ValueError(f"index {word!r} of a face, after {counts[kind]} of {kind!r}")
+            indices.append(str(number))
+    return "/".join(indices)
+
+
+def _materials(libraries: list[str], used: set[str], files: FolderResolver) -> str:
+    """Return the materials of all libraries that an OBJ file names, with readable textures only."""
+    texts = []
+    for line in dict.fromkeys(libraries):
+        try:
+            texts.append(files.get(line))  # a name may have spaces
+        except (OSError, ValueError) as whole:
+            names = line.split()
+            for name in names:
+                try:
+                    texts.append(files.get(name))
+                except (OSError, ValueError) as error:
+                    reason = whole if len(names) == 1 else error
+                    missing = isinstance(reason, FileNotFoundError)
+                    files.left_out.append(
+                        f"material file {name!r}: {'no such file' if missing else reason}"
+                    )
+    lines = []
+    known: set[str] = set()
+    name = ""
+    for line in b"\n".join(texts).decode("utf-8", "replace").splitlines():
+        key, _, value = line.strip().partition(" ")
+        if key.lower() == "newmtl":
+            name = " ".join(value.split())
+            known.add(name)
+        if key.lower() == "map_kd" and not (name in used and files.has_picture(value.strip())):
+            continue
+        lines.append(line.strip())
+    if texts and (unknown := len(used - known)):
+        files.left_out.append(f"{unknown} materials, which no material file defines")
+    return "\n".join(lines)
+
+
+_READERS: dict[str, Callable[[bytes, FolderResolver], list[Piece]]] = {
+    ".dae": read_dae,
+    ".glb": read_glb,
+    ".gltf": read_gltf,
+    ".msh": _read_msh,
+    ".obj": _read_obj,
+    ".ply": _read_ply,
+    ".stl": _read_stl,
+}

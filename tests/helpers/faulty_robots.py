@@ -175,6 +175,9 @@ MESHES: dict[str, Callable[[Path], Robot]] = {
     "mesh-unresolved": lambda folder: _mesh(folder / "nowhere.stl"),
     "mesh-unreadable": lambda folder: _mesh(_text(folder / "empty.obj", "v 0 0 0\n")),
     "mesh-flat": lambda folder: _mesh(_triangle(folder / "triangle.stl")),
+    "mesh-left-out": lambda folder: _mesh(
+        _text(folder / "lines.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nl 1 2\nf 1 2 3\nf 1 2 4\n")
+    ),
     "mesh-huge": lambda folder: _mesh(_ball(folder / "ball.stl", subdivisions=4)),
     "mesh-scale-invalid": lambda folder: _mesh(_ball(folder / "ball.stl"), (1.0, 0.0, 1.0)),
     "mesh-mirrored": lambda folder: _mesh(_ball(folder / "ball.stl"), (1.0, -1.0, 1.0)),

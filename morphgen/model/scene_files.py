@@ -1,0 +1,540 @@
+"""Read the scenes of COLLADA and glTF files from untrusted sources.
+
+COLLADA files declare two properties of their coordinates, and robot descriptions rely on the first:
+
+* ``<unit meter="...">`` is applied. All seven visuals of the KUKA KR210 are in inches by that
+  element, and only with it do they match the same links' collision STLs (mean overlap of the
+  bounding boxes 0.98, without it 0.00).
+* ``<up_axis>`` is ignored. Every file of rtb-data and example-robot-data that declares ``Y_UP`` and
+  can be compared with another mesh of the same part matches it without a rotation: PR2 (14 visuals
+  against collision STLs, mean overlap 0.94, rotated to z up 0.41), Kinova (7 against STLs, equal
+  bounds), Robotiq 2F-85 (3 against ``Z_UP`` files, equal bounds), Baxter's torso (0.99, rotated
+  0.14). None matches better when rotated. RViz, Pinocchio and PyBullet ignore the element too. For
+  the same reason, glTF files are not rotated from y up.
+
+trimesh applies neither; it applies the transforms of the scene graph, as does this module.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import json
+import re
+import struct
+from collections import Counter
+from functools import partial
+from typing import Any
+
+import numpy as np
+import trimesh
+from lxml import etree
+
+from morphgen.model.mesh_pieces import (
+    MAX_FILE_SIZE,
+    UNREADABLE,
+    FolderResolver,
+    Piece,
+    count_triangles,
+    note_missing,
+    parse_numbers,
+    require_faces,
+    require_sets,
+    scene_pieces,
+)
+
+_MAX_NODES = 20_000
+"""Number of nodes of the largest scene that is read, every instance counted."""
+_MAX_DEPTH = 100
+"""Largest nesting depth of nodes in a scene."""
+_MAX_MARKUP = 500_000
+"""Number of elements and attributes, or of JSON values, in the largest scene that is read."""
+
+
+_COMPONENT_SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+_ACCESSOR_SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_ATTRIBUTES = ("POSITION", "TEXCOORD_0", "COLOR_0")
+"""Attributes of a glTF primitive that are read."""
+_HARMLESS_EXTENSIONS = re.compile(r"KHR_(materials|texture|lights)_\w+|EXT_texture_\w+|KHR_xmp\w*")
+"""Extensions of glTF that do not change triangles."""
+_GLTF_MODES = {0: "point sets", 1: "line sets", 2: "line loops", 3: "line strips", 6: "fans"}
+
+
+def read_glb(data: bytes, files: FolderResolver) -> list[Piece]:
+    """Read a binary glTF file as ``read_gltf`` reads a document.
+
+    Raises:
+        ValueError: As ``read_gltf``, or if the chunks are malformed.
+    """
+    if len(data) < 20 or data[:4] != b"glTF":
+        raise ValueError("does not begin as a binary glTF file")
+    version, size, length = struct.unpack_from("<III", data, 4)
+    if version != 2:
+        raise ValueError(f"glTF version {version}; expected 2")
+    if size > len(data) or 20 + length > len(data):
+        raise ValueError(f"its header counts {size} bytes, it has {len(data)}: it is truncated")
+    binary = None
+    start = 20 + length
+    while binary is None and len(data) - start >= 8:
+        chunk, kind = struct.unpack_from("<I4s", data, start)
+        binary = data[start + 8 : start + 8 + chunk] if kind == b"BIN\0" else None
+        start += 8 + chunk
+    return read_gltf(data[20 : 20 + length], files, binary)
+
+
+def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -> list[Piece]:
+    """Read a glTF document by trimesh, reduced to triangles whose bytes exist.
+
+    Args:
+        text: The document.
+        files: The files that it may name.
+        binary: The bytes of the buffer without a file, in a binary glTF file.
+
+    Raises:
+        ValueError: If a count exceeds its bytes or a bound, or something required is not read.
+    """
+    if sum(text.count(mark) for mark in b",:[{") > _MAX_MARKUP:
+        raise ValueError(f"more than {_MAX_MARKUP} JSON values")
+    document = json.loads(text)
+    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
+        raise ValueError("does not contain a glTF document")
+    for name in ("accessors", "bufferViews", "buffers", "images", "materials", "meshes", "nodes"):
+        entries = document.setdefault(name, [])
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise ValueError(f"its {name!r} are not a list of objects")
+    required = [str(name) for name in document.get("extensionsRequired", ())]
+    unread = [name for name in required if not _HARMLESS_EXTENSIONS.fullmatch(name)]
+    if unread:
+        raise ValueError(f"it requires the extension {', '.join(unread)}, which is not read")
+    buffers = _gltf_buffers(document, files, binary)
+    views = [_gltf_view(view, buffers) for view in document["bufferViews"]]
+    if sum(map(len, views)) > 2 * MAX_FILE_SIZE:
+        raise ValueError("its buffer views overlap, more than twice the largest file")
+    _gltf_primitives(document, views, files)
+    _gltf_textures(document, views, files)
+    triangles, pieces = _gltf_nodes(document, files)
+    require_faces(triangles)
+    require_sets(pieces)
+    if not triangles:
+        raise ValueError("its scene holds no triangle")
+    scene = trimesh.load_scene(
+        io.BytesIO(json.dumps(document).encode()), file_type="gltf", process=False, resolver=files
+    )
+    read = scene_pieces(scene)
+    note_missing(files, triangles, read)
+    return read
+
+
+def _gltf_buffers(
+    document: dict[str, Any], files: FolderResolver, binary: bytes | None
+) -> list[memoryview]:
+    """Read every buffer once; the document then names them by their index."""
+    buffers = []
+    for i, buffer in enumerate(document["buffers"]):
+        uri = buffer.get("uri")
+        if uri is None:
+            if binary is None or i:
+                raise ValueError(f"buffer {i} has no bytes")
+            content = binary
+        else:
+            content = _uri_bytes(str(uri), files)
+        if buffer["byteLength"] > len(content):
+            raise ValueError(
+                f"buffer {i} counts {buffer['byteLength']} bytes, and has {len(content)}: it is "
+                "truncated"
+            )
+        buffer["uri"] = f"buffer {i}"
+        files.written[buffer["uri"]] = content
+        buffers.append(memoryview(content))
+    return buffers
+
+
+def _uri_bytes(uri: str, files: FolderResolver) -> bytes:
+    if not uri.startswith("data:"):
+        return files.get(uri)
+    try:
+        return base64.b64decode(uri.partition(",")[2])
+    except binascii.Error as error:
+        raise ValueError(f"data URI: {error}") from error
+
+
+def _gltf_view(view: dict[str, Any], buffers: list[memoryview]) -> memoryview:
+    buffer = buffers[_index(view["buffer"], buffers, "buffer")]
+    start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
+    if start + length > len(buffer):
+        raise ValueError(f"a view ends at byte {start + length} of a buffer of {len(buffer)}")
+    return buffer[start : start + length]
+
+
+def _natural(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"{value!r} is not a count; expected a whole number from 0")
+    return value
+
+
+def _index(value: object, entries: list[Any], name: str) -> int:
+    index = _natural(value)
+    if index >= len(entries):
+        raise ValueError(f"{name} {index}; the file has {len(entries)}")
+    return index
+
+
+def _gltf_primitives(
+    document: dict[str, Any], views: list[memoryview], files: FolderResolver
+) -> None:
+    """Reduce meshes to triangles and what colours them, and require the bytes of both."""
+    accessors = document["accessors"]
+    used: set[int] = set()
+    for mesh in document["meshes"]:
+        lost = [_GLTF_MODES[p["mode"]] for p in mesh["primitives"] if p.get("mode") in _GLTF_MODES]
+        files.left_out += [f"{kind} of a mesh" for kind in lost]
+        if any(mesh.get("weights", ())):
+            files.left_out.append("the default weights of morph targets")
+        primitives = [p for p in mesh["primitives"] if p.get("mode", 4) in (4, 5)]
+        for primitive in primitives:
+            attributes = primitive["attributes"]
+            kept = {name: attributes[name] for name in _ATTRIBUTES if name in attributes}
+            indices = [*kept.values(), *([primitive["indices"]] if "indices" in primitive else [])]
+            used.update(_index(index, accessors, "accessor") for index in indices)
+            if accessors[kept["POSITION"]].get("normalized"):
+                raise ValueError("its vertices are normalised integers, which are not read")
+            primitive["attributes"] = kept
+            for key in ("targets", "extensions"):
+                primitive.pop(key, None)
+        mesh.clear()
+        mesh["primitives"] = primitives
+    total = 0
+    for i, accessor in enumerate(accessors):
+        if i in used:
+            total += _require_accessor(i, accessor, document["bufferViews"], views)
+        else:
+            accessor.clear()
+            accessor.update(componentType=5121, type="SCALAR", count=0)
+    if total > 2 * MAX_FILE_SIZE:
+        raise ValueError(f"its accessors hold {total} bytes; at most {2 * MAX_FILE_SIZE} are read")
+
+
+def _require_accessor(
+    i: int, accessor: dict[str, Any], descriptions: list[Any], views: list[memoryview]
+) -> int:
+    """Return an accessor's bytes; raise ValueError if its view has fewer."""
+    if "bufferView" not in accessor or "sparse" in accessor:
+        kind = "sparse" if "sparse" in accessor else "without a buffer view"
+        raise ValueError(f"accessor {i} is {kind}; expected all of its entries in a buffer")
+    view = _index(accessor["bufferView"], views, "buffer view")
+    count, start = _natural(accessor["count"]), _natural(accessor.get("byteOffset", 0))
+    row = _COMPONENT_SIZES[accessor["componentType"]] * _ACCESSOR_SIZES[accessor["type"]]
+    stride = _natural(descriptions[view].get("byteStride", row))
+    if count and start + (count - 1) * stride + row > len(views[view]):
+        raise ValueError(
+            f"accessor {i} counts {count} entries of {row} bytes; its buffer view has "
+            f"{len(views[view])} bytes"
+        )
+    if "byteStride" in descriptions[view] and stride < row:
+        raise ValueError(f"buffer view {view} has a stride of {stride} bytes for rows of {row}")
+    return count * row
+
+
+def _gltf_textures(
+    document: dict[str, Any], views: list[memoryview], files: FolderResolver
+) -> None:
+    """Keep the pictures of base colours that can be read."""
+    images = document["images"]
+    textures = document.get("textures", [])
+    used: Counter[int] = Counter()
+    for material in document["materials"]:
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
+        if texture is not None:
+            texture = textures[_index(texture, textures, "texture")]
+            webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
+            used[_index(texture.get("source", webp), images, "image")] += 1
+
+    def content(image: dict[str, Any]) -> bytes:
+        if "bufferView" in image:
+            return bytes(views[_index(image["bufferView"], views, "buffer view")])
+        return _uri_bytes(str(image["uri"]), files)
+
+    for i, image in enumerate(images):
+        name = str(image.get("name", image.get("uri", i)))[:100]
+        uses = (files.has_picture(name, partial(content, image)) for _ in range(used[i]))
+        if not used[i] or not all(uses):
+            image.clear()
+
+
+def _gltf_nodes(document: dict[str, Any], files: FolderResolver) -> tuple[int, int]:
+    """Return the numbers of triangles and of their sets in the scene, every instance counted."""
+    nodes, meshes, accessors = (document[name] for name in ("nodes", "meshes", "accessors"))
+    sizes = []
+    for mesh in meshes:
+        counts = [
+            accessors[p.get("indices", p["attributes"]["POSITION"])]["count"] - 2 * (mode == 5)
+            for p in mesh["primitives"]
+            for mode in [p.get("mode", 4)]
+        ]
+        modes = [p.get("mode", 4) for p in mesh["primitives"]]
+        triangles = sum(max(n, 0) if m == 5 else n // 3 for n, m in zip(counts, modes, strict=True))
+        sizes.append((triangles, len(counts)))
+    scenes = document.get("scenes", [])
+    stack = []
+    if scenes:
+        roots = scenes[_index(document.get("scene", 0), scenes, "scene")].get("nodes", [])
+        stack = [(_index(node, nodes, "node"), 0) for node in roots]
+    visited: set[int] = set()
+    triangles = pieces = 0
+    placed: set[int] = set()
+    while stack:
+        index, depth = stack.pop()
+        if index in visited:
+            raise ValueError(f"node {index} has two parents or contains itself")
+        if depth > _MAX_DEPTH or len(visited) > _MAX_NODES:
+            raise ValueError(f"more than {_MAX_NODES} nodes, or {_MAX_DEPTH} levels of them")
+        visited.add(index)
+        node = nodes[index]
+        node.pop("camera", None)
+        node.pop("extras", None)
+        if "EXT_mesh_gpu_instancing" in node.pop("extensions", {}):
+            files.left_out.append("instances by EXT_mesh_gpu_instancing")
+        if "skin" in node:
+            files.left_out.append("a skin, whose mesh is drawn as it lies in the file")
+        if "mesh" in node:
+            mesh = _index(node["mesh"], meshes, "mesh")
+            placed.add(mesh)
+            triangles += sizes[mesh][0]
+            pieces += sizes[mesh][1]
+        stack += [(_index(child, nodes, "node"), depth + 1) for child in node.get("children", [])]
+    if unplaced := len(meshes) - len(placed):
+        files.left_out.append(f"{unplaced} meshes that its scene does not place")
+    return triangles, pieces
+
+
+_XML_ENCODINGS = ("ascii", "iso-8859-1", "latin1", "us-ascii", "utf-8", "utf8", "windows-1252")
+_COLLADA_PARTS = {
+    *("asset", "scene", "library_effects", "library_geometries", "library_images"),
+    *("library_materials", "library_nodes", "library_visual_scenes"),
+}
+_COLLADA_PRIMITIVES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
+_COLLADA_LOST = {
+    "lines": "line sets",
+    "linestrips": "line strips",
+    "convex_mesh": "convex meshes",
+    "spline": "splines",
+    "ph": "polygons with holes",
+}
+
+
+def read_dae(data: bytes, files: FolderResolver) -> list[Piece]:
+    """Read a COLLADA file by trimesh, with skins as plain geometries and readable textures only.
+
+    Raises:
+        ValueError: If a count exceeds a bound, or the scene holds no triangle.
+    """
+    root = _collada(data)
+    _place_skins(root, files)
+    for element in [*root]:
+        if _tag(element) not in _COLLADA_PARTS:
+            root.remove(element)
+    for tag in ("extra", "instance_camera", "instance_light", "Name_array", "IDREF_array"):
+        _remove(root, tag)
+    for tag, meaning in _COLLADA_LOST.items():
+        if count := _remove(root, tag):
+            files.left_out.append(f"{count} {meaning}")
+    _check_textures(root, files)
+    triangles = _collada_triangles(root, files)
+    if not triangles:
+        raise ValueError("its scene holds no triangle")
+    try:
+        pieces = _collada_pieces(root, files)
+    except UNREADABLE:
+        pieces = []
+    if count_triangles(pieces) < triangles and _remove(root, "bind_material"):
+        # pycollada drops a geometry whose material is broken.
+        plain = _collada_pieces(root, files)
+        if count_triangles(plain) > count_triangles(pieces):
+            files.left_out.append("materials, of which one is broken")
+            pieces = plain
+    note_missing(files, triangles, pieces)
+    return pieces
+
+
+def _collada_pieces(root: etree._Element, files: FolderResolver) -> list[Piece]:
+    document = io.BytesIO(etree.tostring(root))
+    return scene_pieces(
+        trimesh.load_scene(document, file_type="dae", process=False, resolver=files)
+    )
+
+
+def _collada(data: bytes) -> etree._Element:
+    # An encoding such as UTF-7 could hide a DOCTYPE or millions of elements.
+    declared = re.match(rb"""[^<]*<\?xml[^>]*encoding\s*=\s*["']([^"'>]*)""", data[:1000])
+    encoding = declared[1].decode("latin-1").lower() if declared else "utf-8"
+    if encoding not in _XML_ENCODINGS or b"\0" in data:
+        raise ValueError(f"encoding {encoding!r} or zero bytes; expected UTF-8")
+    # Without a DOCTYPE no entity can be defined.
+    if b"<!DOCTYPE" in data:
+        raise ValueError("has a DOCTYPE; a mesh needs none, remove it")
+    if data.count(b"<") + data.count(b"=") > _MAX_MARKUP:
+        raise ValueError(f"more than {_MAX_MARKUP} elements and attributes")
+    # huge_tree, because coordinate arrays exceed libxml2's default limit on text.
+    parser = etree.XMLParser(
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        huge_tree=True,
+        remove_comments=True,
+        remove_pis=True,
+    )
+    return etree.fromstring(data, parser)
+
+
+def _tag(element: etree._Element) -> str:
+    return etree.QName(element).localname
+
+
+def _remove(root: etree._Element, tag: str) -> int:
+    elements = [*root.iter(f"{{*}}{tag}")]
+    for element in elements:
+        parent = element.getparent()
+        if parent is not None:
+            parent.remove(element)
+    return len(elements)
+
+
+def _place_skins(root: etree._Element, files: FolderResolver) -> None:
+    """Replace every instance of a controller by one of the geometry that it deforms, at rest."""
+    controllers = {f"#{c.get('id')}": c for c in root.iter("{*}controller")}
+    for instance in [*root.iter("{*}instance_controller")]:
+        url = instance.get("url", "")
+        matrix = np.eye(4)
+        visited = set()
+        while url in controllers and url not in visited:
+            visited.add(url)
+            deformer = next(controllers[url].iterchildren("{*}skin", "{*}morph"), None)
+            if deformer is None:
+                break
+            bind = deformer.findtext("{*}bind_shape_matrix")
+            if bind and _tag(deformer) == "skin":
+                matrix = matrix @ parse_numbers(bind).reshape(4, 4)
+            kind = "a skin" if _tag(deformer) == "skin" else "morph targets"
+            files.left_out.append(f"{kind}, whose mesh is drawn at rest")
+            url = deformer.get("source", "")
+        namespace = etree.QName(instance).namespace
+        prefix = f"{{{namespace}}}" if namespace else ""
+        node = etree.Element(f"{prefix}node")
+        etree.SubElement(node, f"{prefix}matrix").text = " ".join(
+            map(repr, matrix.ravel().tolist())
+        )
+        geometry = etree.SubElement(node, f"{prefix}instance_geometry", url=url)
+        geometry.extend(instance.findall("{*}bind_material"))
+        parent = instance.getparent()
+        if parent is not None:
+            parent.replace(instance, node)
+
+
+def _check_textures(root: etree._Element, files: FolderResolver) -> None:
+    """Let materials whose diffuse texture cannot be read have no colour."""
+    images = {i.get("id"): (i.findtext(".//{*}init_from") or "") for i in root.iter("{*}image")}
+    broken = set()
+    for effect in root.iter("{*}effect"):
+        texture = effect.find(".//{*}diffuse/{*}texture")
+        if texture is None:
+            continue
+        params = {
+            param.get("sid"): (
+                param.findtext("{*}surface/{*}init_from")
+                or param.findtext("{*}sampler2D/{*}source")
+                or ""
+            ).strip()
+            for param in effect.iter("{*}newparam")
+        }
+        name = texture.get("texture", "")
+        for _ in range(2):
+            name = params.get(name, name)
+        file = images.get(name, "").strip()
+        if name not in images:
+            files.left_out.append(f"texture {name!r}, which the file does not define")
+        if name not in images or not files.has_picture(file):
+            broken.add(f"#{effect.get('id')}")
+    faulty = {
+        f"#{material.get('id')}"
+        for material in root.iter("{*}material")
+        for instance in material.iterchildren("{*}instance_effect")
+        if instance.get("url") in broken
+    }
+    for binding in [*root.iter("{*}instance_material")]:
+        parent = binding.getparent()
+        if binding.get("target") in faulty and parent is not None:
+            parent.remove(binding)
+
+
+def _shown_scenes(root: etree._Element, files: FolderResolver) -> list[etree._Element]:
+    shown = {instance.get("url") for instance in root.iter("{*}instance_visual_scene")}
+    scenes = [*root.iter("{*}visual_scene")]
+    hidden = [scene for scene in scenes if shown and f"#{scene.get('id')}" not in shown]
+    files.left_out += ["a scene that is not shown"] * len(hidden)
+    return [scene for scene in scenes if scene not in hidden]
+
+
+def _collada_triangles(root: etree._Element, files: FolderResolver) -> int:
+    """Return the number of triangles in the scene, counted as by a reader that copies instances."""
+    sizes = {
+        f"#{geometry.get('id')}": sum(
+            map(_primitive_size, geometry.iter(*_PRIMITIVE_TAGS)), Counter()
+        )
+        for geometry in root.iter("{*}geometry")
+    }
+    nodes = {f"#{node.get('id')}": node for node in root.iter("{*}node")}
+    lost: Counter[str] = Counter()
+
+    def below(node: etree._Element, depth: int) -> Counter[str]:
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"its nodes are nested deeper than {_MAX_DEPTH} levels")
+        total = Counter(nodes=1)
+        for child in node.iterchildren("{*}node", "{*}instance_node", "{*}instance_geometry"):
+            url = child.get("url", "")
+            if _tag(child) == "node":
+                total += below(child, depth + 1)
+            elif url in nodes and _tag(child) == "instance_node":
+                if url not in sizes:
+                    sizes[url] = below(nodes[url], depth + 1)
+                total += sizes[url]
+            else:
+                total += sizes.get(url, Counter())
+                lost[url] += url not in sizes
+        return total
+
+    total: Counter[str] = Counter()
+    for scene in _shown_scenes(root, files):
+        for node in scene.iterchildren("{*}node"):
+            total += below(node, 0)
+    if total["nodes"] > _MAX_NODES:
+        raise ValueError(f"its scene has {total['nodes']} nodes; at most {_MAX_NODES} are read")
+    require_faces(total["triangles"])
+    require_sets(total["sets"])
+    files.left_out += [
+        f"{count} instances of {url!r}, which the file does not define"
+        for url, count in lost.items()
+        if count
+    ]
+    return total["triangles"]
+
+
+_PRIMITIVE_TAGS = tuple(f"{{*}}{tag}" for tag in _COLLADA_PRIMITIVES)
+
+
+def _primitive_size(primitive: etree._Element) -> Counter[str]:
+    """Return the number of triangles of a primitive, and 1 as the number of their sets."""
+    offsets = [int(i.get("offset", "0")) for i in primitive.iterchildren("{*}input")]
+    width = max(offsets, default=0) + 1
+    tag = _tag(primitive)
+    if tag == "polylist":
+        corners = parse_numbers(primitive.findtext("{*}vcount") or "", np.int32)
+        if (corners < 0).any():
+            raise ValueError("a polygon with a negative number of corners")
+        total = int(np.maximum(corners.astype(np.int64) - 2, 0).sum())
+        return Counter(triangles=total, sets=1)
+    total = 0
+    for indices in primitive.iterchildren("{*}p"):
+        count = len(parse_numbers(indices.text or "", np.int32)) // width
+        total += count // 3 if tag == "triangles" else max(count - 2, 0)
+    return Counter(triangles=total, sets=1)
