@@ -123,8 +123,10 @@ def _ascii_stl(data: bytes) -> Array:
     text = data.lower()
     require_faces(text.count(b"endloop"))
     vertices = re.findall(rb"\bvertex((?:\s+[-+.\dein]\S*){3})", text)
-    facets, ends = len(re.findall(rb"\bfacet\s+normal\b", text)), text.count(b"endloop")
-    if facets != ends or len(vertices) != 3 * ends:
+    facets, ends = len(re.findall(rb"\bouter\s+loop\b", text)), text.count(b"endloop")
+    rest = text[text.rfind(b"endloop") :].replace(b"endfacet", b"")
+    is_cut = b"facet" in rest and b"endsolid" not in rest
+    if is_cut or facets != ends or len(vertices) != 3 * ends:
         raise ValueError(
             f"{len(vertices)} vertices in {facets} facets, {ends} of which end; expected 3 each: "
             "it is truncated or malformed"

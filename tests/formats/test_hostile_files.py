@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -184,7 +185,9 @@ def test_an_obj_reads_materials_from_its_own_folder_only(library, tmp_path, caps
     path = tmp_path / "x.urdf"
     path.write_text(MESH.format("m.obj"))
     assert main(["check", str(path)]) == 0
-    assert "mesh" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert re.findall("(?:warning|error) mesh[^:]*", printed) == ["warning mesh-left-out at link a"]
+    assert f"material file {library!r}: " in printed
 
 
 def test_files_that_are_not_regular_are_not_opened(tmp_path, capsys):

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from tests.helpers.faulty_robots import with_shape
-from tests.model.test_mesh import DAE
 
+from helpers.collada import DAE
+from helpers.faulty_robots import with_shape
 from morphgen.checks import check
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh
