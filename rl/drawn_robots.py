@@ -14,10 +14,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from morphgen.benchmark.robot_factory import RobotFactory, SampledRecipe, members, numbered_name
 from morphgen.benchmark.robot_hash import digest
-from morphgen.benchmark.split import Member
-from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.split import Member, Split
+from morphgen.benchmark.split_file import read_split, split_names, split_text
 from morphgen.benchmark.token_layout import LARGEST_MAX_LINKS
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.data_files import read_json
@@ -42,6 +44,10 @@ MIN_DRAWS = 20
 ROBOTS_PER_JOB = 16
 """Robots that a process draws before it reports; a process takes seconds to start, an arm3 with its
 goals 0.06 s."""
+MAX_FRESH = 10
+"""Most robots of a grammar that are drawn to evaluate on."""
+_FRESH = 0xF4E54
+"""Mixed into the seed of robots to evaluate on, which thus are others than those to train on."""
 HELD_OUT, DRAWN_BEFORE, UNFIT = "held out", "drawn before", "without goals"
 """Reasons for skipping a robot."""
 
@@ -166,6 +172,52 @@ _MAX_DRAWN = 8
 """Largest number of sources whose robots are kept."""
 
 
+def fresh_source(
+    folder: Path,
+    source: RobotSource,
+    config: GoalConfig,
+    seed: int,
+    *,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> tuple[RobotSource, str]:
+    """Draw robots to evaluate a run of drawn robots on, other ones than it was trained on.
+
+    Args:
+        folder: Folder of the run, with its list of robots.
+        source: Grammars of the run, with the number of robots of each; at most ``MAX_FRESH`` of
+            each are drawn.
+        config: Constants of the tasks.
+        seed: Seed of the evaluation, from which that of the robots follows.
+        jobs: Number of processes.
+        progress: Called with the number of robots that are ready, and their total.
+
+    Returns:
+        The robots as the test side of a split, and a line that describes them.
+
+    Raises:
+        TaskError: If the run has no list of its robots, or too few others can be drawn.
+        MorphgenError: As ``draw``.
+    """
+    trained = read_drawn(folder)
+    draw_seed = int(np.random.SeedSequence([_FRESH, source.draw_seed, seed]).generate_state(1)[0])
+    counts = tuple((name, min(count, MAX_FRESH)) for name, count in source.grammars)
+    fresh = replace(source, grammars=counts, draw_seed=draw_seed, drawn_hash="")
+    hashes = frozenset(member.robot_hash for member in trained)
+    robots = _draw_all(fresh, config, jobs, progress, hashes)
+    request = ",".join(f"{Path(name).stem}:{count}" for name, count in counts)
+    line = f"fresh robots {request}, drawn with seed {draw_seed}, hash {robots.hash}"
+    split = Split("fresh", "interpolation", line, trained, robots.members)
+    text = split_text(split)
+    return RobotSource(
+        "fresh",
+        text,
+        side="test",
+        goal_seed=source.goal_seed,
+        library=source.library,
+    ), line
+
+
 def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
     """Write the list of drawn robots into the folder of a run; the same robots give the same bytes.
 
@@ -251,8 +303,13 @@ def _held_out(source: RobotSource) -> tuple[str, ...]:
 
 
 def _draw_all(
-    source: RobotSource, config: GoalConfig, jobs: int, progress: Progress
+    source: RobotSource,
+    config: GoalConfig,
+    jobs: int,
+    progress: Progress,
+    others: frozenset[str] = frozenset(),
 ) -> DrawnRobots:
+    """Draw the robots of a source, without those of test sides and those with other hashes."""
     library = default_library(tuple(map(Path, source.library)))
     held_out, total = _held_out(source), num_drawn(source)
     drawer = _Drawer(
@@ -260,7 +317,7 @@ def _draw_all(
         replace(config, seed=source.goal_seed),
         str(source.task),
         source.obstacles,
-        frozenset(held_out),
+        others | frozenset(held_out),
     )
     kept: dict[str, _Draw] = {}
     skipped: Counter[str] = Counter()

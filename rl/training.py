@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
@@ -56,6 +61,8 @@ class ExecutionConfig:
     """Write TensorBoard events."""
     wandb: bool = False
     """Send metrics to Weights & Biases."""
+    minutes: int | None = None
+    """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -113,9 +120,11 @@ def train(
 ) -> list[Subrun]:
     """Train all parts of a run to their end; see ``subruns_of``.
 
-    Training may be interrupted or killed at any time. A resumed run continues from its last
-    checkpoint and ends with the same weights as an uninterrupted one. Nothing is written before all
-    robots and networks are built.
+    Training may be interrupted or killed at any time. SIGINT, SIGTERM and the end of
+    ``ExecutionConfig.minutes`` let the running update end and write a checkpoint; a second signal
+    acts at once. A resumed run continues from its last checkpoint. One that was killed ends with
+    the same weights as an uninterrupted one; one that was stopped does not, since all its episodes
+    begin anew at another update. Nothing is written before all robots and networks are built.
 
     Args:
         folder: Folder of the run.
@@ -127,13 +136,14 @@ def train(
         hold: Context manager that locks the folder against other runs.
 
     Returns:
-        The trained parts; none in processes of ``torchrun`` other than the first, which alone
-        writes files.
+        The parts, of which the last are unfinished or not begun after ``minutes``; none in
+        processes of ``torchrun`` other than the first, which alone writes files.
 
     Raises:
         TaskError: If the folder has another run, or a metric is not finite.
         FormatError: If another process writes to the folder.
         MorphgenError: If a robot or simulator cannot be built.
+        KeyboardInterrupt: If it was stopped by SIGINT.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
@@ -142,7 +152,7 @@ def train(
     unfinished = [part for part in parts if not is_done(part)]
     if unfinished:  # a finished run is evaluated on machines without its GPU
         require_device(config.device)
-    with ExitStack() as held:
+    with _StopRequest(execution.minutes) as stop, ExitStack() as held:
         processes, device = held.enter_context(process_group(config.device))
         holds = False
         for part in unfinished:
@@ -158,7 +168,8 @@ def train(
             )
             with _learner(part, batches, processes, device) as learner:
                 if not processes.is_first:
-                    _learn(learner, batches, part, None, None)
+                    if _learn(learner, batches, part, None, None, stop):
+                        break
                     continue
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)
@@ -168,7 +179,8 @@ def train(
                 open_run(part.folder, part.config, resume=True)
                 if batches.drawn is not None:
                     write_drawn(part.folder, part.config.source, batches.drawn)
-                _learn(learner, batches, part, execution, show(part) if show else None)
+                if _learn(learner, batches, part, execution, show(part) if show else None, stop):
+                    break
     return parts if processes.is_first else []
 
 
@@ -282,7 +294,8 @@ def _learn(
     part: Subrun,
     execution: ExecutionConfig | None,
     show: ShowMetrics | None,
-) -> None:
+    stop: _StopRequest,
+) -> bool:
     """Make the remaining updates of a part; record their metrics and write its checkpoints.
 
     Args:
@@ -291,7 +304,12 @@ def _learn(
         part: The part.
         execution: How the run is executed; None in a process that writes no files.
         show: Called after every update.
+        stop: Request to stop before the last update.
+
+    Returns:
+        Whether it has stopped early.
     """
+    is_stopped = False
     interval = updates_between(part.config)
     with ExitStack() as stack:
         recorders: Sequence[Recorder] = ()
@@ -305,7 +323,7 @@ def _learn(
                     wandb=execution.wandb,
                 )
             )
-        while not learner.done:
+        while not learner.done and not is_stopped:
             metrics = learner.iterate()
             scores = batches.recorded_scores(metrics.scores, learner.update)
             metrics = replace(metrics, scores=scores)
@@ -315,7 +333,9 @@ def _learn(
                 use_batch(learner, batches.make(learner.update))
             # A checkpoint has the state of the batch that the run continues with.
             left = learner.num_updates - learner.update
-            if not left or (learner.update % interval == 0 and left >= interval):
+            is_stopped = any(learner.processes.gather(stop.is_requested)) and left > 0
+            is_due = learner.update % interval == 0 and left >= interval
+            if not left or is_due or is_stopped:
                 state = state_of(learner)  # of all processes
                 if execution is not None:
                     write_checkpoint(part.folder, part.config, state)
@@ -323,3 +343,49 @@ def _learn(
                 learner.restart_episodes()
             if show:
                 show(metrics, learner.num_updates)
+    return is_stopped
+
+
+class _StopRequest:
+    """Asks training to stop after the running update: by a signal, or because its time is over.
+
+    In this block the first SIGINT or SIGTERM waits for the end of the update, and acts at the end
+    of the block; the next one acts at once.
+    """
+
+    def __init__(self, minutes: int | None) -> None:
+        """Begin to count the minutes, if there is a limit."""
+        self._end = math.inf if minutes is None else time.monotonic() + 60 * minutes
+        self._received: list[int] = []
+        self._handlers: dict[int, Any] = {}
+
+    @property
+    def is_requested(self) -> bool:
+        return bool(self._received) or time.monotonic() >= self._end
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+            # Workers ignore Ctrl-C; handlers of other languages are unknown, and stay.
+            self._handlers = {
+                n: handler
+                for n, handler in handlers.items()
+                if handler not in (None, signal.SIG_IGN)
+            }
+            for number in self._handlers:
+                signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._restore()
+        if self._received and kind is None:
+            signal.raise_signal(self._received[0])
+
+    def _note(self, number: int, _: object) -> None:
+        self._received.append(number)
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
     from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.robot_source import RobotSource
+    from morphgen.rl.runs import RunConfig
     from morphgen.rl.scores import Score
     from morphgen.tasks.task import TaskConfig
 
@@ -177,7 +178,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
         run = read_config(path)
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
-    sources = _sources(args) if args.words else [run.source]
+    given = _given_robots(args, run, files[0].parent, config, display)
+    sources = given or [run.source]
     require_trained_tasks(run, sources, args.checkpoint)
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
@@ -193,14 +195,14 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
     record = plan.record if plan else no_record
-    _prepare(sources if args.words else _sources_of(run.source, sides), config, display)
+    _prepare(given or _sources_of(run.source, sides), config, display)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
         _warn_of_drawn(files[0].parent, sources)
     for mode in (args.mode,) if args.mode else MODES:
         scores = results[mode] = []
-        if args.words:
-            for source in sources:
+        if given:
+            for source in given:
                 progress = display.evaluation(f"{mode} on {source.side}")
                 scores += evaluate_checkpoints(
                     files,
@@ -220,6 +222,38 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     if plan:
         plan.write()
     return results
+
+
+def _given_robots(
+    args: argparse.Namespace,
+    run: RunConfig,
+    folder: Path,
+    config: EvalConfig,
+    display: TrainingProgress,
+) -> list[RobotSource]:
+    """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
+    from morphgen.rl.drawn_robots import fresh_source
+    from morphgen.tasks.env_specs import GoalConfig
+
+    if args.words:
+        return _sources(args)
+    if not run.source.grammars:
+        return []
+    if args.on == "train":
+        raise TaskError(
+            f"--on train: {run.source.name} has no split; its policy is scored on fresh robots"
+        )
+    tasks = _with_goal(config.tasks, [run.source], args)
+    fresh, line = fresh_source(
+        folder,
+        run.source,
+        GoalConfig(tasks=tasks),
+        args.seed,
+        jobs=args.workers,
+        progress=display.goal_sets,
+    )
+    print(f"morphgen: {line}", file=sys.stderr)
+    return [fresh]
 
 
 def _simulator(args: argparse.Namespace) -> str | None:

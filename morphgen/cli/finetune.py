@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli import options as opt
 from morphgen.cli.agent_options import on_off
 from morphgen.cli.command import command, option, path_option
-from morphgen.cli.train import NETWORK_SWITCHES, RESUME, learning_options, run_training
+from morphgen.cli.train import MINUTES, NETWORK_SWITCHES, RESUME, learning_options, run_training
 from morphgen.cli.training_robots import (
     GOAL_SEED,
     SIDES,
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
     ),
     RESUME,
+    MINUTES,
     *(
         on_off(name, f"{help} (default: as the checkpoint's run)")
         for name, help in NETWORK_SWITCHES.items()

@@ -107,6 +107,9 @@ TRAINING_OPTIONS = (
 )
 """Options of the commands that train from random weights."""
 RESUME = flag("--resume", "continue the run in the output folder")
+MINUTES = number(
+    "--minutes", "stop with a checkpoint after the update in which so many minutes are over"
+)
 
 
 @command(
@@ -121,12 +124,13 @@ RESUME = flag("--resume", "continue the run in the output folder")
     opt.OBSTACLES,
     path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
     RESUME,
+    MINUTES,
     *DRAWN_OPTIONS,
     *AGENT_OPTIONS,
     *TRAINING_OPTIONS,
     opt.LIBRARY,
-    details="The algorithm is PPO. The policy is written to the run folder. With --resume, an "
-    "interrupted run continues and ends with the same weights.",
+    details="The algorithm is PPO. The policy is written to the run folder. Ctrl-C, SIGTERM and "
+    "--minutes stop after the running update, with a checkpoint; --resume continues from there.",
     examples=(
         "train interpolation/arm3/reach --agent me-tf --sim mujoco",
         "train arm=ur5 ee=stick task=reach --agent se",
@@ -161,7 +165,7 @@ def train(args: argparse.Namespace) -> None:
 def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
     """Train in a folder with a progress bar, and print the paths of the checkpoints."""
     from morphgen.rl.runs import CHECKPOINT
-    from morphgen.rl.training import train
+    from morphgen.rl.training import is_done, train
 
     with training_progress() as show:
         execution = execution_config(args)
@@ -176,9 +180,16 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
             prepare=show.goal_sets,
         )
     for subrun in subruns:
-        print(subrun.folder / CHECKPOINT)
+        if (subrun.folder / CHECKPOINT).is_file():
+            print(subrun.folder / CHECKPOINT)
     if subruns:  # of the processes of torchrun, the first one says it
-        print(_next_command(folder, config), file=sys.stderr)
+        left = sum(not is_done(subrun) for subrun in subruns)
+        if left:
+            what = f" with {left} of {len(subruns)} robots left" * (len(subruns) > 1)
+            text = f"stopped after {args.minutes} minutes{what}; it continues with --resume"
+        else:
+            text = _next_command(folder, config)
+        print(text, file=sys.stderr)
 
 
 def _next_command(folder: Path, config: RunConfig) -> str:
@@ -189,7 +200,7 @@ def _next_command(folder: Path, config: RunConfig) -> str:
     if source.task is not None and not TASKS.is_installed(source.task):
         program = f"python {shlex.quote(sys.argv[0])}"
     if source.grammars:
-        return f"score it: {program} eval {shlex.quote(str(folder))} --split SPLIT"
+        return f"score it on fresh robots: {program} eval {shlex.quote(str(folder))}"
     if source.task is not None:
         words = [source.task, source.name, *["--obstacles"] * source.obstacles]
         words += ["--policy", str(folder), "--sim", config.sim]
@@ -326,7 +337,8 @@ def execution_config(args: argparse.Namespace) -> ExecutionConfig:
     """
     from morphgen.rl.training import ExecutionConfig
 
-    return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb)
+    minutes = getattr(args, "minutes", None)  # a study has none
+    return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb, minutes)
 
 
 def _folder_name(source: RobotSource) -> str:

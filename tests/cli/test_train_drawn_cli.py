@@ -1,6 +1,7 @@
 """``morphgen train --robots``: training on robots that are drawn from grammars."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ from helpers.splits import member, split
 from morphgen.benchmark.split import Member
 from morphgen.benchmark.split_file import write_split
 from morphgen.grammar.library import default_library
-from morphgen.rl.drawn_robots import FILE, read_drawn
+from morphgen.rl.drawn_robots import FILE, fresh_source, read_drawn
 from morphgen.rl.recorders import read_metrics
+from morphgen.rl.robot_source import members
 from morphgen.rl.runs import read_checkpoint, read_config
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess
 from morphgen.viewer.rollout import training_robots
 
@@ -75,13 +78,40 @@ def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, tmp_pa
     assert f"{folder} has no robots.json: it is unknown whether" in err
 
 
+@pytest.mark.parametrize("drawn", ["cubes:2", "stick:1", "cubes:1,stick:2"])
+def test_without_a_split_fresh_robots_are_evaluated(run, drawn):
+    run(*RUN, drawn, "--steps", "96", "--out", "run")
+    trained = {each.robot_hash for each in read_drawn(Path("run"))}
+    words = ("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    found = []
+    for seed in (0, 0, 1):
+        code, out, err = run(*words, "--seed", str(seed), "--json")
+        assert code == 0
+        request, draw_seed, robots_hash = re.search(
+            r"fresh robots (\S+), drawn with seed (\d+), hash (\w+)", err
+        ).groups()
+        assert request == drawn
+        scores = json.loads(out)["deterministic"]
+        assert len(scores) == len(trained)
+        assert {score["side"] for score in scores} == {"test"}
+        found.append((draw_seed, robots_hash, out))
+    assert found[0] == found[1] != found[2]
+    source = read_config(Path("run")).source
+    fresh, _ = fresh_source(Path("run"), source, GoalConfig(), 0)
+    assert trained.isdisjoint(each.robot_hash for each in members(fresh))
+    code, _, err = run(*words, "--on", "train")
+    assert (code, "its policy is scored on fresh robots" in err) == (2, True)
+    (Path("run") / FILE).unlink()
+    code, _, err = run(*words)
+    assert (code, "no list of drawn robots" in err) == (2, True)
+
+
 def test_held_out_robots_are_skipped_and_fit_the_observations(run, tmp_path):
     run(*RUN, "cubes:2", "--steps", "32", "--out", "free")
-    for words in (("eval", "free"), ("eval", "free", "--on", "test"), ("finetune", "free")):
-        code, _, err = run(*words)
-        assert code == 2
-        assert "robots cubes:2 are drawn from grammars and have no test side" in err
-        assert "with --split" in err
+    code, _, err = run("finetune", "free")
+    assert code == 2
+    assert "robots cubes:2 are drawn from grammars and have no test side" in err
+    assert "with --split" in err
     (_, second) = read_drawn(Path("free"))
     test = Member("known", "cubes", second.derivation, "reach", False, second.robot_hash)
     large = split((member("base=planar ee=cube"),), (test,), provenance={"max_links": 25})

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -47,6 +48,58 @@ def stop_after(update):
         return told
 
     return show
+
+
+def raise_after(number, update):
+    def show(part):
+        def told(report, updates):
+            if report.update == update:
+                signal.raise_signal(number)
+
+        return told
+
+    return show
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, None])
+def test_a_stopped_run_keeps_its_updates(tmp_path, number):
+    """Signals and the end of the minutes let the running update end and write a checkpoint."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    config, folder = small_config(), tmp_path / "run"
+    before = {each: signal.signal(each, interrupt) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        if number is None:
+            (part,) = train(folder, config, execution=replace(QUIET, minutes=0))
+            assert not training.is_done(part)
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                train(folder, config, execution=QUIET, show=raise_after(number, 2))
+        assert {signal.getsignal(each) for each in before} == {interrupt}
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert read_checkpoint(folder)[1]["update"] == (1 if number is None else 3)
+    (part,) = train(folder, config, resume=True, execution=QUIET)
+    assert training.is_done(part)
+    assert [each["update"] for each in read_metrics(folder)] == list(range(1, 7))
+
+
+def test_a_second_signal_acts_at_once(tmp_path):
+    def show(part):
+        def told(report, updates):
+            if report.update == 2:
+                signal.raise_signal(signal.SIGINT)
+                with pytest.raises(KeyboardInterrupt):
+                    signal.raise_signal(signal.SIGINT)
+                raise StoppedError
+
+        return told
+
+    with pytest.raises(StoppedError):
+        train(tmp_path / "run", small_config(), execution=QUIET, show=show)
 
 
 def untimed(folder):
