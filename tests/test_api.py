@@ -212,7 +212,7 @@ def test_vector_environments_of_one_keep_their_axis():
     (vector,) = (morphgen.make_env("reach", "arm3-stick", num_envs=1, sim="kinematic"),)
     assert isinstance(env, gymnasium.Env)
     assert isinstance(vector, gymnasium.vector.VectorEnv)
-    assert vector.action_space.shape == (1, 23)
+    assert vector.action_space.shape == (1, 5)
     env.close()
     vector.close()
 
