@@ -13,7 +13,9 @@ its own imports each file with the package's folder as root. The outcomes are:
 
 ``check_urdf`` (Debian package liburdfdom-tools) reads the refused URDF files; it cannot read xacro.
 The script lists the files that it accepts and morphgen refuses, each with the reason; --all lists
-every file that is not imported. The exit code is 1 if any outcome is CRASHED or wrong.
+every file that is not imported. With --conform, the loaders also read each file that is imported as
+it is: a table counts in how many files they differ from morphgen, and why. The exit code is 1 if
+any outcome is CRASHED or wrong.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ from pathlib import Path
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.checks.conformance import conformance
+from morphgen.checks.conformance import compare_file, conformance
+from morphgen.errors import MorphgenError
+from morphgen.formats.resolve import default_finder
 
 PACKAGES = {
     "pybullet": "pybullet_data",
@@ -52,6 +56,7 @@ PACKAGES = {
 }
 """Folder with the robots of each package."""
 TIMEOUT_S = 300
+AGREES, UNEXPLAINED = "agrees", "UNEXPLAINED: "
 _CHECKER = shutil.which("check_urdf")
 _FORK = multiprocessing.get_context("fork")
 _FRAGMENT = re.compile(r"<link|<xacro:(?!macro|include|property|arg)\w")
@@ -67,6 +72,9 @@ class Outcome:
     reason: str = ""
     accepted: bool | None = None
     """Whether ``check_urdf`` accepts the file; None if it did not read it."""
+    loaders: tuple[tuple[str, str], ...] = ()
+    """Each loader that read the file as it is, with every cause of its differences; ``AGREES`` if
+    there are none, or ``UNEXPLAINED`` and what differs."""
 
 
 def main() -> int:
@@ -75,7 +83,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("sources", nargs="*", metavar="PACKAGE|DIR", default=list(PACKAGES))
-    parser.add_argument("--conform", action="store_true", help="load every bundle everywhere, too")
+    parser.add_argument("--conform", action="store_true", help="load all in every loader, too")
     parser.add_argument("--all", action="store_true", help="list all that is not imported")
     parser.add_argument("--only", default="", help="only files whose path contains this")
     parser.add_argument("--jobs", type=int, default=2)
@@ -116,17 +124,18 @@ def _outcome(package: str, root: Path, path: Path, out: Path, conform: bool) -> 
     child = _FORK.Process(target=_import, args=(sending, root, path, out, conform))
     child.start()
     sending.close()
-    result, reason = "CRASHED", f"no answer in {TIMEOUT_S} s"
+    result, reason, loaders = "CRASHED", f"no answer in {TIMEOUT_S} s", ()
     if receiving.poll(TIMEOUT_S):
         try:
-            result, reason = receiving.recv()
+            result, reason, loaders = receiving.recv()
         except EOFError:
             reason = "the process died"
     child.kill()
     child.join()
     shutil.rmtree(out, ignore_errors=True)
     accepted = _is_accepted(path) if result == "refused" else None
-    return Outcome(package, path.relative_to(root).as_posix(), result, reason, accepted)
+    file = path.relative_to(root).as_posix()
+    return Outcome(package, file, result, reason, accepted, loaders)
 
 
 def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool) -> None:
@@ -138,13 +147,28 @@ def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool
         if code == 2:
             is_fragment = path.suffix == ".xacro" and _is_fragment(path)
             reason = errors.getvalue().strip().removeprefix("morphgen: ").replace(f"{root}/", "")
-            answer.send(("fragment" if is_fragment else "refused", reason))
+            answer.send(("fragment" if is_fragment else "refused", reason, ()))
             return
         rows = conformance(out / "robot", samples=20).rows if conform else ()
         bad = [f"{row.loader}: {row.message}" for row in rows if row.passed is False]
-        answer.send(("wrong", "; ".join(bad)) if bad else ("imported", ""))
+        loaders = tuple(_as_it_is(path, root)) if conform else ()
+        answer.send(("wrong" if bad else "imported", "; ".join(bad), loaders))
     except BaseException:
-        answer.send(("CRASHED", traceback.format_exc().strip().splitlines()[-1]))
+        answer.send(("CRASHED", traceback.format_exc().strip().splitlines()[-1], ()))
+
+
+def _as_it_is(path: Path, root: Path) -> Iterator[tuple[str, str]]:
+    """Yield the loaders of a file and the causes of their differences; see ``Outcome.loaders``."""
+    try:
+        rows = compare_file(path, default_finder(root=root), samples=20)
+    except MorphgenError as error:  # it can be imported, but no loader may get it
+        yield "all", f"no copy for loaders: {error}".replace(f"{root}/", "")
+        return
+    for row in rows:
+        if row.passed is not None:
+            unexplained = (UNEXPLAINED + row.message,) if row.is_unexplained else ()
+            for cause in (AGREES,) if row.passed else (*row.causes, *unexplained):
+                yield row.loader, cause
 
 
 def _morphgen(words: list[str]) -> int:
@@ -182,6 +206,8 @@ def _print(outcomes: list[Outcome], *, everything: bool) -> None:
         rows.append([package, len(own), *(counts[result] for result in results), accepted])
     heads = ["package", "files", *results, "refused, but accepted by check_urdf"]
     print(tabulate(rows, heads))
+    if any(outcome.loaders for outcome in outcomes):
+        _print_loaders(outcomes)
     if _CHECKER is None:
         print("check_urdf is not installed (Debian: liburdfdom-tools)")
     for outcome in outcomes:
@@ -190,6 +216,26 @@ def _print(outcomes: list[Outcome], *, everything: bool) -> None:
             verdict = {True: "accepts", False: "refuses", None: "not asked"}[outcome.accepted]
             print(f"{outcome.package}: {outcome.file}: {outcome.result} (check_urdf: {verdict})")
             print(f"    {outcome.reason[:300]}")
+
+
+def _print_loaders(outcomes: list[Outcome]) -> None:
+    """Print in how many files each loader agrees, and the files of each cause of a difference."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for outcome in outcomes:
+        for loader, cause in outcome.loaders:
+            cause = UNEXPLAINED if cause.startswith(UNEXPLAINED) else cause
+            found.setdefault((loader, cause), []).append(outcome.file)
+    heads = ["loader", "the file as it is", "files", "such as"]
+    rows: list[tuple[str, str, int, str]] = [
+        (loader, cause.strip(": "), len(files), Path(min(files, key=len)).name)
+        for (loader, cause), files in found.items()
+    ]
+    rows.sort(key=lambda row: (row[0], row[1] != AGREES, -row[2]))
+    print(tabulate(rows, heads))
+    for outcome in outcomes:
+        for loader, cause in outcome.loaders:
+            if cause.startswith(UNEXPLAINED):
+                print(f"{outcome.package}: {outcome.file}: {loader}: {cause[:300]}")
 
 
 if __name__ == "__main__":

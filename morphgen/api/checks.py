@@ -8,11 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.checks.conformance import ConformanceReport, compare
+from morphgen.checks.conformance import ConformanceReport, compare, compare_file
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.gate import loader_copy
+from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import (
@@ -106,11 +107,13 @@ def bundle_of(source: RobotSource) -> Path | None:
 def conform(
     robot: RobotLike, *, samples: int = 100, seed: int = 0, library: LibraryFolders = ()
 ) -> ConformanceReport:
-    """Compare a robot in every installed loader, and measure how it holds its home configuration.
+    """Compare a robot in every installed loader, and measure how it holds its home and steps.
 
     The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared in
-    joints, limits, couplings, damping, gains, mass and tool pose. The robot then holds its home
-    for 5 s: its MJCF in MuJoCo, its URDF in PyBullet, and in environments of both.
+    joints, limits, couplings, damping, gains, mass, tool pose, gravity torque and inertia. A URDF,
+    xacro or MJCF is also loaded as it is, which gives rows of ``source`` ``file``. The robot then
+    holds its home for 5 s, and every joint makes a step: its MJCF in MuJoCo, its URDF in PyBullet,
+    and in environments of both.
 
     Examples:
         >>> report = morphgen.conform("ur5-plane", samples=10)
@@ -120,6 +123,8 @@ def conform(
         ('mujoco (urdf)', True)
         >>> report.holds[0].simulator, report.holds[0].drift < 0.02, dict(report.penetrations)
         ('mujoco (mjcf)', True, {})
+        >>> report.holds[0].settling_time < 1.0
+        True
 
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``. The files
@@ -149,7 +154,7 @@ def conform_source(
     samples: int = 100,
     seed: int = 0,
 ) -> ConformanceReport:
-    """Compare loaders and simulators on a bundle, or on one written for it; see ``conform``.
+    """Compare loaders and simulators on a file, and on its bundle; see ``conform``.
 
     Args:
         source: The robot, as ``find_robots`` returns it.
@@ -163,7 +168,12 @@ def conform_source(
     """
     if source.path is not None and (source.path / CARD).is_file():
         return _conform_bundle(source.path, samples, seed)
-    return _conform_robot(read_source(source, library, root), samples, seed)
+    report = _conform_robot(read_source(source, library, root), samples, seed)
+    if source.path is None or source.path.is_dir():
+        return report
+    rows = compare_file(source.path, default_finder(root=root), samples, seed)
+    passed = report.passed and not any(row.is_unexplained for row in rows)
+    return replace(report, passed=passed, rows=(*rows, *report.rows))
 
 
 def _conform_robot(robot: Robot, samples: int, seed: int) -> ConformanceReport:

@@ -1,22 +1,32 @@
-"""Conformance: compare how different loaders read a bundle."""
+"""Conformance: compare how different loaders read a bundle, or a file as it is.
+
+The files of a bundle must be read alike by all loaders. A file of others need not be: each loader
+reads it as its own rules say. Such a row names the causes of its differences. A cause is tried: the
+loader must agree with morphgen's reading of the file that the cause has changed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from lxml import etree
 
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
-from morphgen.checks.joint_readings import compare_joints
-from morphgen.checks.readers import LOADERS, Loader
-from morphgen.errors import FormatError
-from morphgen.formats.bundle import read_bundle
+from morphgen.checks.joint_readings import Reading, compare_joints
+from morphgen.checks.readers import LOADERS, Loader, Quirk, refusal_causes
+from morphgen.errors import FormatError, one_line
+from morphgen.formats.bundle import URDF, read_bundle
+from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
+from morphgen.formats.resolve import PackageFinder, default_finder
+from morphgen.formats.urdf import robot_from_xml
 from morphgen.formats.urdf_text import BOUND_MASS
+from morphgen.model.dynamics import gravity_load, mass_matrix
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot
 from morphgen.typing import Array
@@ -32,6 +42,20 @@ MASS_TOLERANCE = 1e-6
 
 In addition, MuJoCo may add ``BOUND_MASS`` per link.
 """
+
+
+GRAVITY_TOLERANCE = 1e-6
+"""Largest accepted difference of a force that holds the weight, relative to the robot's largest one
+or to ``MIN_FORCE``."""
+MIN_FORCE = 1e-3
+"""Force below which a difference is not relative [N m or N]."""
+INERTIA_TOLERANCE = 1e-5
+"""Largest accepted difference of an entry of the joint-space inertia; see ``inertia_error``."""
+MIN_INERTIA = 1e-8
+"""Diagonal entry below which a difference is not relative [kg m^2 or kg]: that of a joint that
+carries no mass is whatever the loader adds."""
+BUNDLE, FILE = "bundle", "file"
+"""Sources of a row."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +83,23 @@ class ConformanceRow:
     """Whether damping and friction agree."""
     gains: bool | None = None
     """Whether gains and armature of the position actuators agree."""
+    gravity_error: float | None = None
+    """Largest difference of a force that holds the weight [N m or N]; None, here and below, if the
+    loader computes none."""
+    inertia_error: float | None = None
+    """Largest difference of an entry of the joint-space inertia, relative to the root of the
+    product of its two diagonal entries."""
     message: str = ""
     """Description of the disagreement, or ``not installed``."""
+    source: str = BUNDLE
+    """``bundle``, or ``file`` if the loader read the file of others as it is."""
+    causes: tuple[str, ...] = ()
+    """What the loader does with a file of others that explains all its differences."""
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether a difference has no known cause."""
+        return self.passed is False and not self.causes
 
 
 @dataclass(frozen=True)
@@ -76,11 +115,12 @@ class ConformanceReport:
     seed: int
     """Seed of the configurations."""
     passed: bool
-    """Whether every installed loader agrees and, if measured, the robot holds its home."""
+    """Whether every installed loader agrees, or differs on a file of others with known causes, and,
+    if measured, the robot holds its home and steps from it."""
     rows: tuple[ConformanceRow, ...]
     """The loaders."""
     holds: tuple[HoldRow, ...] = ()
-    """The simulators in which the robot holds its home configuration."""
+    """The simulators in which the robot holds its home configuration, and steps from it."""
     penetrations: Mapping[str, float] = field(default_factory=dict)
     """Depth of every pair of links, as ``a, b``, that penetrate at home [m]; ignored pairs are not
     tested."""
@@ -123,23 +163,88 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
     if frame is None:
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
-    q = random_configurations(robot, samples, np.random.default_rng(seed))
-    q = np.clip(q, -MAX_POSITION, MAX_POSITION)
-    rows = tuple(_row(robot, folder, loader, frame.name, q) for loader in LOADERS)
+    q = _configurations(robot, samples, seed)
+    rows = []
+    for loader in LOADERS:
+        row, _ = _row(loader, robot, folder, frame.name, q, has_gains=True)
+        rows.append(row)
     passed = all(row.passed is not False for row in rows)
-    return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)
+    return ConformanceReport(robot.name, frame.name, samples, seed, passed, tuple(rows))
 
 
-def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> ConformanceRow:
-    if find_spec(loader.module) is None:
-        return ConformanceRow(loader.name, None, message="not installed")
+def compare_file(
+    path: Path, finder: PackageFinder, samples: int = 100, seed: int = 0
+) -> tuple[ConformanceRow, ...]:
+    """Compare morphgen's reading of a URDF, xacro or MJCF with that of every loader.
+
+    The loaders get a private copy of the file, with its meshes beside it; see ``loader_copy``. The
+    pose is that of the last link that moves, because loaders may join others to their parents.
+
+    Args:
+        path: The file.
+        finder: Finds ROS packages, and the folder that files may come from.
+        samples: Number of random configurations within the joint limits.
+        seed: Seed of the configurations.
+
+    Raises:
+        MorphgenError: If morphgen cannot read the file.
+    """
+    robot = read_description(path, finder=finder)
+    moving = [joint.child for joint in robot.joints if joint.is_movable]
+    robot = replace(robot, frames=tuple(Frame(link, link) for link in moving[-1:]))
+    frame, q = "".join(moving[-1:]), _configurations(robot, samples, seed)
+    rows = []
+    with loader_copy(path, finder) as folder:
+        is_urdf = (folder / URDF).is_file()
+        for loader in LOADERS:
+            if (loader.file == URDF) is not is_urdf:
+                continue
+            row, reading = _row(loader, robot, folder, frame, q, has_gains=False)
+            if row.passed is False:
+                text = (folder / loader.file).read_bytes()
+                causes = _causes(loader, reading, text, folder, frame, _positions(robot, q))
+                row = replace(row, causes=causes or refusal_causes(row.message))
+            rows.append(replace(row, source=FILE))
+    return tuple(rows)
+
+
+def _configurations(robot: Robot, samples: int, seed: int) -> Array:
+    q = random_configurations(robot, samples, np.random.default_rng(seed))
+    return np.clip(q, -MAX_POSITION, MAX_POSITION)
+
+
+def _positions(robot: Robot, q: Array) -> dict[str, Array]:
+    """Return the positions of every movable joint by name, shape (n,)."""
     names = [robot.joints[k].name for k in robot.movable_joints]
-    positions = dict(zip(names, movable_positions(robot, q).T, strict=True))
+    return dict(zip(names, movable_positions(robot, q).T, strict=True))
+
+
+def _row(
+    loader: Loader, robot: Robot, folder: Path, frame: str, q: Array, *, has_gains: bool
+) -> tuple[ConformanceRow, Reading | None]:
+    """Return a loader's row, and what it read unless it refused the file.
+
+    ``has_gains`` says that the actuators are those that morphgen writes.
+    """
+    if find_spec(loader.module) is None:
+        return ConformanceRow(loader.name, None, message="not installed"), None
     try:
-        reading = loader.read(folder, frame, positions, len(q))
+        reading = loader.read(folder, frame, _positions(robot, q), len(q))
     except FormatError as error:
-        return ConformanceRow(loader.name, False, message=str(error))
-    expected = frame_pose(robot, q, frame)
+        return ConformanceRow(loader.name, False, message=str(error)), None
+    except Exception as error:  # whatever a library of others raises is its refusal
+        message = f"{type(error).__name__}: {one_line(str(error))}"
+        return ConformanceRow(loader.name, False, message=message), None
+    if not has_gains:
+        reading = replace(reading, has_actuators=False)
+    return _compared(loader, robot, reading, frame, q), reading
+
+
+def _compared(
+    loader: Loader, robot: Robot, reading: Reading, frame: str, q: Array
+) -> ConformanceRow:
+    """Compare what a loader read with the robot."""
+    expected = frame_pose(robot, q, frame) if frame else np.tile(np.eye(4), (len(q), 1, 1))
     position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2), from which
@@ -147,7 +252,8 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
     R_difference = reading.T_root_frame[:, :3, :3] - expected[:, :3, :3]
     sines = np.linalg.norm(R_difference, axis=(1, 2)) / np.sqrt(8.0)
     rotation_error = float(2 * np.arcsin(np.clip(sines, 0.0, 1.0)).max(initial=0.0))
-    expected_joints, joints = set(names), set(reading.joints)
+    expected_joints = {robot.joints[k].name for k in robot.movable_joints}
+    joints = set(reading.joints)
     faults = []
     if missing := sorted(expected_joints - joints):
         faults.append(f"lacks joints {', '.join(missing)}")
@@ -162,6 +268,10 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
         faults.append(f"{frame} is {position_error:.3g} m off")
     if rotation_error > ROTATION_TOLERANCE:
         faults.append(f"{frame} is {rotation_error:.3g} rad off")
+    gravity_error = inertia_error = None
+    if reading.forces is not None and joints == expected_joints:
+        gravity_error, inertia_error, more = _dynamics(robot, reading, q)
+        faults += more
     return ConformanceRow(
         loader.name,
         passed=not faults,
@@ -173,5 +283,74 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
         mimic=agreement.mimic,
         damping=agreement.damping,
         gains=agreement.gains,
+        gravity_error=gravity_error,
+        inertia_error=inertia_error,
         message="; ".join(faults),
     )
+
+
+def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, list[str]]:
+    """Return the largest differences of forces and inertia, and what they are."""
+    if reading.forces is None or reading.inertia is None or not robot.dof:
+        return 0.0, 0.0, []
+    order = [list(reading.joints).index(robot.joints[k].name) for k in robot.movable_joints]
+    coupling, _ = robot.mimic_map
+    samples = q[: len(reading.forces)]
+    forces = np.array([gravity_load(robot, configuration) for configuration in samples])
+    M = np.array([mass_matrix(robot, configuration) for configuration in samples])
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", M), MIN_INERTIA))
+    force_errors = np.abs(reading.forces[:, order] - forces)
+    read_M = coupling.T @ reading.inertia[:, order][:, :, order] @ coupling
+    inertia_errors = np.abs(read_M - M) / (scale[:, :, None] * scale[:, None, :])
+    gravity_error, inertia_error = float(force_errors.max()), float(inertia_errors.max())
+    faults = []
+    if not gravity_error <= GRAVITY_TOLERANCE * max(MIN_FORCE, float(np.abs(forces).max())):
+        sample, column = np.unravel_index(int(np.argmax(force_errors)), force_errors.shape)
+        joint = robot.joints[robot.movable_joints[column]]
+        unit = "N" if joint.kind == "prismatic" else "N m"
+        read = reading.forces[sample, order[column]]
+        faults.append(
+            f"joint {joint.name}: carries {read:.4g}, not {forces[sample, column]:.4g} {unit}"
+        )
+    if not inertia_error <= INERTIA_TOLERANCE:
+        _, row, column = np.unravel_index(int(np.argmax(inertia_errors)), inertia_errors.shape)
+        names = [robot.joints[k].name for k in robot.independent_joints]
+        faults.append(f"inertia of {names[row]}, {names[column]} is {inertia_error:.2g} off")
+    return gravity_error, inertia_error, faults
+
+
+def _causes(
+    loader: Loader,
+    reading: Reading | None,
+    text: bytes,
+    folder: Path,
+    frame: str,
+    positions: dict[str, Array],
+) -> tuple[str, ...]:
+    """Return the fewest quirks of a loader that explain what it read; none if they do not."""
+    if reading is None:
+        return ()
+
+    n = len(reading.T_root_frame)
+
+    def explain(quirks: Sequence[Quirk]) -> bool:
+        root = etree.fromstring(text)
+        try:
+            for quirk in quirks:
+                quirk.change(root, folder / loader.file)
+            robot = robot_from_xml(etree.tostring(root), folder / loader.file, default_finder())
+        except (FormatError, ValueError):
+            return False
+        robot = replace(robot, frames=(Frame(frame, frame),) if frame else ())
+        names = [robot.joints[k].name for k in robot.independent_joints]
+        q = np.array([positions[name] for name in names]).reshape(len(names), n).T
+        return bool(_compared(loader, robot, reading, frame, q).passed)
+
+    chosen = list(loader.quirks)
+    if not chosen or not explain(chosen):
+        return ()
+    for quirk in loader.quirks:
+        fewer = [each for each in chosen if each is not quirk]
+        if explain(fewer):
+            chosen = fewer
+    return tuple(quirk.words for quirk in chosen)

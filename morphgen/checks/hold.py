@@ -1,4 +1,4 @@
-"""Drift of a robot that holds its home configuration with the files of its bundle.
+"""Robots that hold their home configuration, and step from it, with the files of their bundle.
 
 MuJoCo simulates ``robot.xml`` with its position actuators and its compensation of gravity. PyBullet
 simulates ``robot.urdf`` with gravity, its own position control and the effort limits of the file: a
@@ -7,20 +7,25 @@ URDF has no controllers, and this is how its users hold a robot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from morphgen.checks.home_pose import home_penetrations
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
 from morphgen.model.dynamics import GRAVITY, gravity_load
 from morphgen.model.kinematics import movable_positions
-from morphgen.model.robot import DEFAULT_EFFORT, Robot
+from morphgen.model.robot import DEFAULT_EFFORT, Joint, Robot
 from morphgen.typing import Array
 
 HOLD_S = 5.0
@@ -34,81 +39,257 @@ SOLVER_ITERATIONS = 200
 MORE_ITERATIONS = 1000
 """Iterations that tell whether a drift is the solver's, which has not converged."""
 
+STEP = {"prismatic": 0.02, "revolute": 0.2, "continuous": 0.2}
+"""Step of an independent joint by its kind, unless its range has less room [m or rad]."""
+MAX_STEP = 0.8
+"""Largest part of the room to a limit that a step takes."""
+BAND = 0.1
+"""Distance from the target at which a joint has settled, relative to its step: 0.02 rad or 2 mm of
+a whole step, as for the drift."""
+MAX_FOLLOWER_ERROR = {"prismatic": 0.005, "revolute": 0.02, "continuous": 0.02}
+"""Largest accepted distance of a mimic joint from its leader's position, at any time during a step
+[m or rad]: 5 mm are 0.02 rad at 25 cm."""
+STEP_S = 3.0
+"""Duration within which a step must settle [s]."""
+SETTLED_S = 0.2
+"""Duration for which all joints must be settled, after which a step ends [s]."""
+
+
+@dataclass(frozen=True)
+class SimulatedRobot:
+    """A robot in a simulator."""
+
+    period: float
+    """Time between the positions that ``run`` yields [s]."""
+    run: Callable[[Array], Iterator[Array]]
+    """Function of targets of the independent joints, shape (dof,) [rad or m]. It puts the robot to
+    its home, at rest, drives it to the targets, and yields the positions of the movable joints,
+    shape (n_movable,) [rad or m], after every period, without end."""
+
 
 @dataclass(frozen=True)
 class HoldRow:
-    """How far a robot moves in a simulator while it holds its home configuration."""
+    """How a robot holds its home configuration in a simulator, and how its joints step."""
 
     simulator: str
     """Name of the simulator, and of the file or the environments."""
     passed: bool | None
-    """Whether no joint is farther than ``MAX_DRIFT`` from home; None without the simulator."""
+    """Whether no joint drifts farther than ``MAX_DRIFT`` from home, all steps settle within
+    ``STEP_S`` and mimic joints stay with their leaders; None without the simulator."""
     drift: float | None = None
     """Largest distance of a joint from home within ``HOLD_S`` [rad or m]; None if diverged."""
     joint: str = ""
-    """Name of the joint that moves farthest."""
+    """Name of the joint that drifts farthest."""
+    step_error: float | None = None
+    """Largest distance of a joint from its target at the end of a step [rad or m]; None, here and
+    below, if a step diverged."""
+    follower_error: float | None = None
+    """Largest distance of a mimic joint from its leader's position during a step [rad or m]."""
+    settling_time: float | None = None
+    """Longest time until all joints are within ``BAND`` of their targets [s]; None if never."""
     message: str = ""
-    """Cause of a drift if it is known, or what went wrong."""
+    """What went wrong."""
+    causes: tuple[str, ...] = ()
+    """What explains a failure; empty if it is not known."""
 
 
 def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
-    """Hold a robot at home with the files of its bundle, for ``HOLD_S`` in each simulator.
+    """Hold a robot at home and step its joints with the files of its bundle in each simulator.
 
     Args:
         robot: The robot that the bundle holds.
         folder: Folder of the bundle.
     """
-    mjcf = hold_row("mujoco (mjcf)", "mujoco", robot, lambda: _hold_mjcf(robot, folder))
+    mjcf = hold_row("mujoco (mjcf)", "mujoco", robot, partial(_mjcf, robot, folder), 0.0)
 
     def hold_urdf(iterations: int) -> HoldRow:
-        hold = partial(_hold_urdf, robot, folder, iterations)
-        return hold_row("pybullet (urdf)", "pybullet", robot, hold)
+        urdf = partial(_urdf, robot, folder, iterations)
+        return hold_row("pybullet (urdf)", "pybullet", robot, urdf, None)
 
     urdf = hold_urdf(SOLVER_ITERATIONS)
-    if urdf.passed is not False:
+    if urdf.passed is not False or urdf.causes:
         return mjcf, urdf
-    causes = overloads(robot)
-    if not causes and hold_urdf(MORE_ITERATIONS).passed:
-        causes = (f"holds with {MORE_ITERATIONS} solver iterations",)
-    return mjcf, replace(urdf, message="; ".join((urdf.message, *causes)))
+    more, causes = hold_urdf(MORE_ITERATIONS), []
+    if more.passed or (urdf.step_error is None and more.step_error is not None):
+        causes.append(f"holds with {MORE_ITERATIONS} solver iterations")
+    if not more.passed and more.settling_time is not None:  # only mimic joints fail
+        causes.append("PyBullet ignores <mimic>, so that followers have motors of their own")
+    return mjcf, replace(urdf, causes=tuple(causes))
 
 
 def hold_row(
-    name: str, module: str, robot: Robot, positions: Callable[[], Iterator[Array]]
+    name: str,
+    module: str,
+    robot: Robot,
+    simulated: Callable[[], AbstractContextManager[SimulatedRobot]],
+    contact_margin: float | None,
 ) -> HoldRow:
-    """Return the row of a simulator.
+    """Return the row of a simulator: drift at home for ``HOLD_S``, then a step of each joint.
+
+    The joints step one after the other, each from home, away from their nearer limit. A robot that
+    does not hold its home makes no steps.
 
     Args:
         name: Name of the row.
         module: Import name of the simulator, which may not be installed.
         robot: The robot.
-        positions: Runs the simulation and yields the positions of the movable joints, shape
-            (n_movable,) [rad or m], after every step; raises ``MorphgenError`` if it cannot.
+        simulated: Opens the simulation; raises ``MorphgenError`` if it cannot.
+        contact_margin: Distance at which links push each other away [m]; None if they never do.
     """
     if find_spec(module) is None:
         return HoldRow(name, None, message="not installed")
-    home = movable_positions(robot, robot.home)
-    if not len(home):
-        return HoldRow(name, True, 0.0)
-    drift = np.zeros(len(home))
+    if not robot.movable_joints:
+        return HoldRow(name, True, 0.0, "", 0.0, 0.0, 0.0)
+    find_causes = partial(_causes, robot, contact_margin)
     try:
-        for q in positions():
-            if not np.isfinite(q).all():
-                return HoldRow(name, False, message="diverged")
-            drift = np.maximum(drift, np.abs(q - home))
+        with simulated() as simulation:
+            row = _hold(name, robot, simulation)
+            if row.passed:
+                return _stepped(row, robot, simulation, find_causes)
     except MorphgenError as error:
         return HoldRow(name, False, message=str(error))
+    return replace(row, causes=find_causes(np.array(robot.home)))
+
+
+def _hold(name: str, robot: Robot, simulation: SimulatedRobot) -> HoldRow:
+    home = movable_positions(robot, robot.home)
+    drift = np.zeros(len(home))
+    run = simulation.run(np.array(robot.home))
+    for q in islice(run, round(HOLD_S / simulation.period)):
+        if not np.isfinite(q).all():
+            return HoldRow(name, False, message="diverged")
+        drift = np.maximum(drift, np.abs(q - home))
     worst = int(drift.argmax())
     passed = bool(drift[worst] <= MAX_DRIFT)
     joint = robot.joints[robot.movable_joints[worst]]
-    unit = "m" if joint.kind == "prismatic" else "rad"
-    message = "" if passed else f"{joint.name} moves {drift[worst]:.3g} {unit}"
-    return HoldRow(name, passed, float(drift[worst]), joint.name, message)
+    message = "" if passed else f"{joint.name} moves {drift[worst]:.3g} {_unit(joint)}"
+    return HoldRow(name, passed, float(drift[worst]), joint.name, message=message)
 
 
-def overloads(robot: Robot) -> tuple[str, ...]:
-    """Return a description of every joint whose effort cannot carry the weight at home."""
-    loads = gravity_load(robot, robot.home).tolist()
+def _stepped(
+    row: HoldRow,
+    robot: Robot,
+    simulation: SimulatedRobot,
+    find_causes: Callable[[Array], tuple[str, ...]],
+) -> HoldRow:
+    """Add the steps of all independent joints to the row of a robot that holds its home."""
+    steps = []
+    for target in step_targets(robot):
+        step = _step(robot, simulation, target)
+        if step is None:
+            return replace(row, passed=False, message="a step diverged")
+        steps.append(step)
+    settling_time = max((step.settling_time for step in steps), default=0.0)
+    row = replace(
+        row,
+        step_error=max((step.error for step in steps), default=0.0),
+        follower_error=max((step.follower_error for step in steps), default=0.0),
+        settling_time=settling_time if settling_time < math.inf else None,
+    )
+    failed = sorted((s for s in steps if s.severity > 1), key=lambda s: s.severity, reverse=True)
+    if not failed:
+        return row
+    others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+    causes = [find_causes(step.target) for step in failed]
+    # They are the causes only if every step that fails has one.
+    known = tuple(dict.fromkeys(chain.from_iterable(causes))) if all(causes) else ()
+    return replace(row, passed=False, message=f"{failed[0].fault}{others}", causes=known)
+
+
+def step_targets(robot: Robot) -> Array:
+    """Return the targets of the steps, shape (n_steps, dof) [rad or m].
+
+    Each is the home configuration with one joint moved by ``STEP`` in the direction of more room.
+    A joint without room has none.
+    """
+    targets = []
+    for i, k in enumerate(robot.independent_joints):
+        joint, home = robot.joints[k], robot.home[i]
+        lower, upper = joint.limits or (-math.inf, math.inf)
+        if joint.is_continuous:
+            lower, upper = -math.inf, math.inf
+        is_up = upper - home >= home - lower
+        room = upper - home if is_up else home - lower
+        size = min(STEP[joint.kind], MAX_STEP * room)
+        if size > 0:
+            target = np.array(robot.home)
+            target[i] += size if is_up else -size
+            targets.append(target)
+    return np.array(targets).reshape(-1, robot.dof)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Result of one step."""
+
+    target: Array
+    error: float
+    follower_error: float
+    settling_time: float
+    severity: float
+    """Error of the worst joint, relative to the accepted one."""
+    fault: str
+    """That error in words."""
+
+
+def _step(robot: Robot, simulation: SimulatedRobot, target: Array) -> _Step | None:
+    """Move to a target; return None if the simulation diverges."""
+    joints = [robot.joints[k] for k in robot.movable_joints]
+    independent = [i for i, joint in enumerate(joints) if joint.is_independent]
+    sizes = np.array([STEP[joint.kind] for joint in joints])
+    moved = int(np.argmax(np.abs(target - robot.home)))
+    size = abs(float(target[moved] - robot.home[moved]))
+    band = BAND * sizes
+    lag, settled_at = np.zeros(len(joints)), math.inf
+    band[independent[moved]] = BAND * size
+    for i, q in enumerate(islice(simulation.run(target), round(STEP_S / simulation.period))):
+        if not np.isfinite(q).all():
+            return None
+        time = (i + 1) * simulation.period
+        lag = np.maximum(lag, np.abs(q - movable_positions(robot, q[independent])))
+        errors = np.abs(q[independent] - target)
+        settled_at = min(settled_at, time) if (errors <= band[independent]).all() else math.inf
+        if time - settled_at >= SETTLED_S:
+            break
+    severities = lag / np.array([MAX_FOLLOWER_ERROR[joint.kind] for joint in joints])
+    distances = lag.copy()
+    if settled_at == math.inf:
+        severities[independent] = errors / band[independent]
+        distances[independent] = errors
+    worst = int(severities.argmax())
+    where = "its target" if worst in independent else "its leader"
+    stepped, joint = joints[independent[moved]], joints[worst]
+    return _Step(
+        target,
+        float(errors.max()),
+        float(lag.max()),
+        settled_at,
+        float(severities[worst]),
+        f"{joint.name} is {distances[worst]:.2g} {_unit(joint)} from {where} when {stepped.name} "
+        f"steps by {size:.2g} {_unit(stepped)}",
+    )
+
+
+def _causes(robot: Robot, contact_margin: float | None, q: Array) -> tuple[str, ...]:
+    """Return what keeps a robot from a configuration: weak motors, and links in the way."""
+    causes = overloads(robot, q)
+    if contact_margin is None:
+        return causes
+    pairs = home_penetrations(replace(robot, home=tuple(q.tolist())), contact_margin)
+    words = {True: "penetrate by", False: "come within PyBullet's collision margin, to"}
+    return causes + tuple(
+        f"{a}, {b} {words[depth > 0]} {1000 * abs(depth):.2g} mm"
+        for (a, b), depth in sorted(pairs.items())
+    )
+
+
+def _unit(joint: Joint) -> str:
+    return "m" if joint.kind == "prismatic" else "rad"
+
+
+def overloads(robot: Robot, q: ArrayLike) -> tuple[str, ...]:
+    """Return a description of every joint whose effort cannot carry the weight."""
+    loads = gravity_load(robot, q).tolist()
     causes = []
     for joint, load in zip((robot.joints[k] for k in robot.movable_joints), loads, strict=True):
         if joint.effort and abs(load) > joint.effort:
@@ -118,7 +299,8 @@ def overloads(robot: Robot) -> tuple[str, ...]:
     return tuple(causes)
 
 
-def _hold_mjcf(robot: Robot, folder: Path) -> Iterator[Array]:
+@contextmanager
+def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
     import mujoco
 
     from morphgen.formats.mujoco_warnings import MujocoWarnings
@@ -131,13 +313,21 @@ def _hold_mjcf(robot: Robot, folder: Path) -> Iterator[Array]:
         raise FormatError("no keyframe 'home'")
     addresses = {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)}
     joints = _joints(robot, addresses)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    driven = {model.joint(model.actuator_trnid[i, 0]).name: i for i in range(model.nu)}
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    for _ in range(round(HOLD_S / model.opt.timestep)):
-        with MujocoWarnings():
-            mujoco.mj_step(model, data)
-        yield data.qpos[joints]
+    data = mujoco.MjData(model)
+
+    def run(targets: Array) -> Iterator[Array]:
+        mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+        for k, target, home in zip(robot.independent_joints, targets, robot.home, strict=True):
+            if target != home:
+                data.ctrl[driven[robot.joints[k].name]] = target
+        while True:
+            with MujocoWarnings():
+                mujoco.mj_step(model, data)
+            yield data.qpos[joints]
+
+    yield SimulatedRobot(model.opt.timestep, run)
 
 
 def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
@@ -152,7 +342,8 @@ def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
     return [index[name] for name in names]
 
 
-def _hold_urdf(robot: Robot, folder: Path, iterations: int) -> Iterator[Array]:
+@contextmanager
+def _urdf(robot: Robot, folder: Path, iterations: int) -> Iterator[SimulatedRobot]:
     with quiet():
         import pybullet
 
@@ -168,21 +359,27 @@ def _hold_urdf(robot: Robot, folder: Path, iterations: int) -> Iterator[Array]:
             for i in range(pybullet.getNumJoints(body, **options))
         ]
         joints = _joints(robot, {info[1].decode(): info[0] for info in infos})
-        for joint, q in zip(joints, movable_positions(robot, robot.home).tolist(), strict=True):
-            pybullet.resetJointState(body, joint, q, **options)
-            pybullet.setJointMotorControl2(
+        # Item 10 is the effort limit; one of zero counts as missing, as in the MJCF.
+        forces = [infos[joint][10] or DEFAULT_EFFORT for joint in joints]
+
+        def run(targets: Array) -> Iterator[Array]:
+            home = movable_positions(robot, robot.home).tolist()
+            for joint, q in zip(joints, home, strict=True):
+                pybullet.resetJointState(body, joint, q, **options)
+            pybullet.setJointMotorControlArray(
                 body,
-                joint,
+                joints,
                 pybullet.POSITION_CONTROL,
-                targetPosition=q,
-                # Item 10 is the effort limit; one of zero counts as missing, as in the MJCF.
-                force=infos[joint][10] or DEFAULT_EFFORT,
+                targetPositions=movable_positions(robot, targets).tolist(),
+                forces=forces,
                 **options,
             )
-        period = pybullet.getPhysicsEngineParameters(**options)["fixedTimeStep"]
-        for _ in range(round(HOLD_S / period)):
-            pybullet.stepSimulation(**options)
-            yield np.array([state[0] for state in pybullet.getJointStates(body, joints, **options)])
+            while True:
+                pybullet.stepSimulation(**options)
+                states = pybullet.getJointStates(body, joints, **options)
+                yield np.array([state[0] for state in states])
+
+        yield SimulatedRobot(pybullet.getPhysicsEngineParameters(**options)["fixedTimeStep"], run)
     except pybullet.error as error:
         raise FormatError(f"PyBullet: {error}") from error
     finally:

@@ -16,6 +16,12 @@ ABSOLUTE_TOLERANCE = 1e-9
 """Largest accepted difference of a joint's value near zero, in its SI unit."""
 
 
+_WITHOUT_VELOCITY = (None, 0.0, math.inf)
+"""Velocity limits that loaders read where a file names none."""
+DYNAMICS_SAMPLES = 20
+"""Number of configurations in which forces and inertia are compared."""
+
+
 @dataclass(frozen=True)
 class JointReading:
     """A movable joint as a loader reads it; None where the loader reads no such value."""
@@ -52,6 +58,13 @@ class Reading:
     """Couplings of the mimic joints by name; None if the loader ignores them."""
     has_actuators: bool = False
     """Whether the file has an actuator for every independent joint."""
+    forces: Array | None = None
+    """Forces that hold the weight of the fixed robot in the first ``DYNAMICS_SAMPLES``
+    configurations, a column per joint in the order of ``joints`` [N m or N]; None, here and below,
+    if the loader computes none."""
+    inertia: Array | None = None
+    """Joint-space inertia in these configurations, shape (samples, n_joints, n_joints) [kg m^2,
+    kg m or kg], without armature and with mimic joints uncoupled."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +100,9 @@ def compare_joints(robot: Robot, reading: Reading) -> JointAgreement:
         )
         if read.effort not in _accepted_efforts(joint):
             faults["limits"] += _differences(name, ("effort", read.effort, joint.effort or 0.0))
-        velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-        faults["limits"] += _differences(name, ("velocity", read.velocity, velocity))
+        if joint.velocity is not None or read.velocity not in _WITHOUT_VELOCITY:
+            velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
+            faults["limits"] += _differences(name, ("velocity", read.velocity, velocity))
         faults["damping"] += _differences(
             name,
             ("damping", read.damping, joint.damping),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,11 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from lxml import etree
 
-from morphgen.checks.joint_readings import JointReading, Reading
+from morphgen.checks.joint_readings import DYNAMICS_SAMPLES, JointReading, Reading
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
+from morphgen.formats.urdf_text import BOUND_INERTIA, BOUND_MASS
+from morphgen.model.dynamics import GRAVITY
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Mimic
 from morphgen.typing import Array
@@ -24,9 +28,26 @@ if TYPE_CHECKING:
     import pinocchio
     import yourdfpy
 
+_SLIDE, _HINGE = 2, 3
+"""MuJoCo's types of the joints that a robot has."""
+
 Read = Callable[[Path, str, Mapping[str, Array], int], Reading]
-"""Function of the bundle's folder, a frame's name, the positions of every movable joint, shape (n,)
-[rad or m], and the number n of configurations."""
+"""Function of a folder, the name of a frame, or of none for the root, the positions of every
+movable joint, shape (n,) [rad or m], and the number n of configurations."""
+
+
+Change = Callable[[etree._Element, Path], None]
+"""Function of the root of a URDF, which it changes to what a loader reads, and of the file."""
+
+
+@dataclass(frozen=True)
+class Quirk:
+    """How a loader reads a URDF otherwise than morphgen."""
+
+    words: str
+    """What the loader does."""
+    change: Change
+    """Changes a URDF so that morphgen reads it as the loader does."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +60,10 @@ class Loader:
     """Import name of the library."""
     read: Read
     """Reads the file; raises ``FormatError`` if the library rejects it or lacks the frame."""
+    file: str
+    """The bundle's file that it reads."""
+    quirks: tuple[Quirk, ...] = ()
+    """What it reads otherwise in URDFs of others."""
 
 
 def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
@@ -46,11 +71,11 @@ def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
     import yourdfpy
 
     urdf = yourdfpy.URDF.load(str(folder / URDF), load_meshes=False)
-    if frame not in urdf.link_map:
+    if frame and frame not in urdf.link_map:
         raise FormatError(f"no link {frame!r}")
-    poses = np.empty((n, 4, 4))
+    poses = np.tile(np.eye(4), (n, 1, 1))
     driven = [name for name in urdf.actuated_joint_names if name in q]
-    for i in range(n):
+    for i in range(n if frame else 0):
         urdf.update_cfg({name: float(q[name][i]) for name in driven})
         poses[i] = urdf.get_transform(frame)
     links, joints = urdf.robot.links, urdf.robot.joints
@@ -83,7 +108,11 @@ def _yourdfpy_joint(joint: yourdfpy.Joint) -> JointReading:
 
 
 def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF with PyBullet, with a floating base, because a fixed one reports no mass."""
+    """Read the URDF with PyBullet, with a floating base, because a fixed one reports no mass.
+
+    The forces and inertia are those of a second body with a fixed base. PyBullet is asked for the
+    inertia of the file, instead of which it takes that of the collision shapes by default.
+    """
     with quiet():
         import pybullet
 
@@ -100,16 +129,15 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
             }
             joints = {name: _pybullet_joint(infos[i]) for name, i in movable.items()}
             links = {info[12].decode(): i for i, info in zip(indices, infos, strict=True)}
-            base = pybullet.getBodyInfo(body, physicsClientId=client)[0].decode()
+            links[pybullet.getBodyInfo(body, physicsClientId=client)[0].decode()] = -1
             mass = sum(
                 pybullet.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in (-1, *indices)
             )
-            if frame == base:
-                return Reading(joints, float(mass), np.tile(np.eye(4), (n, 1, 1)), mimics=None)
-            if frame not in links:
+            if frame and frame not in links:
                 raise FormatError(f"no link {frame!r}")
+            forces, inertia = _pybullet_dynamics(folder / URDF, list(movable), q, n, client)
             poses = np.tile(np.eye(4), (n, 1, 1))
-            for i in range(n):
+            for i in range(n if links.get(frame, -1) >= 0 else 0):
                 for name, index in movable.items():
                     if name in q:
                         pybullet.resetJointState(
@@ -125,7 +153,41 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
             raise FormatError(f"PyBullet: {error}") from error
         finally:
             pybullet.disconnect(client)
-    return Reading(joints, float(mass), poses, mimics=None)
+    return Reading(joints, float(mass), poses, mimics=None, forces=forces, inertia=inertia)
+
+
+def _pybullet_dynamics(
+    urdf: Path, names: Sequence[str], q: Mapping[str, Array], n: int, client: int
+) -> tuple[Array, Array]:
+    """Return the forces and the inertia; see ``Reading``."""
+    import pybullet
+
+    body = pybullet.loadURDF(
+        str(urdf),
+        useFixedBase=True,
+        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+        physicsClientId=client,
+    )
+    # Inverse dynamics takes gravity in the principal axes of the base, item 4 of its dynamics.
+    x, y, z, w = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)[4]
+    R_base_axes = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
+    gravity = R_base_axes.T @ (0.0, 0.0, -GRAVITY)
+    pybullet.setGravity(*gravity.tolist(), physicsClientId=client)
+    forces, inertia = _no_dynamics(names, n)
+    zero = [0.0] * len(names)
+    for i in range(len(forces) if names else 0):
+        positions = [float(q[name][i]) if name in q else 0.0 for name in names]
+        forces[i] = pybullet.calculateInverseDynamics(
+            body, positions, zero, zero, physicsClientId=client
+        )
+        inertia[i] = pybullet.calculateMassMatrix(body, positions, physicsClientId=client)
+    return forces, inertia
+
+
+def _no_dynamics(names: Sequence[str], n: int) -> tuple[Array, Array]:
+    """Return arrays for the forces and the inertia of n configurations."""
+    samples, joints = min(n, DYNAMICS_SAMPLES), len(names)
+    return np.zeros((samples, joints)), np.zeros((samples, joints, joints))
 
 
 def _pybullet_joint(info: Sequence[float]) -> JointReading:
@@ -149,12 +211,15 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
             model = pinocchio.buildModelFromUrdf(str(folder / URDF))
         except (ValueError, RuntimeError) as error:
             raise FormatError("Pinocchio: " + " ".join(str(error).split())) from error
+    model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
     kind = pinocchio.FrameType.BODY
-    if not model.existFrame(frame, kind):
+    if frame and not model.existFrame(frame, kind):
         raise FormatError(f"no link {frame!r}")
-    index, data = model.getFrameId(frame, kind), model.createData()
+    index, data = model.getFrameId(frame, kind) if frame else 0, model.createData()
     names = tuple(model.names)[1:]
     column = {name: model.idx_vs[k + 1] for k, name in enumerate(names)}
+    columns = list(column.values())
+    forces, inertia = _no_dynamics(names, n)
     poses = np.empty((n, 4, 4))
     for i in range(n):
         v = np.zeros(model.nv)
@@ -165,9 +230,16 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
         configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
         pinocchio.framesForwardKinematics(model, data, configuration)
         poses[i] = data.oMf[index].homogeneous
+        if i < len(forces):
+            load = pinocchio.computeGeneralizedGravity(model, data, configuration)
+            M = np.triu(pinocchio.crba(model, data, configuration))
+            forces[i] = load[columns]
+            inertia[i] = (M + np.triu(M, 1).T)[np.ix_(columns, columns)]
     joints = {name: _pinocchio_joint(model, model.getJointId(name)) for name in names}
     mass = float(sum(body.mass for body in model.inertias))
-    return Reading(joints, mass, poses, _pinocchio_mimics(folder / URDF))
+    return Reading(
+        joints, mass, poses, _pinocchio_mimics(folder / URDF), forces=forces, inertia=inertia
+    )
 
 
 def _pinocchio_mimics(urdf: Path) -> dict[str, Mimic] | None:
@@ -207,36 +279,69 @@ def _pinocchio_joint(model: pinocchio.Model, k: int) -> JointReading:
 
 
 def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo."""
+    """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo.
+
+    A free joint at the root is left out, and poses are relative to it.
+    """
     import mujoco
 
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / file))
     except ValueError as error:
         raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
+    # Forces and inertia are those of the bodies, without contacts and equalities.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.gravity[:] = 0.0, 0.0, -GRAVITY
     data = mujoco.MjData(model)
     sites = {model.site(i).name: i for i in range(model.nsite)}
     bodies = {model.body(i).name: i for i in range(model.nbody)}
-    if frame not in sites and frame not in bodies:
+    if frame and frame not in sites and frame not in bodies:
         raise FormatError(f"no site or body {frame!r}")
-    address = {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)}
+    movable = [i for i in range(model.njnt) if model.jnt_type[i] in (_SLIDE, _HINGE)]
+    # A joint without a name is called after its body, as morphgen's reader does.
+    names = [
+        model.joint(i).name or f"{model.body(model.jnt_bodyid[i]).name}_joint" for i in movable
+    ]
+    columns = model.jnt_dofadr[movable]
+    forces, inertia = _no_dynamics(names, n)
+    M = np.zeros((model.nv, model.nv))
+    for free in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        data.qpos[model.jnt_qposadr[free] :][:7] = 0, 0, 0, 1, 0, 0, 0
     poses = np.tile(np.eye(4), (n, 1, 1))
     for i in range(n):
-        for name in address.keys() & q.keys():
-            data.qpos[address[name]] = q[name][i]
+        for joint, name in zip(movable, names, strict=True):
+            if name in q:
+                data.qpos[model.jnt_qposadr[joint]] = q[name][i]
         mujoco.mj_kinematics(model, data)
-        frame_view = data.site(sites[frame]) if frame in sites else data.body(bodies[frame])
-        poses[i, :3, 3] = frame_view.xpos
-        poses[i, :3, :3] = frame_view.xmat.reshape(3, 3)
-    names = [model.joint(i).name for i in range(model.njnt)]
-    joints = {name: _mujoco_joint(model, i) for i, name in enumerate(names)}
+        if frame in sites:
+            poses[i, :3, 3] = data.site(sites[frame]).xpos
+            poses[i, :3, :3] = data.site(sites[frame]).xmat.reshape(3, 3)
+        elif frame:
+            R = data.body(bodies[frame]).xmat.reshape(3, 3)
+            poses[i, :3, 3] = data.body(bodies[frame]).xpos + R @ _anchor(model, bodies[frame])
+            poses[i, :3, :3] = R
+        if i < len(forces):
+            mujoco.mj_forward(model, data)
+            mujoco.mj_fullM(model, data, M)
+            forces[i] = data.qfrc_bias[columns]
+            inertia[i] = (M - np.diag(model.dof_armature))[np.ix_(columns, columns)]
+    joints = {name: _mujoco_joint(model, i) for i, name in zip(movable, names, strict=True)}
     return Reading(
         joints,
         float(model.body_mass.sum()),
         poses,
-        dict(_mujoco_mimics(model, names)),
+        dict(_mujoco_mimics(model)),
         has_actuators=file == MJCF,
+        forces=forces,
+        inertia=inertia,
     )
+
+
+def _anchor(model: mujoco.MjModel, body: int) -> Array:
+    """Return where a body has its last hinge, the origin of the link that morphgen makes of it."""
+    last = int(model.body_jntadr[body] + model.body_jntnum[body]) - 1
+    is_hinge = model.body_jntnum[body] > 0 and model.jnt_type[last] == _HINGE
+    return np.asarray(model.jnt_pos[last]) if is_hinge else np.zeros(3)
 
 
 def _mujoco_joint(model: mujoco.MjModel, i: int) -> JointReading:
@@ -267,14 +372,15 @@ def _mujoco_joint(model: mujoco.MjModel, i: int) -> JointReading:
     )
 
 
-def _mujoco_mimics(model: mujoco.MjModel, names: Sequence[str]) -> Iterator[tuple[str, Mimic]]:
+def _mujoco_mimics(model: mujoco.MjModel) -> Iterator[tuple[str, Mimic]]:
     """Yield the joints that an equality couples to another one, or to a constant."""
     import mujoco
 
     for k in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT).tolist():
         follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
         offset, multiplier = model.eq_data[k, :2].tolist()
-        yield names[follower], Mimic(names[leader] if leader >= 0 else "", multiplier, offset)
+        name = model.joint(leader).name if leader >= 0 else ""
+        yield model.joint(follower).name, Mimic(name, multiplier, offset)
 
 
 def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
@@ -284,11 +390,156 @@ def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
     return read_stage(folder / URDF, frame, q, n)
 
 
-LOADERS = (
-    Loader("yourdfpy", "yourdfpy", read_yourdfpy),
-    Loader("pybullet", "pybullet", read_pybullet),
-    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF)),
-    Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF)),
-    Loader("pinocchio", "pinocchio", read_pinocchio),
-    Loader("usd", "urdf_usd_converter", read_usd),
+def _add_inertia(root: etree._Element, urdf: Path) -> None:
+    for link in root.iterfind("link"):
+        if link.find("inertial") is None and link.get("name") != "world":
+            _set_inertial(link, 1.0, np.eye(3))
+
+
+def _add_solids(root: etree._Element, urdf: Path) -> None:
+    """Give links without inertia the one that MuJoCo makes of their shapes."""
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(str(urdf))
+    spec.compiler.fusestatic = False
+    spec.compiler.boundmass, spec.compiler.boundinertia = BOUND_MASS, BOUND_INERTIA
+    model = spec.compile()
+    for link in root.iterfind("link"):
+        if link.find("inertial") is None and link.find("collision") is not None:
+            body = model.body(link.get("name", ""))
+            w, x, y, z = body.iquat.tolist()
+            R = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
+            inertia = R @ np.diag(body.inertia) @ R.T
+            _set_inertial(link, float(body.mass[0]), inertia, body.ipos.tolist())
+
+
+def _set_inertial(
+    link: etree._Element, mass: float, inertia: Array, com: Sequence[float] = (0, 0, 0)
+) -> None:
+    for old in link.findall("inertial"):
+        link.remove(old)
+    element = etree.SubElement(link, "inertial")
+    etree.SubElement(element, "origin", xyz=" ".join(map(repr, com)))
+    etree.SubElement(element, "mass", value=repr(mass))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    values = inertia[np.triu_indices(3)].tolist()
+    etree.SubElement(element, "inertia", dict(zip(names, map(repr, values), strict=True)))
+
+
+def _drop_quaternions(root: etree._Element, urdf: Path) -> None:
+    for origin in root.iter("origin"):
+        origin.attrib.pop("quat_xyzw", "")
+
+
+def _empty_base(root: etree._Element, urdf: Path) -> None:
+    """Remove the inertia of the root and of the links that are fixed to it."""
+    parents = {}
+    for joint in root.iterfind("joint"):
+        parent, child = (joint.find(end) for end in ("parent", "child"))
+        if joint.get("type") == "fixed" and parent is not None and child is not None:
+            parents[child.get("link")] = parent.get("link")
+        elif child is not None:
+            parents[child.get("link")] = None
+    for link in root.iterfind("link"):
+        name = link.get("name")
+        while name is not None and name in parents:
+            name = parents[name]
+        if name is not None:
+            for inertial in link.findall("inertial"):
+                link.remove(inertial)
+
+
+def _count_massless(root: etree._Element, urdf: Path) -> None:
+    for mass in root.iterfind("link/inertial/mass"):
+        if float(mass.get("value") or 0) == 0:
+            mass.set("value", repr(BOUND_MASS))
+
+
+def _zero_impossible(root: etree._Element, urdf: Path) -> None:
+    for inertia in root.iterfind("link/inertial/inertia"):
+        xx, xy, xz, yy, yz, zz = (
+            float(inertia.get(name) or 0) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
+        if a < 0 or c > a + b:
+            for name in inertia.attrib:
+                inertia.set(name, "0")
+
+
+def _limit_continuous(root: etree._Element, urdf: Path) -> None:
+    for joint in root.iterfind("joint[@type='continuous']"):
+        limit = joint.find("limit")
+        if limit is not None and {"lower", "upper"} & set(limit.attrib):
+            joint.set("type", "revolute")
+
+
+def _zero_ranges(root: etree._Element, urdf: Path) -> None:
+    for limit in root.iterfind("joint/limit"):
+        if not {"lower", "upper"} & set(limit.attrib):
+            limit.set("lower", "0")
+            limit.set("upper", "0")
+
+
+def _open_zero_ranges(root: etree._Element, urdf: Path) -> None:
+    for limit in root.iterfind("joint/limit"):
+        if float(limit.get("lower") or 0) == float(limit.get("upper") or 0) == 0:
+            for name in ("lower", "upper"):
+                limit.attrib.pop(name, "")
+
+
+def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
+    """Let joints that mimic a missing one follow a fixed one, and so stay."""
+    joints = {joint.get("name"): joint.get("type") for joint in root.iterfind("joint")}
+    fixed = next((name for name, kind in joints.items() if kind == "fixed"), None)
+    for mimic in root.iterfind("joint/mimic"):
+        if mimic.get("joint") not in joints and fixed is not None:
+            mimic.set("joint", fixed)
+
+
+NO_QUATERNIONS = Quirk("reads no quat_xyzw", _drop_quaternions)
+COUNT_MASSLESS = Quirk("counts the inertia of links without mass", _count_massless)
+ZERO_RANGES = Quirk("reads a range that is missing as 0 to 0", _zero_ranges)
+YOURDFPY_QUIRKS = (
+    NO_QUATERNIONS,
+    Quirk("holds joints that mimic a missing one", _hold_lost_followers),
 )
+PYBULLET_QUIRKS = (
+    NO_QUATERNIONS,
+    COUNT_MASSLESS,
+    Quirk("gives links without inertia 1 kg and 1 kg m^2", _add_inertia),
+    Quirk("sets inertia that no body has to zero", _zero_impossible),
+    Quirk("limits continuous joints that name a range", _limit_continuous),
+)
+MUJOCO_QUIRKS = (
+    NO_QUATERNIONS,
+    Quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", _add_solids),
+    Quirk("joins the base to the world, without its mass", _empty_base),
+    Quirk("reads a range of 0 to 0 as none", _open_zero_ranges),
+)
+PINOCCHIO_QUIRKS = (COUNT_MASSLESS, ZERO_RANGES)
+USD_QUIRKS = (NO_QUATERNIONS, ZERO_RANGES)
+
+REFUSALS = {
+    "mass and inertia of moving bodies": "refuses moving links without mass or inertia",
+    r"A \+ B >= C": "refuses inertia that no body has",
+    "must have positive eigenvalues": "refuses inertia that is not positive",
+    "getLinkState failed": "returns no state of robots with more than 127 links",
+    "Mimic joint '.*' not found": "refuses a joint that mimics a missing one",
+}
+"""Causes of refusals by a pattern of the loader's message."""
+
+
+def refusal_causes(message: str) -> tuple[str, ...]:
+    """Return why a loader refused a file, in words; nothing if it is not known."""
+    return tuple(words for pattern, words in REFUSALS.items() if re.search(pattern, message))[:1]
+
+
+LOADERS = (
+    Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF, YOURDFPY_QUIRKS),
+    Loader("pybullet", "pybullet", read_pybullet, URDF, PYBULLET_QUIRKS),
+    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF, MUJOCO_QUIRKS),
+    Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF), MJCF),
+    Loader("pinocchio", "pinocchio", read_pinocchio, URDF, PINOCCHIO_QUIRKS),
+    Loader("usd", "urdf_usd_converter", read_usd, URDF, USD_QUIRKS),
+)
+"""Loaders of a bundle. Those of the URDF also read a URDF of others, that of the MJCF an MJCF."""

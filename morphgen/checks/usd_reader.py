@@ -26,7 +26,7 @@ def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
 
     Args:
         urdf: The robot's URDF.
-        frame: Name of the frame's link in the URDF.
+        frame: Name of the frame's link in the URDF; empty for the root.
         q: Positions of every movable joint, shape (n,) [rad or m].
         n: Number of configurations.
 
@@ -49,7 +49,7 @@ def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
             for body in joint.GetBody1Rel().GetTargets()
         }
         links = stage.GetDefaultPrim().GetChild("Geometry")
-        of_frame = [prim for prim in Usd.PrimRange(links) if _name(prim) == frame]
+        of_frame = [prim for prim in Usd.PrimRange(links) if _name(prim) == frame or not frame]
         if not of_frame:
             raise FormatError(f"no prim {frame!r}")
         T_world_root, T_world_frame = (

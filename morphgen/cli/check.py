@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -118,7 +117,7 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
 
 @command(
     "conform",
-    "compare robots in every loader and simulator, and measure how they hold their home",
+    "compare robots in every loader and simulator, and measure how they hold and move",
     opt.ROBOTS,
     option(
         "--samples",
@@ -130,11 +129,14 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
     opt.SEED,
     *opt.ROOT_LIBRARY_JSON,
     details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio; they are "
-    "compared in joints, limits, mimic joints, damping, gains, mass and tool pose. A robot then "
-    "holds its home for 5 s, with its files and in environments of MuJoCo and PyBullet. The exit "
-    "code is 1 if a loader disagrees or a joint drifts more than 0.02 rad or m; and 2 if a robot "
-    "cannot be read, which does not stop the others.",
-    examples=("conform ur5-plane", "conform robots/ --samples 1000"),
+    "compared in joints, limits, mimic joints, damping, gains, mass, tool pose, gravity torque "
+    "and inertia. A URDF, xacro or MJCF has rows for the file as it is, and for the bundle that "
+    "morphgen makes of it. A robot then holds its home for 5 s and steps each joint by 0.2 rad or "
+    "2 cm, with its files and in environments of MuJoCo and PyBullet. The exit code is 1 if a "
+    "loader disagrees about a bundle, or about a file without a known cause, if a joint drifts "
+    "more than 0.02 rad or m, or a step does not settle; and 2 if a robot cannot be read, which "
+    "does not stop the others.",
+    examples=("conform ur5-plane", "conform my_arm.urdf", "conform robots/ --samples 1000"),
 )
 def conform(args: argparse.Namespace) -> int:
     """Print a row per robot and loader, one per simulator, and the pairs that penetrate at home."""
@@ -153,21 +155,83 @@ def conform(args: argparse.Namespace) -> int:
     return 2 if refused else int(not all(report.passed for report in reports.values()))
 
 
+_LOADER_COLUMNS = {
+    "source": "source",
+    "loader": "loader",
+    "agrees": "passed",
+    "joints": "joints",
+    "mass": "mass",
+    "m off": "position_error",
+    "rad off": "rotation_error",
+    "limits": "limits",
+    "mimic": "mimic",
+    "damping": "damping",
+    "gains": "gains",
+    "gravity": "gravity_error",
+    "inertia": "inertia_error",
+}
+"""Fields of ``ConformanceRow`` by the titles of their columns."""
+_SIMULATOR_COLUMNS = {
+    "simulator": "simulator",
+    "passed": "passed",
+    "drift": "drift",
+    "joint": "joint",
+    "step off": "step_error",
+    "follower off": "follower_error",
+    "settles in s": "settling_time",
+}
+"""Fields of ``HoldRow`` by the titles of their columns."""
+_MAX_CELL = 22
+"""Number of characters of a robot's or joint's name in a table."""
+_MAX_NOTE = 400
+"""Number of characters of a row's message; ``--json`` has all."""
+
+
 def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
+    """Return the tables of loaders and simulators, each followed by what went wrong."""
+    sections = []
+    for rows_of, columns in (("rows", _LOADER_COLUMNS), ("holds", _SIMULATOR_COLUMNS)):
+        rows, notes = [], []
+        for label, report in reports.items():
+            name = Path(label).name
+            for row in getattr(report, rows_of):
+                cells = {title: _cell(getattr(row, each)) for title, each in columns.items()}
+                rows.append({"robot": name[:_MAX_CELL]} | cells)
+                if row.message:
+                    where = " ".join(
+                        filter(
+                            None, (cells.get("source"), cells.get("loader") or cells["simulator"])
+                        )
+                    )
+                    notes.append(f"{name}, {where}: {one_line(row.message)}"[:_MAX_NOTE])
+                notes += [f"    cause: {cause}"[:_MAX_NOTE] for cause in row.causes]
+        sections += [_table(rows), "\n".join(notes)]
+    sections.append(
+        "\n".join(
+            f"{Path(label).name}: at home, links {pair} penetrate by {1000 * depth:.3g} mm"
+            for label, report in reports.items()
+            for pair, depth in report.penetrations.items()
+        )
+    )
+    return "\n\n".join(filter(None, sections))
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
     from tabulate import tabulate
 
-    loaders, simulators = (
-        [
-            {"robot": Path(label).name, **asdict(row)}
-            for label, report in reports.items()
-            for row in rows_of(report)
-        ]
-        for rows_of in (attrgetter("rows"), attrgetter("holds"))
-    )
-    lines = [
-        f"{Path(label).name}: at home, links {pair} penetrate by {1000 * depth:.3g} mm"
-        for label, report in reports.items()
-        for pair, depth in report.penetrations.items()
-    ]
-    tables = [tabulate(rows, headers="keys", floatfmt=".2g") for rows in (loaders, simulators)]
-    return "\n\n".join([*tables, *(["\n".join(lines)] if lines else [])])
+    # As headers, the titles would be padded to more than 120 columns.
+    lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
+    return tabulate(lines, tablefmt="plain", disable_numparse=True)
+
+
+def _cell(value: str | bool | float | None) -> str:
+    """Return a value of a row as text; empty if there is none."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return "yes" if value else "NO"
+        case str():
+            return value[:_MAX_CELL]
+        case _:
+            return f"{value:.2g}"

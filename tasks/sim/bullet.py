@@ -27,6 +27,7 @@ from morphgen.tasks.sim.bullet_workers import (
 )
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 from morphgen.tasks.sim.short_arrays import TensorView, all_finite, mask_of
+from morphgen.typing import Array
 
 BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
 """Arguments of ``BulletBatch.reset``."""
@@ -168,6 +169,10 @@ class BulletSimulation:
     def close(self) -> None:
         """Free the clients and end the workers; a second call does nothing."""
         self._free()
+
+    def movable_q(self, env: int) -> Array:
+        """Return the positions of all movable joints of an environment of this process."""
+        return self._local_batches[0].movable_q(env)
 
     def _require_open(self) -> None:
         if not self._free.alive:

@@ -17,6 +17,7 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
 from morphgen.tasks.sim.motor_law import MotorForces, limited_speeds
 from morphgen.tasks.sim.short_arrays import clamp, consecutive, is_within
+from morphgen.typing import Array
 
 MAX_VELOCITY = 1e4
 """Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
@@ -222,6 +223,10 @@ class BulletBatch:
         if not is_sane:
             self._find_diverged()
         return dict(self._diverged)
+
+    def movable_q(self, env: int) -> Array:
+        """Return the positions of all movable joints of an environment, mimic joints included."""
+        return self._positions[self._spans[self._index[env]]].copy()
 
     def _undisturbed(
         self, desired: NDArray[np.float64]

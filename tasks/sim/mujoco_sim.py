@@ -192,6 +192,10 @@ class MujocoSimulation:
         self._control.release()
         self._work, self._data, self._worlds = [], [], []
 
+    def movable_q(self, env: int) -> Array:
+        """Return the positions of all movable joints of an environment, mimic joints included."""
+        return np.array(self._data[env].qpos[self._worlds[env].movable_q_at])
+
     def _put(self, env: int, q: Sequence[float], pose: Sequence[float]) -> None:
         """Put an environment's robot and block at rest at joint positions and a pose."""
         world, data = self._worlds[env], self._data[env]

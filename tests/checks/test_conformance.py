@@ -4,13 +4,17 @@ import re
 from dataclasses import replace
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 
 from helpers.robots import arm, rod
 from morphgen.checks import conformance as module
-from morphgen.checks.conformance import compare, conformance
+from morphgen.checks.conformance import compare, compare_file, conformance
+from morphgen.checks.readers import LOADERS as LOADER_TABLE
 from morphgen.errors import FormatError
+from morphgen.formats import urdf
 from morphgen.formats.bundle import write_bundle
+from morphgen.formats.resolve import default_finder
 from morphgen.model.geometry import Capsule, Pose, Shape
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 
@@ -260,3 +264,166 @@ def test_a_missing_actuator_is_noticed(tmp_path):
     row = next(row for row in conformance(folder, 2).rows if row.loader == "mujoco (mjcf)")
     assert row.gains is False
     assert "joint shoulder: stiffness nan" in row.message
+
+
+BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
+INERTIA = '<inertia ixx="0.01" iyy="0.02" izz="0.025" ixy="0" ixz="0" iyz="0"/>'
+LIMIT = '<limit lower="-1" upper="1" effort="5" velocity="1"/>'
+
+
+def pendulum(tmp_path, *, base=INERTIA, bar=INERTIA, kind="revolute", limit=LIMIT, tip=""):
+    """Write a bar on a base, with a tip that is fixed to it; return the file."""
+
+    def link(name, inertia):
+        mass = f'<inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>{inertia}</inertial>'
+        return f'<link name="{name}">{mass if inertia else ""}<collision>{BOX}</collision></link>'
+
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(
+        f"""<robot name="pendulum">{link("base", base)}{link("bar", bar)}
+        <link name="tip">{tip}</link>
+        <joint name="swing" type="{kind}"><parent link="base"/><child link="bar"/>
+          <origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>{limit}</joint>
+        <joint name="end" type="fixed"><parent link="bar"/><child link="tip"/>
+          <origin xyz="0.05 0 0.3"/></joint></robot>"""
+    )
+    return path
+
+
+def file_rows(path):
+    rows = compare_file(path, default_finder(), samples=20)
+    assert all(row.source == "file" for row in rows)
+    return {row.loader: row for row in rows if row.passed is not None}
+
+
+NO_BASE = ("joins the base to the world, without its mass",)
+KILOGRAM = ("gives links without inertia 1 kg and 1 kg m^2",)
+IMPOSSIBLE = '<inertia ixx="0.01" iyy="0.02" izz="0.05" ixy="0" ixz="0" iyz="0"/>'
+MASSLESS = f'<inertial><mass value="0"/>{INERTIA}</inertial>'
+TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
+
+
+@pytest.mark.parametrize(
+    ("changes", "causes"),
+    [
+        ({}, {"pybullet": KILOGRAM, "mujoco (urdf)": NO_BASE}),
+        ({"tip": TIP, "base": ""}, {"pybullet": KILOGRAM}),
+        (
+            {"tip": TIP, "bar": ""},
+            {
+                "pybullet": KILOGRAM,
+                "mujoco (urdf)": (
+                    "gives links without inertia that of their shapes, of 1000 kg/m^3",
+                    *NO_BASE,
+                ),
+            },
+        ),
+        (
+            {"tip": TIP, "bar": IMPOSSIBLE},
+            {
+                "pybullet": ("sets inertia that no body has to zero",),
+                "mujoco (urdf)": ("refuses inertia that no body has",),
+            },
+        ),
+        (
+            {"tip": MASSLESS},
+            {
+                "pybullet": ("counts the inertia of links without mass",),
+                "pinocchio": ("counts the inertia of links without mass",),
+                "mujoco (urdf)": NO_BASE,
+            },
+        ),
+        (
+            {"tip": TIP, "kind": "continuous"},
+            {
+                "pybullet": ("limits continuous joints that name a range",),
+                "mujoco (urdf)": NO_BASE,
+            },
+        ),
+        (
+            {"tip": TIP, "limit": '<limit effort="5" velocity="1"/>'},
+            {
+                "pinocchio": ("reads a range that is missing as 0 to 0",),
+                "usd": ("reads a range that is missing as 0 to 0",),
+                "mujoco (urdf)": NO_BASE,
+            },
+        ),
+        (
+            {"tip": TIP, "limit": LIMIT.replace("1", "0", 2)},
+            {"mujoco (urdf)": (*NO_BASE, "reads a range of 0 to 0 as none")},
+        ),
+    ],
+)
+def test_what_a_loader_does_with_a_file_is_named(changes, causes, tmp_path):
+    rows = file_rows(pendulum(tmp_path, **changes))
+    for loader, row in rows.items():
+        assert (row.passed, row.causes) == (loader not in causes, causes.get(loader, ())), row
+        assert bool(row.message) is (loader in causes)
+        assert not row.is_unexplained
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"com": (0.1, 0.0, 0.201)},
+        {"com": (0.101, 0.0, 0.2)},
+        {"mass": 2.001},
+        {"inertia": (0.01, 0.0, 0.0, 0.025, 0.0, 0.02)},
+    ],
+)
+def test_a_fault_of_our_reader_is_unexplained(wrong, tmp_path, monkeypatch):
+    """Loaders that compute forces and inertia see it; a bundle of the fault would hide it."""
+    read = urdf._inertial
+
+    def misread(element):
+        inertial = read(element)
+        return replace(inertial, **wrong) if inertial and inertial.mass == 2 else inertial
+
+    monkeypatch.setattr(urdf, "_inertial", misread)
+    rows = file_rows(pendulum(tmp_path, tip=TIP))
+    for name in {"pybullet", "mujoco (urdf)", "pinocchio"} & rows.keys():
+        assert rows[name].is_unexplained, rows[name]
+
+
+@pytest.mark.parametrize(("loader", "torque"), [("pybullet", -6.170), ("pinocchio", -4.274)])
+def test_gravity_torque_of_a_link_without_inertia(loader, torque, tmp_path):
+    inertial = '<inertial><origin xyz="{}" rpy="0.5 0.3 1.0"/><mass value="{}"/>{}</inertial>'
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        f"""<robot name="rot"><link name="base">{inertial.format("0 0 0", 1, INERTIA)}</link>
+        <link name="l1">{inertial.format("0.02 0.01 0.15", 2, INERTIA)}</link><link name="tool"/>
+        <link name="w">{inertial.format("0.1 0 0.05", 1, INERTIA)}</link>
+        <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/>
+          <origin xyz="0 0 0.1"/><axis xyz="1 0 0"/>{LIMIT}</joint>
+        <joint name="f0" type="fixed"><parent link="l1"/><child link="w"/>
+          <origin xyz="0 0 0.3" rpy="3.1416 -1.5708 0"/></joint>
+        <joint name="f1" type="fixed"><parent link="l1"/><child link="tool"/>
+          <origin xyz="0 0 0.3"/></joint></robot>"""
+    )
+    found = next(each for each in LOADER_TABLE if each.name == loader)
+    pytest.importorskip(found.module)
+    reading = found.read(tmp_path, "", {"j1": np.array([0.7])}, 1)
+    assert reading.forces == pytest.approx(np.array([[torque]]), abs=1e-3)
+
+
+def test_a_mjcf_of_others_is_compared_as_it_is(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco model="arm"><compiler angle="degree"/><option gravity="0 0 0"/>
+        <worldbody><body name="base" pos="0 0 1"><freejoint/><geom size="0.1"/>
+          <body name="bar" pos="0.1 0 0" euler="0 30 0"><joint name="swing" axis="0 1 0"
+            pos="0 0 0.02" range="-90 90" armature="0.3"/><geom size="0.05" pos="0.2 0 0"/>
+            <body name="tip" pos="0.3 0 0"><joint type="slide" axis="1 0 0" range="0 0.1"/>
+            <geom type="capsule" size="0.02 0.1"/></body></body></body></worldbody></mujoco>"""
+    )
+    (row,) = file_rows(path).values()
+    assert (row.loader, row.passed, row.message) == ("mujoco (mjcf)", True, "")
+    assert row.gravity_error < 1e-9
+    assert row.inertia_error < 1e-9
+
+
+def test_a_xacro_is_expanded_for_the_loaders(tmp_path):
+    path = pendulum(tmp_path, tip=TIP, base="").rename(tmp_path / "pendulum.xacro")
+    text = path.read_text().replace('value="2"', 'value="${1 + 1}"')
+    path.write_text(text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/xacro" ', 1))
+    assert file_rows(path)["mujoco (urdf)"].passed

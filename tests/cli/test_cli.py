@@ -246,7 +246,7 @@ def test_conform_compares_all_loaders(run, tmp_path):
     code, out, err = run("conform", folder, "--samples", "5")
     assert (code, err) == (0, "")
     for loader in ("yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"):
-        assert f"arm      {loader}" in out
+        assert f"bundle  {loader}" in out
 
 
 def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):

@@ -2,20 +2,36 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from helpers.robots import arm
 from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.api.robots import compose
 from morphgen.model.geometry import Pose, Shape, Sphere
+from morphgen.model.tree import subtree
 from morphgen.tasks.hold_home import hold_in_environment
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 
 @pytest.mark.parametrize("simulator", ["mujoco", PYBULLET])
-def test_an_arm_holds_home(simulator):
-    row = hold_in_environment(arm(), simulator)
+def test_an_arm_holds_home_and_steps(simulator):
+    robot = subtree(arm(), "base", without=["left", "right"])
+    row = hold_in_environment(robot, simulator)
     assert (row.simulator, row.passed, row.message) == (f"{simulator} (environment)", True, "")
     assert row.drift < 1e-5
+    assert row.step_error < 1e-3
+    assert 0.1 < row.settling_time < 0.5
+
+
+def test_mimic_joints_are_read_from_the_simulation(monkeypatch):
+    """The environment's own positions are those of the leaders only."""
+    real = MujocoSimulation.movable_q
+    monkeypatch.setattr(
+        MujocoSimulation, "movable_q", lambda *args: np.add(real(*args), [0, 0, 0, 0, 0.01])
+    )
+    row = hold_in_environment(arm(), "mujoco")
+    assert (row.joint, row.drift) == ("right", pytest.approx(0.01, rel=1e-3))
 
 
 @pytest.mark.parametrize("simulator", ["mujoco", PYBULLET])
@@ -35,5 +51,5 @@ def test_links_that_touch_at_home_are_named():
     assert hold_in_environment(robot, "mujoco").passed
     row = hold_in_environment(robot, "pybullet")
     assert row.passed is False
-    touching = "arm_j2n6s300_link_5, ee_f0_proximal are 0.0034 mm apart at home"
-    assert touching in row.message
+    margin = "come within PyBullet's collision margin, to 0.0034 mm"
+    assert f"arm_j2n6s300_link_5, ee_f0_proximal {margin}" in row.causes
