@@ -24,7 +24,7 @@ from morphgen.benchmark.split import Member, Side, Split, require_side, sided_me
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums
 from morphgen.benchmark.split_folder_files import sums_text
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
-from morphgen.formats.data_files import read_json
+from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
@@ -342,7 +342,7 @@ def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
 def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:
     """Read the goal set of a record in the index, and compare its checksum."""
     path = folder / record["file"]
-    content = path.read_bytes()
+    content = read_bytes(path)
     if _sha256(content) != record["sha256"]:
         raise BenchmarkError(f"{path} is not the file that {INDEX} was written for")
     goals = goals_from_npz(content, record["task"], path)

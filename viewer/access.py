@@ -84,10 +84,10 @@ def refusal_reason(policy: AccessPolicy, path: str, headers: Headers) -> str:
             f"a page of {origins[0][:100]!a} may not use this viewer; if it is yours, start the "
             "viewer with --allow-origin and its origin."
         )
-    query = dict(parse_qsl(urlsplit(path).query))
-    server = _split_url(query.get(_FOREIGN_SERVER, f"ws://{host}"))
-    foreign = server is None or not _is_viewer_name(policy, server.netloc.lower())
-    if _FOREIGN_FILE in query or foreign:
+    query = parse_qsl(urlsplit(path).query, keep_blank_values=True)
+    named = [value for key, value in query if key in (_FOREIGN_SERVER, _FOREIGN_FILE)]
+    # A browser takes the first of several values, other programs the last.
+    if len(named) > 1 or not all(_is_viewer_socket(policy, *pair) for pair in query):
         return f"an address with {_FOREIGN_SERVER}= or {_FOREIGN_FILE}= would show another server."
     return ""
 
@@ -123,6 +123,13 @@ def _is_viewer_name(policy: AccessPolicy, netloc: str) -> bool:
         or (policy.any_address and _is_ip_address(url.hostname))
         or any(url.netloc == urlsplit(origin).netloc for origin in policy.origins)
     )
+
+
+def _is_viewer_socket(policy: AccessPolicy, key: str, value: str) -> bool:
+    """Return whether a value of a query shows nothing but this viewer."""
+    server = _split_url(value) if key == _FOREIGN_SERVER else None
+    own = server is not None and _is_viewer_name(policy, server.netloc.lower())
+    return own or key not in (_FOREIGN_SERVER, _FOREIGN_FILE)
 
 
 def _is_allowed_origin(policy: AccessPolicy, origin: str, host: str) -> bool:

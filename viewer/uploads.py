@@ -31,7 +31,7 @@ from morphgen.formats.data_files import parse_json
 from morphgen.formats.mjcf_document import listed
 from morphgen.formats.resolve import PackageFinder, resolve_uri
 from morphgen.formats.urdf import MAX_URDF_BYTES, UnsoundError
-from morphgen.formats.xml import parse_xml
+from morphgen.formats.xml import parse_description
 from morphgen.formats.zip_files import (
     UNREADABLE,
     ZipLimits,
@@ -118,7 +118,7 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
     for path, data in stored.items():
         if PurePosixPath(path).name == CARD:
             _require_inner_card(path, data)
-        elif formats.get(path) or PurePosixPath(path).suffix == ".urdf":
+        elif formats.get(path) or PurePosixPath(path).suffix.lower() == ".urdf":
             _require_inner_paths(path, _root(documents, path), formats[path])
     roots = {path: _root(documents, path) for path in stored if formats.get(path) == "URDF"}
     mjcf = main if formats[main] == "MJCF" else None
@@ -167,7 +167,7 @@ def _parse_descriptions(unpacked: dict[str, bytes]) -> _Documents:
                     "together; leave out files that the robot does not need; nothing was kept"
                 )
             try:
-                documents[path] = parse_xml(data, path)
+                documents[path], _ = parse_description(data, path)
             except FormatError as error:
                 documents[path] = error
     return documents
@@ -195,8 +195,7 @@ def _is_kept(path: str) -> bool:
     file = PurePosixPath(path)
     return not _is_hidden(file) and (
         file.name in (CARD, PICTURE, PACKAGE)
-        or file.suffix in (".urdf", *_MESH_PARTS)
-        or file.suffix.lower() in MESH_SUFFIXES
+        or file.suffix.lower() in (".urdf", *_MESH_PARTS, *MESH_SUFFIXES)
     )
 
 
@@ -218,7 +217,7 @@ def _main_description(
     urdfs = [
         path
         for path, form in formats.items()
-        if form == "URDF" or (form is None and path.endswith(".urdf") and _is_kept(path))
+        if form == "URDF" or (form is None and path.lower().endswith(".urdf") and _is_kept(path))
     ]
     if urdfs:
         return min(urdfs, key=lambda path: (path.count("/"), path))

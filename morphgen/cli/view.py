@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import os
 import signal
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
 
 SIGNAL_POLL = 0.5
 """Longest delay before a signal is handled [s]."""
+STOP_GRACE = 5.0
+"""Time in which work has to end after a signal; then it is given up [s]."""
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
@@ -79,4 +84,19 @@ def _wait(host: str, viewer: Viewer) -> None:
     finally:
         for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
+        deadline = threading.Timer(STOP_GRACE, _give_up, (viewer,))
+        deadline.daemon = True
+        deadline.start()
         viewer.stop()
+
+
+def _give_up(viewer: Viewer) -> None:
+    """End the process although work still runs, such as a library that cannot be interrupted.
+
+    Python itself would wait for all threads, and for the worker processes.
+    """
+    for process in multiprocessing.active_children():
+        process.kill()
+    viewer.uploads.cleanup()
+    time.sleep(SIGNAL_POLL)  # without its processes, Python ends by itself unless a thread hangs
+    os._exit(0)

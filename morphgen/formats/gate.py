@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,9 +19,14 @@ from morphgen.formats.bundle import MJCF, URDF, mesh_file
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.description import is_mjcf
 from morphgen.formats.mjcf_compile import compile_document
-from morphgen.formats.mjcf_document import read_document
+from morphgen.formats.mjcf_document import read_document, remove_element
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
-from morphgen.formats.urdf import MAX_URDF_BYTES, require_description_file, robot_from_xml
+from morphgen.formats.urdf import (
+    MAX_URDF_BYTES,
+    require_description_file,
+    resolved_meshes,
+    robot_from_xml,
+)
 from morphgen.formats.urdf_schema import CHILDREN
 from morphgen.formats.xacro import expand
 from morphgen.formats.xml import parse_description
@@ -59,17 +65,18 @@ def loader_copy(
         FormatError: If a file cannot be read, is refused, or names one outside of its folder.
     """
     finder = finder or default_finder()
-    files = [path / URDF, path / MJCF] if path.is_dir() else [path]
     with TemporaryDirectory(prefix="morphgen-") as name:
         folder = Path(name)
-        for file in files:
-            if path.is_dir() and not file.exists():
-                continue  # a loader says that it is missing
-            require_description_file(file)
-            if file.name == MJCF if path.is_dir() else is_mjcf(file):
-                _copy_mjcf(file, folder, finder)
+        if not path.is_dir():
+            require_description_file(path)
+            if is_mjcf(path):
+                _copy_mjcf(path, folder, finder)
             else:
-                _copy_urdf(file, folder, finder, args or {})
+                _copy_urdf(path, folder, finder, args or {})
+        for file, copy in ((URDF, partial(_copy_urdf, args={})), (MJCF, _copy_mjcf)):
+            # Each loader says itself that its file is missing.
+            if path.is_dir() and (path / file).exists():
+                copy(resolve_uri(file, path / URDF, finder), folder, finder)
         yield folder
 
 
@@ -91,10 +98,15 @@ def _copy_urdf(path: Path, folder: Path, finder: PackageFinder, args: Mapping[st
         data = read_bytes(path, MAX_URDF_BYTES)
     robot_from_xml(data, path, finder)
     root, _ = parse_description(data, str(path))
+    meshes = resolved_meshes(root, path, finder).files
     _keep_known(root)
     copied = _mesh_copies(folder)
-    for element in root.iter("mesh"):
-        element.set("filename", copied(resolve_uri(element.get("filename", ""), path, finder)))
+    for shape in root.iterfind("link/*"):
+        # Of several geometries, loaders get the one that morphgen reads.
+        for surplus in (*shape.findall("geometry")[1:], *shape.findall("geometry/*")[1:]):
+            remove_element(surplus)
+        for element in shape.iterfind("geometry/mesh"):
+            element.set("filename", copied(meshes[element.get("filename", "")]))
     (folder / URDF).write_bytes(etree.tostring(root, encoding="utf-8"))
 
 

@@ -17,7 +17,7 @@ def read_efforts(model: mujoco.MjModel) -> dict[int, float]:
     """
     efforts: dict[int, float] = {}
     unlimited = set()
-    for k in range(model.nu):
+    for k in range(len(model.actuator_trntype)):
         if _TRN(model.actuator_trntype[k]) not in _JOINT_TRANSMISSIONS:
             continue
         joint = int(model.actuator_trnid[k, 0])
@@ -43,7 +43,11 @@ def _largest_force(model: mujoco.MjModel, actuator: int) -> float | None:
         and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
         and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
     )
-    if is_motor and model.actuator_ctrllimited[actuator]:
+    # From MuJoCo 4 on, an actuator may have several controls; a motor has one.
+    control = (
+        int(model.actuator_ctrladr[actuator]) if hasattr(model, "actuator_ctrladr") else actuator
+    )
+    if is_motor and model.actuator_ctrllimited[control]:
         gain = abs(float(model.actuator_gainprm[actuator, 0]))
-        return gain * float(abs(model.actuator_ctrlrange[actuator]).max())
+        return gain * float(abs(model.actuator_ctrlrange[control]).max())
     return None

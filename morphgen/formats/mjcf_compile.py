@@ -16,6 +16,10 @@ from morphgen.model.mesh_pieces import MAX_FACES
 
 _REFUSALS = (ValueError, mujoco.FatalError)
 """Exceptions by which MuJoCo refuses a document."""
+MAX_CONVEX_FACES = 50_000
+"""Largest number of triangles of a mesh whose inertia is that of its convex hull."""
+_FEWEST = 4
+"""Smallest number of vertices of a convex hull that MuJoCo accepts."""
 _ARRAYS = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "dof_damping", "dof_frictionloss", "key_qpos"),
@@ -61,6 +65,13 @@ def compile_document(
                     "read"
                 )
             asset = spec.mesh(name)
+            if asset.inertia != mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX:
+                asset.maxhullvert = _FEWEST  # the hull, which a robot does not have, takes long
+            elif len(triangles.faces) > MAX_CONVEX_FACES:
+                raise document.error(
+                    f"mesh {name!r} has inertia convex and {len(triangles.faces)} triangles; at "
+                    f"most {MAX_CONVEX_FACES} are read"
+                )
             asset.uservert = np.asarray(triangles.vertices, dtype=np.float64).ravel()
             asset.userface = np.asarray(triangles.faces, dtype=np.int32).ravel()
         try:

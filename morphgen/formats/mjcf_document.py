@@ -12,6 +12,7 @@ from lxml import etree
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolve_uri
+from morphgen.formats.structure import MAX_LINKS
 from morphgen.formats.urdf import UnsoundError
 from morphgen.formats.xacro_functions import RefusedError
 from morphgen.formats.xml import parse_description
@@ -25,6 +26,9 @@ MAX_DEPTH = 40
 """Deepest nesting of includes."""
 MAX_COPIES = 10_000
 """Largest number of elements that the ``<replicate>`` elements of an MJCF make."""
+MAX_ELEMENTS = {"*": 20_000, "body": MAX_LINKS, "default": 1000, "mesh": 2000, "replicate": 100}
+"""Largest number of elements of an MJCF with its includes, of all tags and of some. MuJoCo's time
+grows with the square of it."""
 GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
 """Types of geoms that a robot can have, for errors."""
 
@@ -108,7 +112,7 @@ def read_document(path: Path, finder: PackageFinder, *, with_options: bool = Fal
     includes = _Includes(path, finder)
     root, findings = includes.read(path, 0)
     etree.cleanup_namespaces(root)
-    _require_bounded_copies(root, path)
+    _require_few_elements(root, path)
     if not with_options:
         for element in [*root.iterchildren("option")]:
             root.remove(element)
@@ -219,7 +223,7 @@ def _keep_known(root: etree._Element, path: Path) -> None:
                 "a primitive geom"
             )
     for element in [*root.iter(*_LEFT_OUT)]:
-        _remove(element)
+        remove_element(element)
     for element in root.iter():
         if element.tag not in _ELEMENTS:
             raise FormatError(
@@ -238,9 +242,14 @@ def _require_plain(root: etree._Element, path: Path) -> None:
                 )
 
 
-def _require_bounded_copies(root: etree._Element, path: Path) -> None:
+def _require_few_elements(root: etree._Element, path: Path) -> None:
     if root.tag != "mujoco":
         raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
+    for tag, bound in MAX_ELEMENTS.items():
+        count = sum(1 for _ in root.iter(tag))
+        if count > bound:
+            what = "elements" if tag == "*" else f"<{tag}> elements"
+            raise FormatError(f"{path}: has {count} {what}; at most {bound} are read")
     copies = sum(_copies(element, path) for element in root.iter("replicate"))
     if copies > MAX_COPIES:
         raise FormatError(
@@ -302,7 +311,8 @@ def _drop(element: etree._Element, *keys: str) -> None:
             del element.attrib[key]
 
 
-def _remove(element: etree._Element) -> None:
+def remove_element(element: etree._Element) -> None:
+    """Remove an element from its parent, if it has one."""
     parent = element.getparent()
     if parent is not None:
         parent.remove(element)

@@ -34,6 +34,8 @@ _PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
 _PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
 _LICENCE_TAG = re.compile(rb"<license[^>]*>([^<]{1,200})<")
+_MAX_MANIFEST = 2**20
+"""Part of a ``package.xml`` that is searched for name and licence [bytes]."""
 _NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 
 
@@ -269,7 +271,7 @@ def package_source(file: FoundFile) -> dict[str, str]:
     The source is the pip distribution with its version, else the folder's name.
     """
     manifest = file.folder / "package.xml"
-    declared = _LICENCE_TAG.search(manifest.read_bytes()) if manifest.is_file() else None
+    declared = _LICENCE_TAG.search(_manifest_text(manifest)) if manifest.is_file() else None
     licence = declared[1].decode(errors="replace").strip() if declared else ""
     for name, folders in _DATA_ROOTS.items():
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -428,9 +430,14 @@ def _declared_name(folder: Path) -> str | None:
     return _read_name(manifest, manifest.stat().st_mtime_ns)
 
 
+def _manifest_text(manifest: Path) -> bytes:
+    with manifest.open("rb") as file:
+        return file.read(_MAX_MANIFEST)
+
+
 @lru_cache(maxsize=1024)
 def _read_name(manifest: Path, mtime_ns: int) -> str | None:
-    match = _NAME_TAG.search(manifest.read_bytes())
+    match = _NAME_TAG.search(_manifest_text(manifest))
     return match[1].decode(errors="replace") if match else None
 
 

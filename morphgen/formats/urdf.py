@@ -153,7 +153,7 @@ def robot_from_xml(
         raise UnsoundError(str(path), errors)
     for element in () if trusted else above_free_base(root):
         root.remove(element)
-    meshes = _resolved_meshes(root, path, finder)
+    meshes = resolved_meshes(root, path, finder)
     colours, unknown = _named_colours(root, str(path))
     link_list = [_link(element, meshes.files, colours) for element in root.iterfind("link")]
     links = {link.name: link for link in link_list}
@@ -234,7 +234,7 @@ class _Meshes:
     findings: list[Finding]
 
 
-def _resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
+def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
     """Find the files of all meshes; remove shapes whose mesh is missing, if the finder skips them.
 
     Raises:

@@ -1,7 +1,10 @@
 """``morphgen view``: serving, warnings and rejected input."""
 
+import os
 import re
 import signal
+import subprocess
+import sys
 import urllib.request
 from pathlib import Path
 
@@ -55,6 +58,50 @@ def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
     _, errors = viewing.communicate(timeout=60)
     assert (viewing.returncode, errors) == (0, "")
     assert list(tmp_path.glob("morphgen-uploads-*")) == []
+
+
+STUCK = {
+    "thread": "ThreadPoolExecutor(1).submit(os.read, os.pipe()[0], 1)",
+    "pipe that is opened": "ThreadPoolExecutor(1).submit(open, PIPE)",
+    "worker": "viewer.workers.submit(time.sleep, 10_000)",
+    "worker that opens a pipe": "viewer.workers.submit(os.open, PIPE, os.O_RDONLY)",
+}
+"""Work that never ends, which a viewer has begun."""
+
+
+@pytest.mark.parametrize("stuck", STUCK.values(), ids=STUCK)
+def test_work_that_hangs_does_not_keep_the_viewer_running(tmp_path, monkeypatch, stuck):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "stuck.py").write_text(
+        f"""
+import os, time
+from concurrent.futures import ThreadPoolExecutor
+from morphgen.cli import main
+from morphgen.viewer import app
+PIPE = {str(tmp_path / "pipe")!r}
+if __name__ == "__main__":
+    serve = app.serve
+    def serve_stuck(*arguments):
+        viewer = serve(*arguments)
+        {stuck}
+        return viewer
+    app.serve = serve_stuck
+    raise SystemExit(main(["view", "--port", "8936"]))
+"""
+    )
+    viewing = subprocess.Popen(
+        [sys.executable, tmp_path / "stuck.py"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    address(viewing)
+    (folder,) = tmp_path.glob("morphgen-uploads-*")
+    viewing.send_signal(signal.SIGTERM)
+    viewing.communicate(timeout=60)  # which ends once its workers have ended, too
+    assert viewing.returncode == 0
+    assert not folder.exists()
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
         ),
         (
             f"<worldbody>{'<body/>' * 1001}</worldbody>",
-            "it has 1002 bodies; at most 1000 are read",
+            "has 1001 <body> elements; at most 1000 are read",
         ),
         (
             '<worldbody><body name="a" pos="0 0 nan"><geom size="0.1"/></body></worldbody>',

@@ -88,6 +88,12 @@ def test_duplicate_host_or_origin_headers_are_rejected():
         "websocket=//[",
         "playbackPath=https://evil.example/a.viser",
         "playbackPath=a.viser",
+        "websocket=ws://localhost:8080&websocket=wss://evil.example",
+        "websocket=wss://evil.example&websocket=ws://localhost:8080",
+        "websocket=ws://localhost:8080&websocket=ws://localhost:8080",
+        "websocket=&websocket=wss://evil.example",
+        "%77ebsocket=wss://evil.example&websocket=ws://localhost:8080",
+        "playbackPath=&websocket=ws://localhost:8080",
     ],
 )
 def test_url_cannot_connect_to_another_server(query):

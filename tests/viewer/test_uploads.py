@@ -18,6 +18,7 @@ from helpers.viser_client import PlainClient
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
+from morphgen.model.mesh import mesh_parts
 from morphgen.viewer import uploads
 from morphgen.viewer.robot_files import bundle_files, thumbnail_of_picture, zip_files
 from morphgen.viewer.robot_uri import UriError, read_robot_uri
@@ -371,3 +372,37 @@ def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
 def test_a_picture_of_too_many_pixels_is_none(tmp_path):
     Image.new("1", (20_000, 20_000)).save(tmp_path / "preview.png")
     assert thumbnail_of_picture(tmp_path / "preview.png") == ""
+
+
+@pytest.mark.parametrize("change", [str.lower, str.upper, str.title])
+def test_suffixes_of_files_that_a_mesh_names_have_any_case(access, change):
+    library, texture, mesh = (f"part{change(suffix)}" for suffix in (".mtl", ".png", ".obj"))
+    picture = io.BytesIO()
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(picture, "png")
+    obj = (
+        f"mtllib {library}\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\n"
+        "f 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
+    )
+    files = {
+        "a.urdf": MESHED % mesh.encode(),
+        mesh: obj.encode(),
+        library: f"newmtl red\nmap_Kd {texture}\n".encode(),
+        texture: picture.getvalue(),
+    }
+    robot = read_robot_uri(store_upload("a.zip", archive(files), access), access)
+    (part,) = mesh_parts(robot.root.visuals[0].geometry.path)
+    assert part.rgba == (1, 0, 0, 1)
+
+
+@pytest.mark.parametrize("name", ["mjcf_include", "mjcf_replicate", "urdf"])
+def test_a_namespace_hides_nothing_in_an_upload(access, name):
+    text = {
+        "mjcf_include": b'<mujoco><worldbody><body name="a"><geom size="1"/>'
+        b'<include xmlns="x" file="more.xml"/></body></worldbody></mujoco>',
+        "mjcf_replicate": b'<mujoco><worldbody><body name="a"><geom size="1"/><replicate '
+        b'xmlns="x" count="3000000"><geom size="1"/></replicate></body></worldbody></mujoco>',
+        "urdf": b'<robot xmlns="x" name="r"><link name="a"/></robot>',
+    }[name]
+    with pytest.raises(MorphgenError, match=r"namespace|x}robot"):
+        read_robot_uri(store_upload("a.xml", text, access), access)
+    assert list(access.uploads.iterdir()) == []

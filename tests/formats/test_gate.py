@@ -1,0 +1,435 @@
+"""Every reader of strangers' robots, with every kind of reference out of the robot's folder."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import mujoco
+import pytest
+import trimesh
+
+from helpers.robots import arm
+from helpers.uploads import archive
+from morphgen.api.checks import conform
+from morphgen.checks.conformance import conformance
+from morphgen.errors import FormatError, MorphgenError
+from morphgen.formats.bundle import MJCF, URDF, read_robot, write_bundle
+from morphgen.formats.description import read_description
+from morphgen.formats.gate import loader_copy
+from morphgen.model.mesh import load_mesh
+from morphgen.model.robot import Robot
+from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
+from morphgen.viewer.uploads import store_upload
+
+URDF_TEXT = """<robot name="r"><link name="a"><visual><geometry><sphere radius="0.1"/></geometry>
+</visual>{}</link>{}</robot>"""
+MJCF_TEXT = """<mujoco model="r">{}<worldbody><body name="a"><geom size="0.1"/>{}</body></worldbody>
+</mujoco>"""
+MESH = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
+REFERENCES = {
+    "absolute path": "{outside}/{file}",
+    "parent folder": "../../../outside/{file}",
+    "parent folder, escaped": "..%2f..%2f../outside/{file}",
+    "file URI": "file://{outside}/{file}",
+    "package of another folder": "package://../outside/{file}",
+    "package in the file system": "package://outside/{file}",
+    "backslashes": "..\\..\\..\\outside\\{file}",
+    "network share": "\\\\{outside}\\{file}",
+    "link out of the folder": "link-{file}",
+    "linked folder": "linked/{file}",
+    "pipe": "pipe.{suffix}",
+    "device": "/dev/zero",
+    "linked device": "zero.{suffix}",
+    "folder": "folder.{suffix}",
+    "web": "https://localhost:1/{file}",
+}
+"""Every kind of reference that leaves the folder of a robot, or is no regular file."""
+URDF_ELEMENTS = {
+    "mesh": URDF_TEXT.format(MESH.format("{uri}"), ""),
+    "mesh with a namespace": URDF_TEXT.format(
+        MESH.format("{uri}").replace("<mesh", '<mesh xmlns="x"'), ""
+    ),
+    "texture": URDF_TEXT.format("", '<material name="m"><texture filename="{uri}"/></material>'),
+    "include": URDF_TEXT.format("", '<include file="{uri}"/>'),
+    "include in <mujoco>": URDF_TEXT.format("", '<mujoco><include file="{uri}"/></mujoco>'),
+    "asset in <mujoco>": URDF_TEXT.format(
+        "", '<mujoco><asset><mesh name="m" file="{uri}"/></asset></mujoco>'
+    ),
+    "signed distance field": URDF_TEXT.format(
+        "<collision><geometry><sdf filename='{uri}'/></geometry></collision>", ""
+    ),
+}
+MJCF_ELEMENTS = {
+    "include": MJCF_TEXT.format("", '<include file="{uri}"/>'),
+    "include with a namespace": MJCF_TEXT.format("", '<include xmlns="x" file="{uri}"/>'),
+    "include with a prefix": MJCF_TEXT.format("", '<x:include xmlns:x="x" file="{uri}"/>'),
+    "include in an include": MJCF_TEXT.format("", '<include file="inner.xml"/>'),
+    "mesh": MJCF_TEXT.format(
+        '<asset><mesh name="m" file="{uri}"/></asset>', '<geom type="mesh" mesh="m"/>'
+    ),
+    "mesh with a namespace": MJCF_TEXT.format(
+        '<asset><mesh xmlns="x" name="m" file="{uri}"/></asset>', '<geom type="mesh" mesh="m"/>'
+    ),
+    "mesh of a default class": MJCF_TEXT.format(
+        '<default><mesh file="{uri}"/></default><asset><mesh name="m"/></asset>',
+        '<geom type="mesh" mesh="m"/>',
+    ),
+    "height field": MJCF_TEXT.format(
+        '<asset><hfield name="m" file="{uri}" size="1 1 1 1"/></asset>', ""
+    ),
+    "texture": MJCF_TEXT.format('<asset><texture name="m" type="2d" file="{uri}"/></asset>', ""),
+    "texture of a cube": MJCF_TEXT.format(
+        '<asset><texture name="m" type="cube" fileup="{uri}"/></asset>', ""
+    ),
+    "skin": MJCF_TEXT.format('<deformable><skin name="m" file="{uri}"/></deformable>', ""),
+    "model": MJCF_TEXT.format(
+        '<asset><model name="m" file="{uri}"/></asset>', '<attach model="m" body="b" prefix="p"/>'
+    ),
+    "flexible body": MJCF_TEXT.format("", '<flexcomp name="f" type="mesh" file="{uri}"/>'),
+    "mesh attribute of a geom": MJCF_TEXT.format("", '<geom size="0.1" file="{uri}"/>'),
+}
+MESH_FILES = {
+    "material library": ("obj", "mtllib {uri}\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "buffer": (
+        "gltf",
+        '{{"asset": {{"version": "2.0"}}, "scenes": [{{"nodes": [0]}}], "nodes": [{{"mesh": 0}}], '
+        '"meshes": [{{"primitives": [{{"attributes": {{"POSITION": 0}}}}]}}], "accessors": '
+        '[{{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}}], "bufferViews": '
+        '[{{"buffer": 0, "byteLength": 36}}], "buffers": [{{"byteLength": 36, "uri": "{uri}"}}]}}',
+    ),
+    "image": (
+        "dae",
+        '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset/>'
+        '<library_images><image id="i"><init_from>{uri}</init_from></image></library_images>'
+        "</COLLADA>",
+    ),
+}
+
+
+def upload(path):
+    """Store a file, and the regular files beside it, as an upload; read it as a page does."""
+    uploads = path.parent.parent / "uploads"
+    uploads.mkdir(exist_ok=True)
+    access = FileAccess((), (path.parent,), uploads)
+    names = [each for each in sorted(path.parent.iterdir()) if each.is_file() and each != path]
+    near = {each.name: each.read_bytes() for each in names if not each.is_symlink()}
+    stored = store_upload("a.zip", archive({path.name: path.read_bytes(), **near}), access)
+    return read_robot_uri(stored, access)
+
+
+def copy(path):
+    """Return the bytes of the copy that loaders get."""
+    with loader_copy(path) as folder:
+        return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+READERS = {
+    "description": read_description,
+    "robot": read_robot,
+    "copy for loaders": copy,
+    "upload": upload,
+}
+"""Everything that reads a description."""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A robot's folder with links, a pipe and a folder; sound files lie beside it."""
+    inside, outside = tmp_path / "a" / "robot", tmp_path / "outside"
+    inside.mkdir(parents=True)
+    outside.mkdir()
+    (outside / "secret.xml").write_text('<mujoco><geom name="secret" size="0.3"/></mujoco>')
+    trimesh.creation.box((1, 1, 1)).export(outside / "secret.stl")
+    (outside / "secret.png").write_bytes(b"secret")
+    (inside / "linked").symlink_to(outside)
+    for suffix in ("xml", "stl", "png"):
+        (inside / f"link-secret.{suffix}").symlink_to(outside / f"secret.{suffix}")
+        (inside / f"zero.{suffix}").symlink_to("/dev/zero")
+        os.mkfifo(inside / f"pipe.{suffix}")
+        (inside / f"folder.{suffix}").mkdir()
+    return inside
+
+
+@pytest.fixture(autouse=True)
+def _no_pipe_blocks():
+    """Fail, instead of waiting for ever, if something opens a pipe."""
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def reference(kind, suffix, folder):
+    outside = folder.parent.parent / "outside"
+    return REFERENCES[kind].format(outside=outside, file=f"secret.{suffix}", suffix=suffix)
+
+
+def block_outside(folder):
+    """Replace the files outside of the folder by pipes, which block whoever opens one."""
+    for file in (folder.parent.parent / "outside").iterdir():
+        file.unlink()
+        os.mkfifo(file)
+
+
+def require_nothing_of_outside(read, path):
+    """Require that a reader refuses a file, or returns nothing that lies outside its folder."""
+    try:
+        result = read(path)
+    except MorphgenError:
+        return
+    text = repr(result)
+    for name in ("secret", "outside", "pipe", "zero", "0.3,"):
+        assert name not in text.replace(str(path.parent), "")
+
+
+@pytest.mark.parametrize("kind", REFERENCES)
+@pytest.mark.parametrize("reader", READERS)
+def test_a_description_reads_nothing_outside_its_folder(reader, kind, folder):
+    for is_blocked in (False, True):
+        if is_blocked:
+            block_outside(folder)
+        for element, text in URDF_ELEMENTS.items():
+            path = folder / "robot.urdf"
+            suffix = "png" if element == "texture" else "stl"
+            path.write_text(text.replace("{uri}", reference(kind, suffix, folder)))
+            require_nothing_of_outside(READERS[reader], path)
+        for element, text in MJCF_ELEMENTS.items():
+            path = folder / "robot.xml"
+            suffix = next(
+                (s for s in ("xml",) if "include" in element or element == "model"), "stl"
+            )
+            uri = reference(kind, suffix, folder)
+            (folder / "inner.xml").write_text(f'<mujoco><include file="{uri}"/></mujoco>')
+            path.write_text(text.replace("{uri}", uri))
+            require_nothing_of_outside(READERS[reader], path)
+            (folder / "inner.xml").unlink()
+        for suffix, text in MESH_FILES.values():
+            uri = reference(kind, "png", folder)
+            (folder / f"mesh.{suffix}").write_text(text.format(uri=uri))
+            path = folder / "robot.urdf"
+            path.write_text(URDF_TEXT.format(MESH.format(f"mesh.{suffix}"), ""))
+            require_nothing_of_outside(lambda path: mesh_of(READERS[reader](path)), path)
+
+
+def mesh_of(result):
+    """Return the triangles of a robot's mesh; the result itself if it is no robot."""
+    shapes = result.links[0].collisions if isinstance(result, Robot) else ()
+    return [load_mesh(shape.geometry).vertices for shape in shapes] or result
+
+
+@pytest.mark.parametrize("kind", REFERENCES)
+def test_the_folders_of_an_mjcf_compiler_do_not_lead_outside(kind, folder):
+    block_outside(folder)
+    for attribute in ("meshdir", "assetdir", "texturedir"):
+        for file in ("secret.stl", "../outside/secret.stl", "link-secret.stl"):
+            path = folder / "robot.xml"
+            where = reference(kind, "stl", folder).removesuffix("/secret.stl")
+            path.write_text(
+                MJCF_TEXT.format(
+                    f'<compiler {attribute}="{where}"/>'
+                    f'<asset><mesh name="m" file="{file}"/></asset>',
+                    '<geom type="mesh" mesh="m"/>',
+                )
+            )
+            for read in READERS.values():
+                with pytest.raises(MorphgenError):
+                    read(path)
+
+
+NAMESPACES = {
+    "include": '<include xmlns="x" file="inner.xml"/>',
+    "replicate": '<replicate xmlns="x" count="3000000"><body><geom size=".1"/></body></replicate>',
+    "prefix": '<x:replicate xmlns:x="x" count="3000000"><geom size=".1"/></x:replicate>',
+    "prefix without a declaration": '<x:include file="inner.xml"/>',
+    "attribute": '<geom size="1" x:file="a" xmlns:x="x"/>',
+    "attribute of XML": '<geom size="1" xml:base="inner.xml"/>',
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("name", NAMESPACES)
+def test_an_mjcf_with_namespaces_is_refused(name, reader, folder):
+    path = folder / "robot.xml"
+    path.write_text(MJCF_TEXT.format("", NAMESPACES[name]))
+    with pytest.raises(MorphgenError, match=r"has the namespace .*; names in an MJCF have none"):
+        READERS[reader](path)
+
+
+@pytest.mark.parametrize(
+    "encode",
+    [
+        lambda text: text.encode("utf-16"),
+        lambda text: ('<?xml version="1.0" encoding="iso-8859-1"?>' + text).encode("latin-1"),
+        lambda text: ("<!-- <a> --><?x y?>" + text).encode(),
+        lambda text: text.replace("include ", "<![CDATA[ ]]><include ").encode(),
+    ],
+)
+def test_no_spelling_of_xml_hides_an_include(encode, folder):
+    path = folder / "robot.xml"
+    for text in (
+        '<include file="../outside/secret.xml"/>',
+        '<include file="&#46;./outside/secret.xml"/>',
+        "<include file='../outside/secret.xml'></include>",
+    ):
+        path.write_bytes(encode(MJCF_TEXT.format("", text)))
+        for read in READERS.values():
+            with pytest.raises(MorphgenError):
+                read(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<mujoco><include file="../outside/secret.xml"/></mujoco>',
+        '<mujoco><include xmlns="x" file="../outside/secret.xml"/></mujoco>',
+        '<mujoco><include file="pipe.xml"/></mujoco>',
+        "pipe.xml",
+        "link-secret.xml",
+    ],
+)
+def test_loaders_get_nothing_of_a_bundle_unchecked(text, folder):
+    bundle = write_bundle(arm(), folder.parent / "bundle", picture=False)
+    (bundle / MJCF).unlink()
+    if text.startswith("<"):
+        (folder / "pipe.xml").rename(bundle / "pipe.xml")
+        (bundle / MJCF).write_text(text)
+    else:
+        (folder / text).rename(bundle / MJCF)
+    for compare in (conform, conformance):
+        with pytest.raises(FormatError):
+            compare(bundle, samples=1)
+
+
+def test_loaders_get_the_robot_with_its_meshes(folder):
+    trimesh.creation.box((1, 1, 1)).export(folder / "box.stl")
+    (folder / "inner.xml").write_text(
+        '<mujoco><asset><mesh name="m" file="box.stl" scale="2 2 2"/></asset></mujoco>'
+    )
+    path = folder / "robot.xml"
+    path.write_text(
+        MJCF_TEXT.format(
+            '<option timestep="0.001"/><size memory="900G"/><include file="inner.xml"/>',
+            '<geom name="box" type="mesh" mesh="m" density="1"/><site name="s"/>',
+        )
+    )
+    with loader_copy(path) as copied:
+        model = mujoco.MjModel.from_xml_path(str(copied / MJCF))
+        assert model.opt.timestep == 0.001
+        assert model.geom("box").size == pytest.approx([1, 1, 1])
+        assert sorted(each.suffix for each in copied.iterdir()) == [".stl", ".xml"]
+    assert not copied.exists()
+    path = folder / "robot.urdf"
+    path.write_text(
+        URDF_TEXT.format(
+            MESH.format("box.stl"),
+            '<mujoco><compiler meshdir="/etc" fusestatic="false"/><size memory="900G"/></mujoco>'
+            '<gazebo><plugin filename="x.so"/></gazebo>',
+        )
+    )
+    with loader_copy(path) as copied:
+        assert "gazebo" not in (copied / URDF).read_text()
+        assert "/etc" not in (copied / URDF).read_text()
+        model = mujoco.MjModel.from_xml_path(str(copied / URDF))
+        assert model.nmesh == 1
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from morphgen.errors import MorphgenError
+from morphgen.formats.mjcf_read import read_mjcf
+resource.setrlimit(resource.RLIMIT_CPU, (120, 120))
+for file in sys.argv[1:]:
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    try:
+        read_mjcf(Path(file))
+    except MorphgenError as error:
+        assert "\\n" not in str(error)
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    if after.ru_utime - before.ru_utime > 10 or after.ru_maxrss > 2**20:
+        print(Path(file).name, after.ru_utime - before.ru_utime, after.ru_maxrss)
+"""
+"""Reads files and prints those that took more than 10 s of CPU or 1 GiB of memory."""
+JOINTS = '<joint name="j" range="-1 1"/>'
+HUGE = {
+    "pairs": (20_000, "contact", '<exclude body1="world" body2="a"/>'),
+    "couplings": (20_000, "equality", '<joint joint1="j"/>'),
+    "tendons": (20_000, "tendon", '<fixed><joint joint="j" coef="1"/></fixed>'),
+    "motors": (20_000, "actuator", '<motor joint="j"/>'),
+    "classes": (20_000, "default", '<default class="c#"/>'),
+    "meshes": (20_000, "asset", '<mesh name="m#" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'),
+    "materials": (20_000, "asset", '<material name="m#"/>'),
+    "keyframes": (20_000, "keyframe", "<key/>"),
+    "replicates": (20_000, "worldbody", '<replicate count="1"/>'),
+    "copies": (1, "worldbody", '<replicate count="9999"><geom size="1"/></replicate>'),
+    "cameras": (19_000, "worldbody", "<camera/>"),
+    "sites": (19_000, "worldbody", "<site/>"),
+    "bodies": (19_000, "worldbody", '<body><geom size="1"/></body>'),
+    "any": (1_000_000, "worldbody", "<frame/>"),
+    "height field": (1, "asset", '<hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/>'),
+    "texture": (1, "asset", '<texture type="2d" builtin="flat" width="99999" height="99999"/>'),
+    "built-in mesh": (1, "asset", '<mesh name="m" builtin="supersphere" params="9999 1 1"/>'),
+    "hull": (
+        1,
+        "asset",
+        '<mesh name="m" maxhullvert="2000000000" vertex="0 0 0 1 0 0 0 1 0 0 1 1"/>',
+    ),
+    "memory": (1, "", '<size memory="900G"/>'),
+    "user values": (1, "", '<size nuser_geom="99999999" nuserdata="999999999"/>'),
+    "numbers": (1, "custom", '<numeric name="n" size="999999999"/>'),
+    "sensor": (1, "sensor", '<user dim="999999999"/>'),
+    "grid of points": (1, "worldbody", '<flexcomp name="f" type="grid" count="999 999 999"/>'),
+    "grid of bodies": (1, "worldbody", '<composite type="grid" count="999 999 999"/>'),
+    "activations": (1, "actuator", '<general joint="j" dyntype="user" actdim="999999999"/>'),
+    "delays": (1, "actuator", '<motor joint="j" nsample="999999999" delay="1"/>'),
+}
+"""Count, section and element of documents that ask for more than a robot needs."""
+
+
+@pytest.mark.slow
+def test_no_mjcf_takes_more_memory_or_time_than_a_stranger_may(tmp_path):
+    files = []
+    for name, (count, section, element) in HUGE.items():
+        content = "".join(element.replace("#", str(i)) for i in range(min(count, 200_000)))
+        files.append(tmp_path / f"{name}.xml")
+        files[-1].write_text(
+            MJCF_TEXT.format(f"<{section}>{content}</{section}>" if section else content, JOINTS)
+        )
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *files], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr[-2000:]) == (0, "", "")
+
+
+@pytest.mark.slow
+def test_no_number_of_mujocos_schema_takes_the_memory_of_the_machine(tmp_path):
+    """Every attribute of every element of MuJoCo's own schema, with a huge number."""
+    schema = mujoco.mj_printSchema(True, False).replace("&nbsp;", " ")
+    rows = re.findall(r'class="el">(.*?)</td>.*?class="at">(.*?)</td>', schema, re.DOTALL)
+    stack, files = [], []
+    for name, attributes in rows:
+        depth = (len(name) - len(name.lstrip())) // 4
+        stack = [*stack[:depth], name.strip()]
+        section = "worldbody" if stack[1:2] == ["(world)body"] else "".join(stack[1:2])
+        known = re.sub("<.*?>", "", attributes).split() if len(stack) > 1 else ()
+        for attribute in known:
+            values = {
+                key: text for key, text in {"joint": "j", "name": "n"}.items() if key in known
+            }
+            values[attribute] = "999999999"
+            text = " ".join(f'{key}="{value}"' for key, value in values.items())
+            element = f"<{stack[-1]} {text}/>"
+            inside = f"<{section}>{element}</{section}>" if len(stack) > 2 else element
+            files.append(tmp_path / f"{len(files)}.xml")
+            files[-1].write_text(MJCF_TEXT.format(inside, JOINTS))
+    assert len(files) > 500
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", LIMITED, *files],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr[-2000:]) == (0, "", "")
