@@ -18,8 +18,18 @@ from morphgen.tasks.sim.warp_model import Structure, dof_leaders, put_model
 
 CONTACTS_PER_WORLD, FEWEST_CONTACTS = 24, 1024
 """Number of contacts that the memory of a group holds: for each world on average, and at least."""
-IGNORED_OVERFLOW = int(OverflowType.EPA_HORIZON | OverflowType.CONTACT_MATCH)
-"""Overflows that lose no contact."""
+IGNORED_OVERFLOW = int(
+    OverflowType.EPA_HORIZON
+    | OverflowType.CONTACT_MATCH
+    | OverflowType.ITERATIONS
+    | OverflowType.LS_ITERATIONS
+)
+"""Overflows that lose no contact.
+
+Two are not about memory: the solver, or its line search, stopped at its number of iterations. It
+then goes on with the last forces, as MuJoCo does; in single precision many worlds that press links
+together never reach the tolerance.
+"""
 
 
 class Group:

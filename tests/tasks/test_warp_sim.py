@@ -173,6 +173,21 @@ def test_contacts_that_do_not_fit_are_reported(monkeypatch):
     assert sim.counts[0, 1] == 1
 
 
+@pytest.mark.parametrize("aside", [-0.01, 0.0, 0.01])
+def test_a_solver_that_stops_at_its_last_iteration_has_not_diverged(aside):
+    scenes = [push_scene()]
+    sim = simulation(scenes)
+    (group,) = sim._groups
+    group.model.opt.iterations, group.model.opt.tolerance = 1, wp.zeros(1, dtype=float)
+    poses = block_poses(scenes)
+    poses[0, 0] += aside
+    sim.reset(torch.tensor([True]), sim.q.clone(), poses)
+    assert not sim.step(sim.q).any()
+    assert group.data.overflow.numpy()[0] & warp_group.OverflowType.ITERATIONS
+    assert sim.faults() == {}
+    assert sim.counts.tolist() == [[0, 0]]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("aside", [0.0, 0.05])
 def test_blocks_are_pushed_as_in_mujoco(aside):
