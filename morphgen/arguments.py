@@ -2,11 +2,72 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from numbers import Integral
+from os import PathLike
+from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, SignatureError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def checked_signature(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a public function whose errors about its arguments name those that it has."""
+    signature = inspect.signature(function)
+    parameters = [each.replace(annotation=each.empty) for each in signature.parameters.values()]
+    shown = signature.replace(parameters=parameters, return_annotation=signature.empty)
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            name = function.__qualname__
+            raise SignatureError(f"{name}: {error}; expected {name}{shown}") from None
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:
+    """Return the path that a text or another path names.
+
+    Args:
+        name: Name of the argument, for the message.
+        value: Its value.
+        error: Class of the error.
+
+    Raises:
+        MorphgenError: Of that class, if it is something else, or no path can have this name.
+    """
+    if isinstance(value, str | PathLike):
+        path = Path(value)
+        if "\0" not in str(path):
+            return path
+    raise error(f"{name} {value!r}: expected a path")
+
+
+def text_argument(name: str, value: object, error: type[MorphgenError]) -> str:
+    """Return a text.
+
+    Args:
+        name: Name of the argument, for the message.
+        value: Its value.
+        error: Class of the error.
+
+    Raises:
+        MorphgenError: Of that class, if it is something else.
+    """
+    if isinstance(value, str):
+        return value
+    raise error(f"{name} {value!r}: expected a text")
 
 
 def whole_number(

@@ -18,6 +18,7 @@ from multiprocessing import get_context, parent_process, resource_tracker
 from types import ModuleType
 from typing import Any, TypeVar
 
+from morphgen.arguments import whole_number
 from morphgen.errors import MissingDependencyError, MorphgenError
 
 T = TypeVar("T")
@@ -64,8 +65,7 @@ def parallel_map(
     Raises:
         MorphgenError: If ``jobs`` is below 1 or a process died. Errors of ``work`` are passed on.
     """
-    if jobs < 1:
-        raise MorphgenError(f"{jobs} jobs: expected 1 or more")
+    jobs = whole_number("jobs", jobs, MorphgenError, 1)
     chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
     results = map(work, items) if jobs <= 1 else _in_processes(work, chunks, jobs)

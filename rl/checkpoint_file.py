@@ -15,7 +15,7 @@ import pickletools
 import struct
 import zipfile
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
     return {key: in_main_memory(value) for key, value in data.items()}, digest is not None
 
 
-@cache
+@lru_cache(maxsize=1024)
 def warn_of_no_hash(file: Path) -> None:
     """Warn once per file."""
     _log.warning(

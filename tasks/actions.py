@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -59,7 +59,7 @@ def decode_actions(
     return numbers if is_host(device) else torch.where(is_valid, numbers, torch.nan)
 
 
-@cache
+@lru_cache(maxsize=16)
 def _bins(device: torch.device) -> torch.Tensor:
     """Return ``BINS`` on a device."""
     return torch.tensor(BINS, device=device)

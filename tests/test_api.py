@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -343,3 +344,54 @@ def test_importing_morphgen_loads_no_heavy_package():
     code = f"import sys, morphgen; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+NOT_TEXTS = (5, None, [3], {}, 1.5, b"x", object())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda value: morphgen.compose(arm=value if value not in (5, 1.5) else None),
+        lambda value: morphgen.compose("prims", geometry=value),
+        lambda value: morphgen.read(value),
+        lambda value: morphgen.write("prims", value),
+        lambda value: morphgen.sample(value, 1),
+        lambda value: morphgen.split(value),
+        lambda value: morphgen.make_env(value),
+        lambda value: morphgen.make_env("reach", "prims", kind=value),
+        lambda value: morphgen.similarity(value),
+        lambda value: morphgen.similarity(["prims", "z1-plane"], [value]),
+        lambda value: morphgen.check(value),
+    ],
+)
+def test_values_that_are_no_texts_give_one_clear_error(call):
+    for value in NOT_TEXTS:
+        with pytest.raises(MorphgenError) as caught:
+            call(value)
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_arguments_that_a_function_lacks_are_named_with_those_that_it_has(name):
+    function = getattr(morphgen, name)
+    for arguments in (range(9), ("ur5", "plane", "robots", "more", "and", "more")):
+        with pytest.raises(
+            MorphgenError, match=rf"^{name}: too many positional .*; expected {name}\("
+        ) as caught:
+            function(*arguments)
+        assert isinstance(caught.value, TypeError)
+    assert pickle.loads(pickle.dumps(function)) is function
+
+
+def test_the_signature_of_compose_is_shown():
+    with pytest.raises(MorphgenError, match=r"expected compose\(request='', \*, name=None, geom"):
+        morphgen.compose("ur5", "plane")
+    with pytest.raises(MorphgenError, match=r"write: missing a required argument: 'folder'; expec"):
+        morphgen.write("prims")
+    with pytest.raises(MorphgenError, match="folder 5: expected a path"):
+        morphgen.write("prims", 5)
+    with pytest.raises(MorphgenError, match="arm None: expected a text or a number"):
+        morphgen.compose(arm=None)
+    with pytest.raises(MorphgenError, match=r"^read: got an unexpected keyword argument 'rot'; ex"):
+        morphgen.read("x", rot="y")

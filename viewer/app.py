@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import socket
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -111,8 +110,6 @@ def serve(
         return viewer is not None and _receive(viewer, token, query)
 
     server = start_server(host, port, policy, receive)
-    # Work that ends after its browser has disconnected still writes to the page; that is harmless.
-    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
     _accept_browsers(viewer)
     return viewer

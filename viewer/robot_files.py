@@ -16,7 +16,7 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
-from morphgen.formats.bundle import CARD, MJCF, PICTURE, URDF, write_bundle
+from morphgen.formats.bundle import CARD, MJCF, PICTURE, write_bundle
 from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import framed_height, render
 from morphgen.formats.zip_files import write_entries
@@ -131,7 +131,7 @@ def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     }
     with tempfile.TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / "robot", picture=False)
-        picture = render(robot, bundle / URDF, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
+        picture = render(robot, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
     if ":" not in uri and is_robot_folder(files.path(uri)):
         _store_picture(files.path(uri) / PICTURE, picture)
     return Thumbnail(_data_url(picture), facts)

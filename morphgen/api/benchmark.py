@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from morphgen.arguments import checked_signature, text_argument
 from morphgen.benchmark import tokens as encoding
 from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
 from morphgen.benchmark.token_layout import default_max_links
@@ -17,6 +19,7 @@ from morphgen.grammar.robot_source import RobotLike, resolve_robot, robot_list
 from morphgen.typing import Array
 
 
+@checked_signature
 @explain_missing_extras()
 def tokens(
     robot: RobotLike,
@@ -52,9 +55,15 @@ def tokens(
     parts = default_library(library)
     loaded = resolve_robot(robot, parts)
     size = default_max_links([len(loaded.links)]) if max_links is None else max_links
+    if q is not None:
+        try:
+            q = np.asarray(q, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise BenchmarkError(f"q {q!r}: expected joint positions") from None
     return encoding.tokens(loaded, token_shapes(loaded, parts.folders), q, max_links=size)
 
 
+@checked_signature
 @explain_missing_extras()
 def similarity(
     robots: Iterable[RobotLike],
@@ -89,7 +98,10 @@ def similarity(
         MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
         MorphgenError: If a robot cannot be composed or read.
     """
-    names = [measures] if isinstance(measures, str) else list(measures)
+    several = (
+        [measures] if isinstance(measures, str) or not isinstance(measures, Iterable) else measures
+    )
+    names = [text_argument("measure", name, BenchmarkError) for name in several]
     if not names:
         raise BenchmarkError(f"no measure is named; valid: {', '.join(MEASURES)}")
     for name in names:

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
+from morphgen.arguments import checked_signature
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file
 from morphgen.checks.hold import HoldRow, hold_files
 from morphgen.checks.home_pose import home_penetrations
@@ -29,6 +30,7 @@ from morphgen.model.robot import Robot
 __all__ = ["check", "check_source", "conform", "conform_source", "fix"]
 
 
+@checked_signature
 def check(
     robot: RobotLike, *, tool_required: bool = True, library: LibraryFolders = ()
 ) -> tuple[Finding, ...]:
@@ -56,6 +58,7 @@ def check(
     return check_source(find_robot(robot), default_library(library), tool_required=tool_required)
 
 
+@checked_signature
 def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple[Finding, ...]]:
     """Apply all safe repairs to a robot.
 
@@ -104,6 +107,7 @@ def bundle_of(source: RobotSource) -> Path | None:
     return folder if (folder / CARD).is_file() else None
 
 
+@checked_signature
 def conform(
     robot: RobotLike, *, samples: int = 100, seed: int = 0, library: LibraryFolders = ()
 ) -> ConformanceReport:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
+from morphgen.arguments import checked_signature, text_argument
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import LibraryFolders
@@ -73,6 +74,7 @@ def make_env(
     num_envs: int,
     **options: Unpack[VectorOptions],
 ) -> TaskVector: ...
+@checked_signature
 @explain_missing_extras()
 def make_env(
     task: str,
@@ -118,6 +120,10 @@ def make_env(
         if name not in valid:
             kind = "one environment" if num_envs is None else "vector environments"
             raise TaskError(f"{kind}: unknown option {name!r}{nearest(name, valid)}")
+    texts: dict[str, object] = {"task": task, **options}
+    for name in ("task", "sim", "kind"):
+        if name in texts and (name, texts[name]) != ("sim", None):
+            text_argument(name, texts[name], TaskError)
     if num_envs is None:
         from morphgen.tasks.gym_env import TaskEnv
 

@@ -6,6 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from morphgen.arguments import checked_signature
 from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from morphgen.fitting.link_fit import Search
 
 
+@checked_signature
 @explain_missing_extras()
 def fit(
     robot: RobotLike,

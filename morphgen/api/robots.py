@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 
-from morphgen.arguments import whole_number
+from morphgen.arguments import (
+    checked_signature,
+    path_argument,
+    text_argument,
+    truth,
+    whole_number,
+)
 from morphgen.checks import check
-from morphgen.errors import CompositionError, nearest
+from morphgen.errors import CompositionError, FormatError, GrammarError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.collision_geometry import GEOMETRIES, with_geometry
 from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
+from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import parse_conditions
-from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
@@ -22,6 +29,7 @@ from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.model.robot import Robot
 
 
+@checked_signature
 @explain_missing_extras()
 def compose(
     request: str = "",
@@ -57,17 +65,23 @@ def compose(
         MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
             value is out of range; the message lists what is valid.
     """
-    if geometry not in GEOMETRIES:
+    if text_argument("geometry", geometry, CompositionError) not in GEOMETRIES:
         raise CompositionError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
     if not isinstance(request, str):
         raise CompositionError(f"{request!r}: expected words, such as ur5-plane")
+    for key, value in words.items():
+        if isinstance(value, bool) or not isinstance(value, str | Real):
+            raise CompositionError(f"{key} {value!r}: expected a text or a number")
+    if name is not None:
+        name = text_argument("name", name, CompositionError)
     parts = default_library(library)
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
     derivation, default_name = parse_words(request_words, parts)
-    robot = compose_derivation(derivation, parts, str(name or default_name))
+    robot = compose_derivation(derivation, parts, name or default_name)
     return with_geometry(robot, geometry, parts.folders)
 
 
+@checked_signature
 def sample(
     grammar: str | PathLike[str],
     n: int,
@@ -97,7 +111,9 @@ def sample(
             meets the conditions in 500 draws.
     """
     parts = default_library(library)
-    loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
+    loaded = load_sound_grammar(str(path_argument("grammar", grammar, GrammarError)), parts)
+    if where is not None:
+        where = text_argument("where", where, GrammarError)
     conditions = parse_conditions([where] if where else [], "where")
     n = whole_number("sample: n", n, SamplingError, 0)
     seed = whole_number("sample: seed", seed, SamplingError, 0)
@@ -105,6 +121,7 @@ def sample(
     return (sample.robot for sample in samples)
 
 
+@checked_signature
 def read(
     path: str | PathLike[str],
     *,
@@ -128,10 +145,12 @@ def read(
     Raises:
         FormatError: If the path is none of these, or the description is invalid.
     """
-    folder = None if root is None else Path(root)
-    return read_robot(Path(path), root=folder, skip_missing_meshes=skip_missing_meshes)
+    folder = None if root is None else path_argument("root", root, FormatError)
+    source = path_argument("path", path, FormatError)
+    return read_robot(source, root=folder, skip_missing_meshes=skip_missing_meshes)
 
 
+@checked_signature
 def write(
     robot: RobotLike,
     folder: str | PathLike[str],
@@ -159,6 +178,8 @@ def write(
         FormatError: If the folder cannot be written, or contains something else of that name.
         MorphgenError: If the robot cannot be composed or read.
     """
+    parent = path_argument("folder", folder, FormatError)
+    picture = truth("picture", picture, FormatError)
     robot = resolve_robot(robot, default_library(library))
-    target = bundle_folder(Path(folder), robot.name)  # names of strangers may be paths
+    target = bundle_folder(parent, robot.name)  # names of strangers may be paths
     return write_bundle(robot, target, check(robot), picture=picture)

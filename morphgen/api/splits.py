@@ -9,7 +9,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.api.loaded_split import LoadedSplit
-from morphgen.arguments import truth, whole_number
+from morphgen.arguments import checked_signature, path_argument, truth, whole_number
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
 from morphgen.benchmark.split import HOLD_OUT, Regime
@@ -67,6 +67,7 @@ def split(
     library: LibraryFolders = ...,
     **choice: Unpack[NewSplit],
 ) -> tuple[LoadedSplit, ...]: ...
+@checked_signature
 @explain_missing_extras()
 def split(
     name: str | PathLike[str] = "",
@@ -130,6 +131,7 @@ def split(
             invalid, or too few robots meet it.
         MorphgenError: If a part or a grammar is unknown, or parts do not fit.
     """
+    name = str(path_argument("name", name, BenchmarkError)) if name != "" else ""
     parts = default_library(library)
     if not choice and train is None:
         if not str(name):

@@ -16,10 +16,10 @@ from morphgen.cli.export_formats import (
     FolderFormat,
     formats_with,
 )
-from morphgen.cli.progress import track
 from morphgen.errors import FormatError
 
 if TYPE_CHECKING:
+    from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.robot import Robot
 
@@ -73,7 +73,8 @@ _DEFAULT = "html"
     *opt.LIBRARY_JSON,
     details="In a bundle a file is robot.html, robot.glb and so on, elsewhere it has the name of "
     "the robot. Folders are NAME-urdf and so on. An existing folder is replaced only if all its "
-    "files are those of an earlier export.",
+    "files are those of an earlier export. A robot that cannot be read or written does not stop "
+    "the others; the exit code is then 2.",
     examples=(
         "export robots/ur5-plane --format html",
         "export arm=ur5 ee=plane --format gif --out figures",
@@ -81,24 +82,29 @@ _DEFAULT = "html"
         "export arm=ur5 ee=plane --format curobo --spheres 16 --cover 0.995",
     ),
 )
-def export(args: argparse.Namespace) -> None:
+def export(args: argparse.Namespace) -> int:
     """Write a file or a folder for each robot."""
     from morphgen.grammar.robot_source import read_source
 
     settings = _settings(args)
-    sources, library = opt.sources_of(args), opt.library_of(args)
     if args.out is not None and not args.out.is_dir():
         problem = "is no folder" if args.out.exists() else "no such folder; create it first"
         raise FormatError(f"--out {args.out}: {problem}")
     paths: list[Path] = []
-    for source in track(sources, args, "exporting", "robot", len(sources)):
+
+    def write(source: RobotSource, library: Library) -> None:
         robot = read_source(source, library, args.root)
         path = _target(source, robot, args)
         if path in paths:
             raise FormatError(f"{source.label}: {path} is of another robot of this command already")
         _write(robot, path, args.format, settings)
         paths.append(path)
-    opt.print_result(args, [str(path) for path in paths], lambda: "\n".join(map(str, paths)))
+
+    _, refused = opt.for_each_robot(args, "exporting", write)
+    refusals = [{"robot": label, **error} for label, error in refused.items()]
+    data = [*map(str, paths), *refusals]
+    opt.print_result(args, data, lambda: "\n".join(map(str, paths)))
+    return 2 if refused else 0
 
 
 def _settings(args: argparse.Namespace) -> ExportSettings:

@@ -54,7 +54,7 @@ def count(args: argparse.Namespace) -> None:
     from morphgen.grammar.limits import COUNT_DIGITS, MAX_COUNT
     from morphgen.grammar.structures import count_structures
 
-    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args))
+    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
     structures, sampled = count_structures(grammar), variables(grammar)
     data = {
         "structures": int(structures) if structures <= MAX_COUNT else None,
@@ -89,7 +89,8 @@ def enumerate_structures(args: argparse.Namespace) -> None:
     from morphgen.grammar.structures import enumerate_structures
 
     library = opt.library_of(args)
-    structures = enumerate_structures(opt.load_grammar_named(args.grammar, library), library)
+    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
+    structures = enumerate_structures(grammar, library)
     texts = map(str, itertools.islice(structures, args.limit))
     if args.json:
         print(json.dumps(list(texts)))

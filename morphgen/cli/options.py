@@ -129,15 +129,21 @@ def library_of(args: argparse.Namespace) -> Library:
     return default_library(args.library)
 
 
-def sources_of(args: argparse.Namespace) -> list[RobotSource]:
+def sources_of(
+    args: argparse.Namespace, refuse: Callable[[str, FormatError], object] | None = None
+) -> list[RobotSource]:
     """Return the sources of the robots that the arguments name, one or several.
+
+    Args:
+        args: The arguments.
+        refuse: As for ``find_robots``.
 
     Raises:
         MorphgenError: If a word names no robot, or ``--root`` is given for a composed robot.
     """
     from morphgen.grammar.robot_source import find_robots
 
-    sources = find_robots(args.words, library_of(args))
+    sources = find_robots(args.words, library_of(args), refuse)
     if args.root is not None and (composed := [s for s in sources if s.path is None]):
         raise FormatError(
             f"--root {args.root}: {composed[0].label} is composed; expected a bundle, a URDF, a "
@@ -177,18 +183,24 @@ def for_each_robot(
         label of those that failed, which are printed. With any of these, the exit code is 2.
 
     Raises:
-        MorphgenError: As ``sources_of``; or the error of ``work`` if there is one robot only.
+        MorphgenError: As ``sources_of``; or the error if there is one robot only.
     """
     from morphgen.cli.progress import track
 
-    library, sources = library_of(args), sources_of(args)
     results: dict[str, T] = {}
     refused: dict[str, dict[str, str]] = {}
+
+    def refuse(word: str, error: FormatError) -> None:
+        if len(args.words) == 1:
+            raise error
+        refused[word] = refusal(error, word, word)
+
+    library, sources = library_of(args), sources_of(args, refuse)
     for source in track(sources, args, verb, "robot", len(sources)):
         try:
             results[source.label] = work(source, library)
         except MorphgenError as error:
-            if len(sources) == 1:
+            if len(sources) == 1 and not refused:
                 raise
             refused[source.label] = refusal(error, source.label, source.label)
     return results, refused

@@ -9,6 +9,8 @@ import signal
 import sys
 import threading
 import time
+import warnings
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from morphgen.cli.command import command, option, repeated, whole_number
@@ -61,11 +63,11 @@ def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
     from morphgen.viewer.app import serve
 
-    try:
+    with suppress(KeyboardInterrupt), warnings.catch_warnings():
+        # Work that ends after its browser has disconnected still writes to the page: harmless.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
         _wait(args.host, viewer)
-    except KeyboardInterrupt:
-        pass
 
 
 def _wait(host: str, viewer: Viewer) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,7 +18,7 @@ from morphgen.checks import check
 from morphgen.checks.conformance import ConformanceRow, conformance
 from morphgen.doctor import reference
 from morphgen.doctor.entry import Entry, attempt, failure
-from morphgen.formats.bundle import MJCF, URDF, write_bundle
+from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.picture import gl_context, render
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.robot import Robot
@@ -159,11 +158,10 @@ def _score() -> Entry:
 
 def _picture(robot: Robot, bundle: Path) -> Entry:
     """Draw the robot as for ``preview.png``."""
-    picture = np.asarray(render(robot, bundle / URDF, bundle / MJCF, size=PICTURE_SIZE))
+    picture = np.asarray(render(robot, bundle / MJCF, size=PICTURE_SIZE))
     if picture.min() == picture.max():
         return Entry("picture", "error", "the renderer draws nothing; say --no-picture")
-    renderer = "PyBullet" if find_spec("pybullet") is not None else "MuJoCo"
-    return Entry("picture", "ok", f"drawn by {renderer} without a display")
+    return Entry("picture", "ok", "drawn by MuJoCo without a display")
 
 
 def _film(folder: Path) -> Entry:

@@ -124,7 +124,7 @@ def write_bundle(
         card = robot_card(robot, findings, hashes, {"morphgen": version("morphgen")})
         (partial / CARD).write_text(card_text(card), encoding="utf-8")
         if picture:
-            render(robot, partial / URDF, partial / MJCF).save(partial / PICTURE)
+            render(robot, partial / MJCF).save(partial / PICTURE)
     return folder
 
 

@@ -13,7 +13,7 @@ import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -299,6 +299,6 @@ def keep_fit(path: Path, text: str) -> None:
         _warn_of(path.parent, error.strerror)
 
 
-@cache
+@lru_cache(maxsize=1024)
 def _warn_of(folder: Path, reason: str | None) -> None:
     _LOGGER.warning("cannot keep fits in %s: %s; they are made again each time", folder, reason)

@@ -1,4 +1,4 @@
-"""Draw a robot without a display or GPU."""
+"""Draw a robot without a display or GPU, with MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import MissingDependencyError
-from morphgen.formats.quiet import log_mujoco_warnings, quiet
+from morphgen.formats.quiet import log_mujoco_warnings
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
 
 SIZE = (640, 480)
 """Width and height of a picture [px]."""
-_OVERSAMPLING = 2
-"""Pixels that PyBullet draws per pixel and direction, against aliasing."""
 _FOV = 35.0
 """Vertical field of view [deg]."""
 _YAW, _PITCH = 50.0, -20.0
@@ -54,99 +52,24 @@ class GlContext(Protocol):
 
 
 def render(
-    robot: Robot, urdf: Path, mjcf: Path, q: ArrayLike | None = None, size: tuple[int, int] = SIZE
+    robot: Robot, mjcf: Path, q: ArrayLike | None = None, size: tuple[int, int] = SIZE
 ) -> Image.Image:
-    """Draw a robot from its files, with PyBullet's software renderer or else with MuJoCo's.
+    """Draw a robot from its MJCF with MuJoCo's renderer.
 
     Args:
-        robot: The robot that the files describe.
-        urdf: Its URDF.
-        mjcf: Its MJCF.
+        robot: The robot that the file describes.
+        mjcf: The MJCF.
         q: Configuration, shape (dof,); home by default.
         size: Width and height [px].
 
     Raises:
-        MissingDependencyError: If neither renderer works here.
+        MissingDependencyError: If there is no offscreen OpenGL.
     """
-    configuration = np.asarray(robot.home if q is None else q, dtype=np.float64)
-    view = _framing(robot, configuration, size[0] / size[1])
-    if find_spec("pybullet") is not None:
-        return _render_pybullet(robot, urdf, configuration, view, size)
-    return _render_mujoco(robot, mjcf, configuration, view, size)
-
-
-def framed_height(robot: Robot) -> float:
-    """Return the height at the middle of a robot that its picture at home shows [m]."""
-    view = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
-    return 2 * view.distance * math.tan(math.radians(_FOV / 2))
-
-
-def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
-    """Return the closest view that shows the whole robot and its root's origin, centred."""
-    T_root_link = forward_kinematics(robot, q)
-    points = [np.zeros((1, 3))]
-    for T, link in zip(T_root_link, robot.links, strict=True):
-        if link.visuals or link.collisions:
-            corners = box_corners(*bounding_box(link.visuals or link.collisions))
-            points.append(corners @ T[:3, :3].T + T[:3, 3])
-    axes = Rotation.from_euler("ZX", [_YAW, _PITCH], degrees=True).as_matrix()
-    across, ahead, up = (np.concatenate(points) @ axes).T
-    middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
-    tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
-    distances = np.maximum(
-        np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
-    )
-    distance = max(float((distances - (ahead - middle[1])).max()), 0.05)
-    x, y, z = (axes @ middle).tolist()
-    return View((x, y, z), distance)
-
-
-def _render_pybullet(
-    robot: Robot, urdf: Path, q: NDArray[np.float64], view: View, size: tuple[int, int]
-) -> Image.Image:
-    with quiet():
-        import pybullet
-
-        client = pybullet.connect(pybullet.DIRECT)
-        try:
-            flags = pybullet.URDF_USE_MATERIAL_COLORS_FROM_MTL
-            body = pybullet.loadURDF(
-                str(urdf), useFixedBase=True, flags=flags, physicsClientId=client
-            )
-            index = {
-                pybullet.getJointInfo(body, i, physicsClientId=client)[1].decode(): i
-                for i in range(pybullet.getNumJoints(body, physicsClientId=client))
-            }
-            for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
-                pybullet.resetJointState(
-                    body, index[robot.joints[k].name], float(position), physicsClientId=client
-                )
-            width, height = (_OVERSAMPLING * side for side in size)
-            near, far = 0.02 * view.distance, 4 * view.distance
-            image = pybullet.getCameraImage(
-                width,
-                height,
-                pybullet.computeViewMatrixFromYawPitchRoll(
-                    view.target, view.distance, _YAW, _PITCH, 0, 2
-                ),
-                pybullet.computeProjectionMatrixFOV(_FOV, width / height, near, far),
-                lightDirection=(1.0, -0.6, 1.6),
-                shadow=0,
-                renderer=pybullet.ER_TINY_RENDERER,
-                physicsClientId=client,
-            )[2]
-        finally:
-            pybullet.disconnect(client)
-    pixels = np.asarray(image, dtype=np.uint8).reshape(height, width, 4)[..., :3]
-    return Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
-
-
-def _render_mujoco(
-    robot: Robot, mjcf: Path, q: NDArray[np.float64], view: View, size: tuple[int, int]
-) -> Image.Image:
     import mujoco
 
     log_mujoco_warnings()
+    q = np.asarray(robot.home if q is None else q, dtype=np.float64)
+    view = _framing(robot, q, size[0] / size[1])
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     data = mujoco.MjData(model)
     for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
@@ -178,6 +101,32 @@ def _render_mujoco(
         context.free()
     pixels[depth >= 1.0] = 255
     return Image.fromarray(pixels[::-1])
+
+
+def framed_height(robot: Robot) -> float:
+    """Return the height at the middle of a robot that its picture at home shows [m]."""
+    view = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
+    return 2 * view.distance * math.tan(math.radians(_FOV / 2))
+
+
+def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
+    """Return the closest view that shows the whole robot and its root's origin, centred."""
+    T_root_link = forward_kinematics(robot, q)
+    points = [np.zeros((1, 3))]
+    for T, link in zip(T_root_link, robot.links, strict=True):
+        if link.visuals or link.collisions:
+            corners = box_corners(*bounding_box(link.visuals or link.collisions))
+            points.append(corners @ T[:3, :3].T + T[:3, 3])
+    axes = Rotation.from_euler("ZX", [_YAW, _PITCH], degrees=True).as_matrix()
+    across, ahead, up = (np.concatenate(points) @ axes).T
+    middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
+    tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
+    distances = np.maximum(
+        np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
+    )
+    distance = max(float((distances - (ahead - middle[1])).max()), 0.05)
+    x, y, z = (axes @ middle).tolist()
+    return View((x, y, z), distance)
 
 
 def gl_context(width: int, height: int) -> GlContext:

@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
+from morphgen.arguments import path_argument
 from morphgen.errors import PartError, nearest
 from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
@@ -97,10 +98,9 @@ def library_folders(folders: LibraryFolders) -> tuple[Path, ...]:
         PartError: If it is neither a folder nor several.
     """
     several = [folders] if isinstance(folders, str | PathLike) else folders
-    try:
-        return tuple(map(Path, several))
-    except TypeError as error:
-        raise PartError(f"library {folders!r}: expected a folder, or several") from error
+    if not isinstance(several, Iterable):
+        raise PartError(f"library {folders!r}: expected a folder, or several")
+    return tuple(path_argument("library", folder, PartError) for folder in several)
 
 
 def shipped_folders() -> tuple[Path, ...]:

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from morphgen.errors import CompositionError, nearest
+from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import derive
-from morphgen.grammar.grammar_file import SUFFIX, find_grammar, grammar_names, load_grammar
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest, PartKind
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
@@ -55,7 +56,7 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     first = words[0]
     grammars = known_grammars(library)
     if first in grammars or first.endswith(SUFFIX):
-        grammar = load_grammar(find_grammar(first, library.folders), library.folders)
+        grammar = load_sound_grammar(first, library)
         derivation = derive(pin(grammar, words[1:], library), library, FirstChooser())
         return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
     if "=" not in first and len(words) > 1 and first not in library.paths:

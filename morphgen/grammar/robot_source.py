@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias, TypeGuard, cast
+from typing import TypeAlias, TypeGuard
 
 from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
@@ -43,7 +43,11 @@ class RobotSource:
     """Words of ``morphgen compose``."""
 
 
-def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
+def find_robots(
+    words: Sequence[str],
+    library: Library,
+    refuse: Callable[[str, FormatError], object] | None = None,
+) -> list[RobotSource]:
     """Return the robots that the words of a command line name, without reading them.
 
     Each word is one of: a bundle's folder, a URDF, a xacro or an MJCF; a set of ``morphgen sample``
@@ -51,6 +55,11 @@ def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
     ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
     ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
     spaces is a request of its own. Each robot is returned once.
+
+    Args:
+        words: The words.
+        library: Library of the parts.
+        refuse: Called with a path that names no robot and the reason, which is then no error.
 
     Raises:
         CompositionError: If no robot is named.
@@ -72,12 +81,17 @@ def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
         ):
             request.append(word)
         elif is_file:
-            sources += _file_sources(Path(word))
+            try:
+                sources += _file_sources(Path(word))
+            except FormatError as error:
+                if refuse is None:
+                    raise
+                refuse(word, error)
         else:
             sources.append(_request_source(word.split()))
     if request:
         sources.append(_request_source(request))
-    if not sources:
+    if not words:
         raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
     return list(dict.fromkeys(sources))
 
@@ -142,7 +156,9 @@ def is_one_robot(robots: RobotLike | Iterable[RobotLike]) -> TypeGuard[RobotLike
 
 def robot_list(robots: RobotLike | Iterable[RobotLike]) -> list[RobotLike]:
     """Return an argument that may be one robot or several as a list."""
-    return [robots] if is_one_robot(robots) else list(cast("Iterable[RobotLike]", robots))
+    if is_one_robot(robots) or not isinstance(robots, Iterable):
+        return [robots]  # anything else is refused as every value of a list
+    return list(robots)
 
 
 def resolve_robot(robot: RobotLike, library: Library, root: Path | None = None) -> Robot:

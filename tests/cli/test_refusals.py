@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+import morphgen
 from helpers.commands import start, tree
 from helpers.parts import write_part
 from helpers.robots import arm
 from morphgen import cli
 from morphgen.cli.command import whole_number
 from morphgen.cli.export_formats import FORMATS, FileFormat
+from morphgen.errors import MorphgenError
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar import library
@@ -347,3 +349,49 @@ def test_interrupted_process_leaves_no_partial_bundle_or_temporary_folder(tmp_pa
     assert (process.returncode, printed) == (130, "")
     assert err == "morphgen: interrupted; nothing half-written is left\n"
     assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("where", [0, 1, 2])
+@pytest.mark.parametrize("missing", ["no/such.urdf", "gone/", "./empty"])
+@pytest.mark.parametrize(
+    "command", [["check"], ["conform", "--samples", 1], ["export", "--format", "urdf"]]
+)
+def test_a_missing_robot_does_not_stop_the_others(command, missing, where, run):
+    Path("empty").mkdir()
+    robots = ["prims", "arm3-stick"] if command[0] != "conform" else ["prims"]
+    words = [*robots]
+    words.insert(where, missing)
+    code, out, err = run(*command, *words)
+    assert code == 2
+    assert all(name in out for name in robots)
+    assert err.startswith("morphgen: ")
+    assert str(Path(missing)) in err
+    assert err.index("\n") == len(err) - 1
+
+
+UNSOUND = {
+    "unknown part": "robot -> base arm\nbase -> fixed\narm -> nosuch\n",
+    "unused value": "let unused = uniform(1, 2)\nrobot -> base arm3\nbase -> fixed\n",
+    "unreachable": "robot -> base arm3\nbase -> fixed\nother -> stick\n",
+    "never ending": "robot -> base loop\nbase -> fixed\nloop -> arm3 loop\n",
+}
+
+
+@pytest.mark.parametrize("text", UNSOUND.values(), ids=UNSOUND)
+def test_commands_refuse_the_grammars_that_check_refuses(text, run, refused):
+    Path("mine.grammar").write_text(text)
+    code, out, _ = run("grammar", "check", "mine.grammar")
+    assert code == 1
+    fault = out.splitlines()[0]
+    for command in (
+        ["grammar", "count", "mine.grammar"],
+        ["grammar", "enumerate", "mine.grammar"],
+        ["sample", "mine.grammar", "-n", 1, "--out", "out"],
+        ["compose", "mine.grammar"],
+        ["derive", "mine.grammar"],
+        ["split", "new", "interpolation", "--grammar", "mine.grammar", "--out", "s.yaml"],
+    ):
+        assert fault in refused(*command)
+    with pytest.raises(MorphgenError) as caught:
+        list(morphgen.sample("mine.grammar", 1))
+    assert fault in str(caught.value)

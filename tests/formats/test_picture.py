@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
+import morphgen
 from morphgen.errors import MissingDependencyError
 from morphgen.formats import picture
 
@@ -29,3 +30,14 @@ def test_a_process_can_draw_and_then_import_triton():
     code = "from morphgen.formats.picture import gl_context; gl_context(8, 8).free(); import triton"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("robot", ["prims", "arm3-stick", "gantry-plane"])
+def test_a_picture_does_not_depend_on_optional_packages(robot, tmp_path, monkeypatch):
+    composed = morphgen.compose(robot if robot != "gantry-plane" else "base=gantry ee=plane")
+    mjcf = morphgen.write(composed, tmp_path, picture=False) / "robot.xml"
+    image = picture.render(composed, mjcf, size=(64, 48))
+    for package in ("pybullet", "trimesh", "viser"):
+        monkeypatch.setitem(sys.modules, package, None)
+    assert picture.render(composed, mjcf, size=(64, 48)).tobytes() == image.tobytes()
+    assert len(image.getcolors()) > 1
