@@ -255,6 +255,8 @@ def _uniform_rows(
     return rows if all((column == column[0]).all() for column in lengths) else None
 
 
+_MAX_STRIPS = 100_000
+"""Number of triangle strips of the largest PLY file that is read: each takes 13 us."""
 _Rows = NDArray[Any] | Sequence[NDArray[Any]]
 """Lists of a PLY file: an array with a row for each, or an array for each."""
 
@@ -310,6 +312,8 @@ def _fans(polygons: _Rows, files: FolderResolver) -> Iterator[NDArray[np.int64]]
 def _strips(strips: _Rows) -> Iterator[NDArray[np.int64]]:
     """Yield the triangles of strips; in each, -1 begins another one."""
     yield np.empty((0, 3), np.int64)
+    if len(strips) > _MAX_STRIPS:
+        raise ValueError(f"{len(strips)} strips of triangles; at most {_MAX_STRIPS} are read")
     for strip in strips:
         corners = np.asarray(strip, dtype=np.int64)
         # A triangle is turned if its place in its own strip is odd.

@@ -27,7 +27,7 @@ MAX_FILE_SIZE = 64 * 2**20
 mesh names [bytes]. An STL of ``MAX_FACES`` triangles has 48 MiB."""
 MAX_FACES = 1_000_000
 """Number of triangles of the largest mesh that is read, every instance counted. Loading as many
-takes up to 0.9 GiB and 7 s (``benchmarks/mesh_bounds.py``)."""
+takes up to 0.7 GiB and 8 s of CPU (``python benchmarks/mesh_counts.py FILE``)."""
 MAX_PIXELS = 2**25
 """Number of pixels of all textures that are read for one mesh, each use counted."""
 MAX_COORDINATE = 1e9
@@ -133,8 +133,9 @@ class FolderResolver(trimesh.resolvers.Resolver):
             read: Returns its content; by default, that of the file with the name.
         """
         try:
-            width, height = read_picture(read() if read else self.get(name)).size
-            self._pixels_left -= width * height
+            if self._pixels_left >= 0:  # otherwise not even decoded
+                width, height = read_picture(read() if read else self.get(name)).size
+                self._pixels_left -= width * height
             if self._pixels_left < 0:
                 raise ValueError(f"the textures have more than {MAX_PIXELS} pixels")
         except FileNotFoundError:

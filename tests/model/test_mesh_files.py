@@ -416,6 +416,11 @@ REFUSED: dict[str, tuple[Any, str]] = {
         ply([*PLY_POINTS, "1000000000 0 1 2"], PLY_VERTICES, "element face 1", PLY_LIST),
         "a list of 1000000000 entries",
     ),
+    "strips.ply": (
+        ply([*PLY_POINTS, *["3 0 1 2"] * 100_001], PLY_VERTICES, "element tristrips 100001",
+            PLY_LIST),
+        "100001 strips of triangles; at most 100000",
+    ),
     "less.ply": (ply([], PLY_VERTICES.replace("4", "-4")), "counts -4 of element 'vertex'"),
     "face.obj": ("v 0 0 0\nf" + " 1" * 40_000 + "\n", "a line has more than 65536 characters"),
     "faces.obj": ("v 0 0 0\n" + ("f" + " 1" * 30_000 + "\n") * 40, "1199920 triangles"),
