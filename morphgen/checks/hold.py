@@ -78,6 +78,8 @@ class HoldRow:
     ``STEP_S`` and mimic joints stay with their leaders; None without the simulator."""
     drift: float | None = None
     """Largest distance of a joint from home within ``HOLD_S`` [rad or m]; None if diverged."""
+    unit: str = ""
+    """Unit of ``drift``: ``rad`` or ``m``."""
     joint: str = ""
     """Name of the joint that drifts farthest."""
     step_error: float | None = None
@@ -139,7 +141,7 @@ def hold_row(
     if find_spec(module) is None:
         return HoldRow(name, None, message="not installed")
     if not robot.movable_joints:
-        return HoldRow(name, True, 0.0, "", 0.0, 0.0, 0.0)
+        return HoldRow(name, True, 0.0, "", "", 0.0, 0.0, 0.0)
     find_causes = partial(_causes, robot, contact_margin)
     try:
         with simulated() as simulation:
@@ -163,7 +165,7 @@ def _hold(name: str, robot: Robot, simulation: SimulatedRobot) -> HoldRow:
     passed = bool(drift[worst] <= MAX_DRIFT)
     joint = robot.joints[robot.movable_joints[worst]]
     message = "" if passed else f"{joint.name} moves {drift[worst]:.3g} {_unit(joint)}"
-    return HoldRow(name, passed, float(drift[worst]), joint.name, message=message)
+    return HoldRow(name, passed, float(drift[worst]), _unit(joint), joint.name, message=message)
 
 
 def _stepped(
