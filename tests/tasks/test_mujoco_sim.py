@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,10 @@ from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs
 from morphgen.errors import SimulationError
-from morphgen.model.dynamics import BANDWIDTH
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
+from morphgen.grammar.library import default_library
+from morphgen.grammar.sampling import sample_robot
+from morphgen.model.dynamics import BANDWIDTH, armature, movable_mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits, movable_positions
 from morphgen.model.robot import Frame
@@ -325,3 +329,39 @@ def test_movable_joint_order_matches_the_robot():
         sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable_joints
     ]
     assert joint_positions == pytest.approx(expected)
+
+
+def scaled_eigenvalues(inertia):
+    """Return eigenvalues of a joint-space inertia, scaled to a diagonal of ones."""
+    diagonal = np.sqrt(np.diag(inertia))
+    return np.linalg.eigvalsh(inertia / np.outer(diagonal, diagonal))
+
+
+def compiled_inertia(body):
+    """Return the joint-space inertia at home of a robot's compiled scene, with all armatures."""
+    (world,) = mujoco_model.worlds([Scene(body)], NOTHING_TOUCHES)
+    data = mujoco.MjData(world.model)
+    data.qpos[world.movable_q_at] = movable_positions(world.robot, world.robot.home)
+    mujoco.mj_forward(world.model, data)
+    inertia = np.zeros((world.model.nv, world.model.nv))
+    mujoco.mj_fullM(world.model, data, inertia)
+    return inertia
+
+
+@pytest.mark.parametrize("index", [23, 139, 304])
+def test_joints_with_nearly_one_axis_have_inertia_against_each_other(index):
+    library = default_library()
+    body = sample_robot(load_grammar(find_grammar("serial")), library, index, seed=0).robot
+    of_robot = movable_mass_matrix(body, body.home) + np.diag(armature(body))
+    assert scaled_eigenvalues(of_robot)[0] < 0.001
+    inertia = compiled_inertia(body)
+    assert scaled_eigenvalues(inertia)[0] == pytest.approx(mujoco_model.LEAST_EIGENVALUE, rel=1e-3)
+    # Motors have the gains of the robot: what is added is a small share of a joint's inertia.
+    assert np.diag(inertia) == pytest.approx(np.diag(of_robot), rel=0.021)
+
+
+def test_the_inertia_of_a_real_arm_stays():
+    body = robot("arm=ur5 ee=plane")
+    of_robot = movable_mass_matrix(body, body.home) + np.diag(armature(body))
+    inertia = compiled_inertia(body)
+    np.testing.assert_allclose(inertia, of_robot, rtol=1e-4, atol=1e-4)
