@@ -48,5 +48,5 @@ def test_a_process_that_dies_while_results_are_used_is_reported():
 
 @pytest.mark.parametrize("jobs", [0, -1])
 def test_number_of_jobs_is_at_least_one(jobs):
-    with pytest.raises(MorphgenError, match=f"{jobs} jobs: expected 1 or more"):
+    with pytest.raises(MorphgenError, match=f"jobs {jobs}: expected a whole number, 1 or more"):
         list(parallel_map(fail, [1], jobs))

@@ -65,6 +65,9 @@ class _Connection(ServerConnection):
         super().__init__(protocol, *arguments, **options)
         read_line = protocol.reader.read_line
         protocol.reader.read_line = lambda m: read_line(max(m, MAX_REQUEST_LINE))  # type: ignore[method-assign]
+        # The parser that websockets 14 to 16 started already reads lines by the old function.
+        protocol.parser = protocol.parse()
+        next(protocol.parser)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ANN401  (as its base class)
         """Return the next message; viser never sees a malformed one."""

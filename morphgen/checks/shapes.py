@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -22,6 +23,9 @@ UNIT_TOLERANCE = 1.2
 """Factor within which a ratio counts as one of ``UNIT_RATIOS``."""
 MIN_SOLIDITY = 1e-9
 """Volume over the cube of the longest edge below which shapes count as flat."""
+
+_ONLY_DRAWN = re.compile(r"materials? |texture|\d+ (lines?|points?|spline)")
+"""Notes of a mesh file about what has no triangles: they change a picture, and no contact."""
 
 
 def check_shapes(robot: Robot) -> Iterator[Finding]:
@@ -138,7 +142,7 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
     if parts := left_out(mesh.path):
         yield Finding(
             "mesh-left-out",
-            "warning",
+            "info" if all(map(_ONLY_DRAWN.match, parts)) else "warning",
             where,
             f"{mesh.path.name}: left out: {'; '.join(parts)}",
             "export the mesh as triangles with its materials beside it",

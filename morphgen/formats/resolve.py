@@ -92,7 +92,6 @@ class PackageFinder:
         stems = dict.fromkeys([package, _PACKAGE_SUFFIX.sub("", package)])
         for name in stems:
             yield from ((folder, False) for folder in self._around(name, files))
-        for name in stems:
             for root in self.roots:
                 for folder in self._in_root(name, root):
                     yield folder, root != self.root and not any(_is_in(f, [root]) for f in files)

@@ -15,7 +15,7 @@ def test_demo_composes_checks_and_loads_a_robot(run):
         "$ morphgen conform robots/ur5-plane",
     ]
     assert "robots/ur5-plane: 0 error, 0 warning, 0 info\n" in out
-    assert all(f"ur5-plane  {loader.name} " in out for loader in LOADERS)
+    assert all(f"ur5-plane  bundle  {loader.name} " in out for loader in LOADERS)
     *_, last = out.splitlines()
     assert last == "The robot is in robots/ur5-plane; its picture is robots/ur5-plane/preview.png"
     assert Path("robots/ur5-plane/preview.png").is_file()

@@ -73,10 +73,19 @@ def test_names_that_are_not_plain_folder_names_are_rejected(refused, robot_urdf,
 
 def test_robot_name_in_a_file_cannot_leave_the_output_folder(refused, robot_urdf):
     path = robot_urdf(replace(arm(), name=".."))
-    assert "name '..': use letters" in refused("check", path, "--fix", "out")
     assert "name '..': use letters" in refused("import", path, "--out", "out", "--as-is")
-    path = robot_urdf(replace(arm(), name="../../x"))
-    assert "use letters" in refused("check", path, "--fix", "out")
+
+
+@pytest.mark.parametrize("name", ["..", "../../x", "/x"])
+def test_a_repaired_name_stays_in_the_output_folder(run, robot_urdf, tmp_path, name):
+    path = robot_urdf(replace(arm(), name=name))
+    work = tmp_path / "work"
+    work.mkdir()
+    assert run("check", path, "--fix", work / "out")[0] == 0
+    (repaired,) = (work / "out").iterdir()
+    assert repaired.is_dir()
+    assert {entry.name for entry in tmp_path.iterdir()} >= {"work", path.name}
+    assert [entry.name for entry in work.iterdir()] == ["out"]
 
 
 @pytest.mark.parametrize(
