@@ -55,6 +55,10 @@ SETTLED_S = 0.2
 """Duration for which all joints must be settled, after which a step ends [s]."""
 
 
+MIN_TIMESTEP = 1e-4
+"""Smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding."""
+
+
 @dataclass(frozen=True)
 class SimulatedRobot:
     """A robot in a simulator."""
@@ -329,6 +333,10 @@ def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
                 mujoco.mj_step(model, data)
             yield data.qpos[joints]
 
+    if not model.opt.timestep >= MIN_TIMESTEP:
+        raise FormatError(
+            f"{MJCF}: timestep {model.opt.timestep:g} s; expected at least {MIN_TIMESTEP:g} s"
+        )
     yield SimulatedRobot(model.opt.timestep, run)
 
 

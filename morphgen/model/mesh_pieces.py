@@ -26,8 +26,9 @@ MAX_FILE_SIZE = 64 * 2**20
 """Size of the largest mesh, texture or material file that is read, and of all such files that one
 mesh names [bytes]. An STL of ``MAX_FACES`` triangles has 48 MiB."""
 MAX_FACES = 1_000_000
-"""Number of triangles of the largest mesh that is read, every instance counted. Loading as many
-takes up to 0.7 GiB and 8 s of CPU (``python benchmarks/mesh_counts.py FILE``)."""
+"""Number of triangles of the largest mesh that is read, every instance counted. Reading as many
+from an STL takes 0.5 GiB and 1 s of CPU (``python benchmarks/mesh_counts.py FILE``); text takes
+longer, an ASCII PLY of the largest size 8 s."""
 MAX_PIXELS = 2**25
 """Number of pixels of all textures that are read for one mesh, each use counted."""
 MAX_COORDINATE = 1e9

@@ -56,6 +56,17 @@ def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path)
         assert row.causes == overloads(lever(effort), (0.0,)) == (cause,)
 
 
+@pytest.mark.parametrize("timestep", ["1e-9", "0.00001", "nan"])
+def test_a_tiny_time_step_is_not_simulated(timestep, tmp_path):
+    option = f'<option timestep="{timestep}"/></mujoco>'
+    row = held(lever(30.0), tmp_path, lambda text: text.replace("</mujoco>", option))[
+        "mujoco (mjcf)"
+    ]
+    assert row.passed is False
+    assert row.drift is None
+    assert re.search("timestep|time step", row.message)
+
+
 @needs_pybullet
 @pytest.mark.parametrize("make", [arm, lambda: lever(30.0), lambda: lever(None)])
 def test_joints_step_and_settle(make, tmp_path):
