@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, Typ
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.errors import TaskError
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
@@ -379,8 +380,11 @@ class Task(ABC, Generic[C, G]):
             config: Constants of the task.
             tool_pose: Pose of the tool in the root frame, shape (7,).
             block_pose: Pose of the block, shape (7,).
+
+        Raises:
+            TaskError: If the task does not define it.
         """
-        raise NotImplementedError
+        raise TaskError(f"task {self.name!r} has a goal_field, but no achieved_goal")
 
     def goal_reward(self, config: C, achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
         """Return the reward terms that depend on the goal alone, summed, shape (k,).
@@ -389,8 +393,11 @@ class Task(ABC, Generic[C, G]):
             config: Constants of the task.
             achieved: Goals that states achieve, shape (k, g).
             desired: Goals that they should achieve, shape (k, g).
+
+        Raises:
+            TaskError: If the task does not define it.
         """
-        raise NotImplementedError
+        raise TaskError(f"task {self.name!r} has a goal_field, but no goal_reward")
 
     def episode_score(self, total: float, last: float, steps: int) -> float:
         """Return the score of an episode: the mean of its steps' scores.

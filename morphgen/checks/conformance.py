@@ -94,7 +94,7 @@ class ConformanceRow:
     source: str = BUNDLE
     """``bundle``, or ``file`` if the loader read the file of others as it is."""
     causes: tuple[str, ...] = ()
-    """What the loader does with a file of others that explains all its differences."""
+    """The deviations of the loader that explain all its differences from morphgen."""
 
     @property
     def is_unexplained(self) -> bool:

@@ -94,9 +94,9 @@ class HoldRow:
     settling_time: float | None = None
     """Longest time until all joints are within ``BAND`` of their targets [s]; None if never."""
     message: str = ""
-    """What went wrong."""
+    """Description of the failure; empty if the robot passed."""
     causes: tuple[str, ...] = ()
-    """What explains a failure; empty if it is not known."""
+    """Known causes of the failure; empty if none is known."""
 
 
 def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
@@ -235,7 +235,7 @@ class _Step:
     severity: float
     """Error of the worst joint, relative to the accepted one."""
     fault: str
-    """That error in words."""
+    """Description of the largest error."""
 
 
 def _step(robot: Robot, simulation: SimulatedRobot, target: Array) -> _Step | None:

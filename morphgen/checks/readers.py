@@ -45,7 +45,7 @@ class Quirk:
     """How a loader reads a URDF otherwise than morphgen."""
 
     words: str
-    """What the loader does."""
+    """Description of the deviation."""
     change: Change
     """Changes a URDF so that morphgen reads it as the loader does."""
 
@@ -63,7 +63,7 @@ class Loader:
     file: str
     """The bundle's file that it reads."""
     quirks: tuple[Quirk, ...] = ()
-    """What it reads otherwise in URDFs of others."""
+    """Deviations of the loader from the URDF specification, in files of other tools."""
 
 
 def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:

@@ -48,7 +48,7 @@ class MeshContent:
     pieces: tuple[Piece, ...]
     """Colour and triangles of every geometry."""
     left_out: tuple[str, ...]
-    """What the file holds beside these, each a phrase with a count, such as ``3 line sets``."""
+    """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
 
 
 def read_mesh_file(path: Path) -> MeshContent:

@@ -102,7 +102,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         self.written: dict[str, bytes] = {}
         """Content of files that exist only here, by name."""
         self.left_out: list[str] = []
-        """What the reader left out, each as a phrase."""
+        """Content that was not read, each a phrase."""
 
     def get(self, name: str) -> bytes:
         """Return the content of a file.
