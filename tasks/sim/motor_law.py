@@ -124,14 +124,18 @@ class MotorForces:
 def _inertia(robot: Robot) -> Array:
     """Return forces on movable joints per acceleration of independent joints, (dof, movable).
 
-    Joints of a mimic group also carry what others do to a part of the group alone, such as the
-    reaction of a motor on the rod of a parallelogram: up to sqrt(M_jj M_kk), which bounds M_jk.
+    Each joint of a mimic group has a motor of its own: it carries what accelerates its own link,
+    while the inertia of the group is that of all, in which two fingers that move apart cancel. In
+    the group it also carries what others do to a part of it, such as the reaction of a motor on
+    the rod of a parallelogram: up to sqrt(M_jj M_kk), which bounds M_jk away from home.
     """
     matrix, _ = robot.mimic_map
     gains = np.abs(matrix)
     armatures = np.diag([motor.armature for motor in actuation(robot)])
     inertia = np.abs(mass_matrix(robot, robot.home)) + armatures
-    carried = np.abs(np.diag(movable_mass_matrix(robot, robot.home)))
+    of_movable = movable_mass_matrix(robot, robot.home)
+    bound = np.sqrt(np.outer(np.diag(inertia), np.diag(of_movable))) * (gains.T > 0)
+    of_group = np.maximum(np.abs(of_movable @ matrix).T, bound)
     is_grouped = (gains > 0) @ ((gains > 0).sum(axis=0) > 1)
-    bound = np.sqrt(np.outer(np.diag(inertia), carried))
-    return np.asarray(np.maximum(inertia @ gains.T, np.where(is_grouped, bound, 0.0)))
+    alone = inertia @ gains.T
+    return np.asarray(np.where(is_grouped, np.maximum(alone, of_group), alone))

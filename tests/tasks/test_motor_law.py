@@ -8,6 +8,8 @@ import pytest
 from helpers.robots import arm, finger
 from helpers.scenes import robot
 from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 from morphgen.tasks.sim.motor_law import (
     FASTEST_SLIDE,
     FASTEST_TURN,
@@ -86,3 +88,26 @@ def test_joints_without_a_speed_limit_use_the_default():
     assert speed_limit(joints["elbow"]) == 2.0
     assert speed_limit(replace(joints["elbow"], velocity=None)) == FASTEST_TURN
     assert speed_limit(replace(joints["left"], velocity=None)) == FASTEST_SLIDE
+
+
+@pytest.mark.parametrize("mass", [0.1, 1.0, 5.0])
+def test_fingers_that_move_apart_carry_their_own_inertia(mass):
+    bar = Link("arm", Inertial(2.0, (0.25, 0, 0), (0.01, 0, 0, 0.05, 0, 0.05)))
+    tip = Inertial(mass, (0, 0, 0), (1e-4, 0, 0, 1e-4, 0, 1e-4))
+    links = (Link("base"), bar, Link("left", tip), Link("right", tip))
+    strength = {"limits": (-0.5, 0.5), "effort": 50.0, "velocity": 1.0}
+    joints = (
+        Joint("turn", "revolute", "base", "arm", axis=(0, 0, 1), **strength),
+        *(
+            Joint(name, "prismatic", "arm", name, Pose((0.5, 0, 0)), axis, mimic=mimic, **strength)
+            for name, axis, mimic in (
+                ("left", (0, 1, 0), None),
+                ("right", (0, -1, 0), Mimic("left", 1.0, 0.0)),
+            )
+        ),
+    )
+    body = Robot("gripper", links, joints, home=(0.0, 0.0))
+    forces = limits(body, [0.01, 0.0, 0.0])
+    # A finger is 0.5 m from the arm's axis; the forces on both cancel in the joint that moves them.
+    wanted = (1 + SLACK) * GAIN * 0.5 * mass * BANDWIDTH**2 * 0.01
+    assert forces[1:] == pytest.approx([wanted, wanted])
