@@ -164,13 +164,14 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
 def _inertias(robot: Robot) -> tuple[Array, Array]:
     """Return the inertias that gains assume, (dof,), and the armatures in them, (n_movable,)."""
     matrix, _ = robot.mimic_map
-    carried = np.diag(movable_mass_matrix(robot, robot.home))
+    of_movable = movable_mass_matrix(robot, robot.home)
+    carried = np.diag(of_movable)
     rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
     follows = matrix**2
     follows[rows] = 0
     armatures = COUPLED_INERTIA * carried
     armatures[rows] = 0
-    inertia = np.diag(mass_matrix(robot, robot.home)) + follows.T @ armatures
+    inertia = np.diag(matrix.T @ of_movable @ matrix) + follows.T @ armatures
     prismatic = np.array(
         [robot.joints[k].kind == "prismatic" for k in robot.independent_joints], dtype=bool
     )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix, movable_mass_matrix
+from morphgen.model.dynamics import BANDWIDTH, actuation, movable_mass_matrix
 from morphgen.model.robot import Joint, Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.tasks.sim.short_arrays import clamp
@@ -132,8 +132,8 @@ def _inertia(robot: Robot) -> Array:
     matrix, _ = robot.mimic_map
     gains = np.abs(matrix)
     armatures = np.diag([motor.armature for motor in actuation(robot)])
-    inertia = np.abs(mass_matrix(robot, robot.home)) + armatures
     of_movable = movable_mass_matrix(robot, robot.home)
+    inertia = np.abs(matrix.T @ of_movable @ matrix) + armatures
     bound = np.sqrt(np.outer(np.diag(inertia), np.diag(of_movable))) * (gains.T > 0)
     of_group = np.maximum(np.abs(of_movable @ matrix).T, bound)
     is_grouped = (gains > 0) @ ((gains > 0).sum(axis=0) > 1)

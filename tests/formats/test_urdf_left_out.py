@@ -1,4 +1,4 @@
-"""What a URDF holds besides a robot, and meshes in unexpected places, are read or findings."""
+"""Content of a URDF without a place in a robot, and meshes in unexpected places, are findings."""
 
 import json
 import re
