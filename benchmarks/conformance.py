@@ -6,8 +6,9 @@
 The robots are all arms with all end-effectors of the library (arms with two flanges get two), and
 ``--n`` robots of each grammar, in an order that the seed shuffles, so that any beginning of the
 list is a sample of it. For each, ``morphgen conform`` compares the loaders, holds the home for 5 s
-in the simulators and lists the links that penetrate at home. ``--doctor`` names the command
-``mjcf-doctor`` (a pip package of others, which needs no morphgen), which then checks the MJCF.
+in the simulators, steps each joint and lists the links that penetrate at home. ``--doctor`` names
+the command ``mjcf-doctor`` (a pip package of others, which needs no morphgen), which then checks
+the MJCF.
 
 A row per robot goes to ``rows.csv`` in ``--out``. Robots that have a row are skipped, so an
 interrupted run resumes. ``--only`` keeps robots or groups whose name contains the text, ``--count``
@@ -33,7 +34,6 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.api.checks import conform
-from morphgen.checks.hold import MAX_DRIFT
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.files import write_file
 from morphgen.grammar.compose import compose
@@ -46,12 +46,19 @@ ROWS = "rows.csv"
 MISFIT = "the hand reaches behind its flange into the arm; morphgen check warns of it"
 OVERLOAD = "hand and arm are heavier than the effort limit of the source carries"
 TOUCH = "links touch at home, and PyBullet enlarges meshes by 1 mm"
-MARGIN = "within PyBullet's collision margin"
-"""Part of the message of links that touch; see ``morphgen.tasks.hold_home``."""
+MARGIN = "come within PyBullet's collision margin"
+"""Part of the cause of links that touch; see ``morphgen.checks.hold``."""
+PENETRATE = "penetrate by"
+"""Part of the cause of links that penetrate."""
 SOLVER = "PyBullet's solver has not converged; the robot holds with more iterations"
 HOLDS = "solver iterations"
+UNCOUPLED = "PyBullet ignores <mimic>"
+"""Part of the cause of mimic joints that leave their leaders."""
 CARRY = "to carry the weight"
-"""Part of the message of a motor that is too weak; see ``morphgen.checks.hold.overloads``."""
+"""Part of the cause of a motor that is too weak; see ``morphgen.checks.hold.overloads``."""
+BECAUSE = ", because "
+"""Words between what goes wrong in a simulator and its causes."""
+COLLIDE = "a step leads links into each other"
 COMPOSED = "arm x end-effector"
 TWO_FLANGES = ("yumi",)
 """Arms with the ports ``left`` and ``right`` instead of ``flange``."""
@@ -61,7 +68,7 @@ SIMULATORS = {
     "mujoco (environment)": "mujoco",
     "pybullet (environment)": "pybullet",
 }
-"""Columns of the drifts, by the names of the rows of ``morphgen conform``."""
+"""Columns of the simulators, by the names of the rows of ``morphgen conform``."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +96,16 @@ class Row:
     loaders: str
     """Differences of the loaders; empty if all agree."""
     mjcf: str
-    """Drift in MuJoCo with ``robot.xml`` [rad or m]; empty if it diverged, as the next three."""
+    """In MuJoCo with ``robot.xml``: drift [rad or m], follower error [rad or m] and settling time
+    [s]; ``-`` for one that was not measured."""
     urdf: str
-    """Drift in PyBullet with ``robot.urdf``."""
+    """The same in PyBullet with ``robot.urdf``."""
     mujoco: str
-    """Drift in an environment of MuJoCo."""
+    """The same in an environment of MuJoCo."""
     pybullet: str
-    """Drift in an environment of PyBullet."""
+    """The same in an environment of PyBullet."""
     moving: str
-    """Simulators in which a joint drifts too far, and the joint."""
+    """Simulators in which a joint drifts too far or does not step, the joint and the causes."""
     penetrations: str
     """Pairs of links that penetrate at home, and their depth."""
     doctor: str
@@ -110,13 +118,18 @@ class Row:
         misfit = MISFIT if self._is_misfit else ""
         if self.penetrations:
             causes["penetrations"] = misfit
-        overload = OVERLOAD if CARRY in self.moving else SOLVER if HOLDS in self.moving else ""
-        touch = TOUCH if MARGIN in self.moving else ""
-        known = {"mjcf": misfit, "urdf": overload, "mujoco": misfit, "pybullet": misfit or touch}
-        for column, cause in known.items():
-            drift = getattr(self, column)
-            if drift == "" or float(drift) > MAX_DRIFT:
-                causes[column] = cause
+        for part in filter(None, self.moving.split(" | ")):
+            name, _, message = part.partition(": ")
+            words = message.partition(BECAUSE)[2]
+            collide = misfit or (COLLIDE if PENETRATE in words else "")
+            known = {
+                CARRY: OVERLOAD,
+                HOLDS: SOLVER,
+                UNCOUPLED: UNCOUPLED,
+                MARGIN: TOUCH,
+                PENETRATE: collide,
+            }
+            causes[SIMULATORS[name]] = next((known[key] for key in known if key in words), "")
         return causes
 
     @property
@@ -194,8 +207,12 @@ def _measure(item: Item, library: Library, args: argparse.Namespace) -> Row:
         folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
         report = conform(folder, samples=args.samples, seed=args.seed)
         doctor = _doctor(folder / MJCF, args.doctor) if args.doctor else "-"
-    drifts = {row.simulator: row for row in report.holds}
-    moving = [f"{row.simulator}: {row.message}" for row in report.holds if row.passed is False]
+    holds = {row.simulator: row for row in report.holds}
+    moving = [
+        f"{row.simulator}: {row.message}" + (BECAUSE + "; ".join(row.causes) if row.causes else "")
+        for row in report.holds
+        if row.passed is False
+    ]
     return Row(
         group=item.group,
         robot=item.name,
@@ -204,10 +221,14 @@ def _measure(item: Item, library: Library, args: argparse.Namespace) -> Row:
         dof=robot.dof,
         loaders="; ".join(f"{r.loader}: {r.message}" for r in report.rows if r.passed is False),
         **{
-            column: "" if drifts[name].drift is None else f"{drifts[name].drift:.2g}"
+            column: " ".join(
+                "-" if value is None else f"{value:.2g}"
+                for value in (row.drift, row.follower_error, row.settling_time)
+            )
             for name, column in SIMULATORS.items()
+            for row in (holds[name],)
         },
-        moving="; ".join(moving),
+        moving=" | ".join(moving),
         penetrations="; ".join(
             f"{pair} {1000 * depth:.2g} mm" for pair, depth in report.penetrations.items()
         ),
@@ -278,7 +299,7 @@ def _by_cause(cause: str, rows: list[Row]) -> dict[str, object]:
     return {
         "cause": cause,
         "robots": len(found),
-        "drift": sum(bool(row.moving) for row in found),
+        "do not move": sum(bool(row.moving) for row in found),
         "penetrate": sum(bool(row.penetrations) for row in found),
         "such as": ", ".join(row.robot for row in found[:3]),
     }
@@ -299,17 +320,29 @@ def _summary(group: str, rows: list[Row]) -> dict[str, object]:
         "robots": group,
         "number": len(rows),
         "loaders agree": sum(not row.loaders for row in rows),
-        **{f"worst {column}": _worst(rows, column) for column in SIMULATORS.values()},
-        f"drift > {MAX_DRIFT:g}": sum(bool(row.moving) for row in rows),
+        **{f"moves: {column}": _passing(rows, column) for column in SIMULATORS.values()},
+        "follower off": _worst(rows, 1),
+        "settles": _worst(rows, 2),
         "penetrate": sum(bool(row.penetrations) for row in rows),
         "unexplained": sum(row.is_unexplained for row in rows),
         "doctor: clean": f"{sum(not row.doctor for row in tested)}/{len(tested)}",
     }
 
 
-def _worst(rows: list[Row], column: str) -> str:
-    values = [getattr(row, column) for row in rows]
-    return "diverged" if "" in values else max(values, key=float)
+def _passing(rows: list[Row], column: str) -> int:
+    """Return how many robots hold their home and step from it in a simulator."""
+    return sum(column not in row.causes for row in rows)
+
+
+def _worst(rows: list[Row], item: int) -> str:
+    """Return the worst value of the robots that pass in a simulator, over all simulators."""
+    values = [
+        getattr(row, column).split()[item]
+        for row in rows
+        for column in SIMULATORS.values()
+        if column not in row.causes
+    ]
+    return max(values, key=float, default="-")
 
 
 if __name__ == "__main__":
