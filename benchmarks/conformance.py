@@ -58,6 +58,11 @@ CARRY = "to carry the weight"
 """Part of the cause of a motor that is too weak; see ``morphgen.checks.hold.overloads``."""
 BECAUSE = ", because "
 """Words between what goes wrong in a simulator and its causes."""
+WEAK = (
+    "the effort limits of the source are too small to settle in 3 s; ten times as much are enough"
+)
+SLOW = "joint damping and dry friction of the source slow the joints down"
+DAMPING = "PyBullet integrates joint damping explicitly, which turns light links on"
 COLLIDE = "a step leads links into each other"
 COMPOSED = "arm x end-effector"
 TWO_FLANGES = ("yumi",)
@@ -126,6 +131,9 @@ class Row:
                 CARRY: OVERLOAD,
                 HOLDS: SOLVER,
                 UNCOUPLED: UNCOUPLED,
+                "joint damping": DAMPING if name.startswith("pybullet") else SLOW,
+                "dry friction": SLOW,
+                "effort limits": WEAK,
                 MARGIN: TOUCH,
                 PENETRATE: collide,
             }
@@ -288,6 +296,12 @@ def _print(rows: list[Row]) -> None:
     explained = [_by_cause(cause, rows) for cause in causes if cause]
     if explained:
         print("\n" + tabulate(explained, headers="keys", disable_numparse=True))
+    parts = [
+        _followers(part, rows)
+        for part in sorted({_part(row) for row in rows if any(_follower_errors(row).values())})
+    ]
+    if parts:
+        print("\n" + tabulate(parts, headers="keys", disable_numparse=True))
     for row in filter(lambda row: row.is_unexplained, rows):
         print(f"UNEXPLAINED {row.robot}: {row.loaders} {row.moving} {row.penetrations}")
     for text, robots in sorted(_doctor_findings(rows).items()):
@@ -302,6 +316,32 @@ def _by_cause(cause: str, rows: list[Row]) -> dict[str, object]:
         "do not move": sum(bool(row.moving) for row in found),
         "penetrate": sum(bool(row.penetrations) for row in found),
         "such as": ", ".join(row.robot for row in found[:3]),
+    }
+
+
+def _part(row: Row) -> str:
+    """Return the end-effector of a composed robot, or the grammar of a drawn one."""
+    return row.robot.rpartition("-")[2] if row.group == COMPOSED else row.group
+
+
+def _follower_errors(row: Row) -> dict[str, float]:
+    """Return the largest error of a mimic joint in each simulator in which the robot passes."""
+    passing = [column for column in SIMULATORS.values() if column not in row.causes]
+    errors = {column: getattr(row, column).split()[1] for column in passing}
+    return {column: float(error) for column, error in errors.items()}
+
+
+def _followers(part: str, rows: list[Row]) -> dict[str, object]:
+    """Return how far mimic joints of a part's robots are from their leaders while joints step."""
+    errors = [_follower_errors(row) for row in rows if _part(row) == part]
+    return {
+        "mimic joints of": part,
+        "robots": len(errors),
+        **{
+            f"{column} [rad or m]": f"{max(own):.2g} ({len(own)} pass)" if own else "none passes"
+            for column in SIMULATORS.values()
+            for own in ([error[column] for error in errors if column in error],)
+        },
     }
 
 

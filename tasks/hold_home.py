@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from morphgen.checks.hold import HoldRow, SimulatedRobot, hold_row
+from morphgen.checks.hold import HoldRow, SimulatedRobot, hold_row, with_causes
 from morphgen.errors import SimulationError
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
@@ -34,7 +34,11 @@ def hold_in_environment(robot: Robot, simulator: str) -> HoldRow:
     """
     name = f"{simulator} (environment)"
     margin = BULLET_MARGIN if simulator == "pybullet" else 0.0
-    return hold_row(name, simulator, robot, lambda: _simulated(robot, simulator), margin)
+
+    def hold(robot: Robot) -> HoldRow:
+        return hold_row(name, simulator, robot, lambda: _simulated(robot, simulator), margin)
+
+    return with_causes(hold(robot), robot, hold)
 
 
 @contextmanager

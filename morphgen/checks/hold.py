@@ -15,13 +15,14 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.checks.home_pose import home_penetrations
 from morphgen.errors import FormatError, MorphgenError
-from morphgen.formats.bundle import MJCF, URDF
+from morphgen.formats.bundle import MJCF, URDF, bundle_folder, write_bundle
 from morphgen.formats.quiet import quiet
 from morphgen.model.dynamics import GRAVITY, gravity_load
 from morphgen.model.kinematics import movable_positions
@@ -57,6 +58,15 @@ SETTLED_S = 0.2
 
 MIN_TIMESTEP = 1e-4
 """Smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding."""
+
+CHANGES: Mapping[str, Callable[[Joint], Joint]] = {
+    "it settles without the joint damping": lambda joint: replace(joint, damping=0.0),
+    "it settles without the dry friction": lambda joint: replace(joint, friction=0.0),
+    "ten times the effort limits are enough": lambda joint: replace(
+        joint, effort=None if joint.effort is None else 10 * joint.effort
+    ),
+}
+"""Changes of the joints that tell a cause of a failure, by the words of the cause."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +116,60 @@ def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
         robot: The robot that the bundle holds.
         folder: Folder of the bundle.
     """
-    mjcf = hold_row("mujoco (mjcf)", "mujoco", robot, partial(_mjcf, robot, folder), 0.0)
 
-    def hold_urdf(iterations: int) -> HoldRow:
+    def in_new_bundle(hold: Callable[[Robot, Path], HoldRow], robot: Robot) -> HoldRow:
+        with TemporaryDirectory() as parent:
+            bundle = bundle_folder(Path(parent), robot.name)
+            write_bundle(robot, bundle, picture=False)
+            return hold(robot, bundle)
+
+    return tuple(
+        with_causes(hold(robot, folder), robot, partial(in_new_bundle, hold))
+        for hold in (_hold_mjcf, _hold_urdf)
+    )
+
+
+def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) -> HoldRow:
+    """Add the causes to the row of a robot that fails without a known one.
+
+    A property of the joints is a cause if the robot fails with it and passes, or fails only for
+    known causes, without it.
+
+    Args:
+        row: The row.
+        robot: The robot.
+        hold: Returns the row of a robot in the same simulator.
+    """
+    if row.passed is not False or row.causes or hold(robot).passed is not False:
+        return row  # if the robot passes, the fault is in the files
+    causes: list[str] = []
+    for cause, change in CHANGES.items():
+        changed = replace(robot, joints=tuple(change(joint) for joint in robot.joints))
+        if changed != robot:
+            trial = hold(changed)
+            if trial.passed or trial.causes:
+                causes += (cause, *trial.causes)
+    return replace(row, causes=tuple(dict.fromkeys(causes)))
+
+
+def _hold_mjcf(robot: Robot, folder: Path) -> HoldRow:
+    return hold_row("mujoco (mjcf)", "mujoco", robot, partial(_mjcf, robot, folder), 0.0)
+
+
+def _hold_urdf(robot: Robot, folder: Path) -> HoldRow:
+    def hold(iterations: int) -> HoldRow:
         urdf = partial(_urdf, robot, folder, iterations)
         return hold_row("pybullet (urdf)", "pybullet", robot, urdf, None)
 
-    urdf = hold_urdf(SOLVER_ITERATIONS)
-    if urdf.passed is not False or urdf.causes:
-        return mjcf, urdf
-    more, causes = hold_urdf(MORE_ITERATIONS), []
-    if more.passed or (urdf.step_error is None and more.step_error is not None):
+    row = hold(SOLVER_ITERATIONS)
+    if row.passed is not False or row.causes:
+        return row
+    more, causes = hold(MORE_ITERATIONS), []
+    if more.passed or (row.step_error is None and more.step_error is not None):
         causes.append(f"holds with {MORE_ITERATIONS} solver iterations")
     if not more.passed and more.settling_time is not None:  # only mimic joints fail
         causes.append("PyBullet ignores <mimic>, so that followers have motors of their own")
-    return mjcf, replace(urdf, causes=tuple(causes))
+    return replace(row, causes=tuple(causes))
 
 
 def hold_row(

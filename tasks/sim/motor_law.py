@@ -75,7 +75,8 @@ class MotorForces:
     ``morphgen.model.dynamics`` is a spring and a damper; so a motor j may pull as hard as these do
     with the joint-space inertia M at home: the sum over joints k of |M_jk a_k| with the law's
     acceleration a_k = omega^2 e_k - 2 omega v_k, plus ``SLACK``, times ``GAIN``. Free motion needs
-    no more.
+    no more. A mimic joint also needs the force that keeps it with its leader while others swing it
+    around: up to sqrt(M_jj M_kk) v_k^2.
     """
 
     def __init__(self, robots: Sequence[Robot], efforts: Sequence[float]) -> None:
@@ -91,18 +92,23 @@ class MotorForces:
         """Force of each row per acceleration of each independent joint; padded with zeros."""
         self._row = np.zeros((max_dof, len(self._efforts)), np.intp)
         """Row of that independent joint."""
+        self._swing = np.zeros_like(self._pull)
+        """Force of each row of a mimic joint per squared velocity of each independent joint."""
         farthest: list[float] = []
-        inertias: dict[int, Array] = {}
+        inertias: dict[int, tuple[Array, Array]] = {}
         for robot in robots:
             if id(robot) not in inertias:
                 inertias[id(robot)] = _inertia(robot)
             start, end = len(farthest), len(farthest) + len(robot.movable_joints)
-            self._pull[: robot.dof, start:end] = GAIN * inertias[id(robot)]
+            inertia, swing = inertias[id(robot)]
+            self._pull[: robot.dof, start:end] = GAIN * inertia
+            self._swing[: robot.dof, start:end] = GAIN * swing
             self._row[: robot.dof, start:end] = [
                 [start + robot.movable_joints.index(k)] for k in robot.independent_joints
             ]
             farthest.extend(farthest_targets(robot, robot.movable_joints))
         self._farthest = np.array(farthest)
+        self._has_mimic_joints = bool(self._swing.any())
 
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
         """Return the largest forces in a control step, shape (m,) [N m or N].
@@ -117,12 +123,18 @@ class MotorForces:
         begin, end = (np.abs(k - d) for k, d in zip(springs, dampers, strict=True))
         accelerations = np.maximum(begin, end) + SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
         forces = self._pull * accelerations[self._row]
+        if self._has_mimic_joints:
+            fastest = np.maximum(np.abs(velocities[0]), np.abs(velocities[1]))
+            forces += self._swing * (fastest**2)[self._row]
         # Along the first axis NumPy adds one row after the other, so that padding changes no bit.
         return np.minimum(np.add.reduce(forces, axis=0), self._efforts)
 
 
-def _inertia(robot: Robot) -> Array:
+def _inertia(robot: Robot) -> tuple[Array, Array]:
     """Return forces on movable joints per acceleration of independent joints, (dof, movable).
+
+    The second array is that per squared velocity of independent joints, which is zero for joints
+    that are no mimic joints.
 
     Each joint of a mimic group has a motor of its own: it carries what accelerates its own link,
     while the inertia of the group is that of all, in which two fingers that move apart cancel. In
@@ -134,8 +146,9 @@ def _inertia(robot: Robot) -> Array:
     armatures = np.diag([motor.armature for motor in actuation(robot)])
     of_movable = movable_mass_matrix(robot, robot.home)
     inertia = np.abs(matrix.T @ of_movable @ matrix) + armatures
-    bound = np.sqrt(np.outer(np.diag(inertia), np.diag(of_movable))) * (gains.T > 0)
-    of_group = np.maximum(np.abs(of_movable @ matrix).T, bound)
+    bound = np.sqrt(np.outer(np.diag(inertia), np.diag(of_movable)))
+    of_group = np.maximum(np.abs(of_movable @ matrix).T, bound * (gains.T > 0))
     is_grouped = (gains > 0) @ ((gains > 0).sum(axis=0) > 1)
     alone = inertia @ gains.T
-    return np.asarray(np.where(is_grouped, np.maximum(alone, of_group), alone))
+    is_mimic = [robot.joints[k].mimic is not None for k in robot.movable_joints]
+    return np.where(is_grouped, np.maximum(alone, of_group), alone), np.where(is_mimic, bound, 0.0)

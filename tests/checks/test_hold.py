@@ -193,3 +193,22 @@ def test_the_drift_has_the_unit_of_its_joint(name, unit):
     simulated = module.SimulatedRobot(1.0, lambda target: iter([home + far]))
     row = module._hold("mujoco", robot, simulated)
     assert (row.joint, row.unit, row.drift) == (joint.name, unit, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize(
+    ("property_of_joint", "causes"),
+    [
+        ({"effort": 0.01}, ["ten times the effort limits are enough"]),
+        ({"damping": 40.0}, ["it settles without the joint damping"]),
+        (
+            {"damping": 10.0, "friction": 12.0},
+            ["it settles without the joint damping", "it settles without the dry friction"],
+        ),
+    ],
+)
+def test_a_property_without_which_a_joint_settles_is_a_cause(property_of_joint, causes, tmp_path):
+    light = Link("bar", Inertial(0.02, (0, 0, 0), (1e-3, 0, 0, 1e-3, 0, 1e-3)))
+    joint = replace(lever(5.0).joints[0], **property_of_joint)
+    robot = replace(lever(5.0).with_links([light]), joints=(joint,))
+    row = held(robot, tmp_path)["mujoco (mjcf)"]
+    assert (row.passed, row.causes) == (False, tuple(causes))

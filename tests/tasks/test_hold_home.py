@@ -53,3 +53,11 @@ def test_links_that_touch_at_home_are_named():
     assert row.passed is False
     margin = "come within PyBullet's collision margin, to 0.0034 mm"
     assert f"arm_j2n6s300_link_5, ee_f0_proximal {margin}" in row.causes
+
+
+@needs_pybullet
+@pytest.mark.parametrize("arm_name", ["xarm7", "ur3", "iiwa14"])
+def test_light_fingers_stay_with_their_leader_when_the_arm_swings_them(arm_name):
+    """Its fingertips are light: what parts them from their leader is mostly centrifugal force."""
+    row = hold_in_environment(compose(f"arm={arm_name} ee=tiago_pro_gripper"), "pybullet")
+    assert row.follower_error < 0.02
