@@ -245,7 +245,8 @@ def _stepped(
     if not failed:
         return row
     others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
-    causes = [find_causes(step.target) for step in failed]
+    # Links that penetrate at home may hold a joint that steps out of the contact.
+    causes = [find_causes(step.target) or find_causes(np.array(robot.home)) for step in failed]
     # They are the causes only if every step that fails has one.
     known = tuple(dict.fromkeys(chain.from_iterable(causes))) if all(causes) else ()
     return replace(row, passed=False, message=f"{failed[0].fault}{others}", causes=known)
