@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -59,6 +60,31 @@ _REFUSED = {
     "flexstrain": "a robot has rigid links",
 }
 """Elements that are refused, and why."""
+_UNHELD = {
+    "geom": "friction condim priority solmix solref solimp margin gap fluidshape fluidcoef hfield",
+    "joint": (
+        "stiffness springref springdamper armature margin solreffriction solimpfriction "
+        "solreflimit solimplimit actuatorgravcomp"
+    ),
+    "freejoint": "group align",
+    "body": "gravcomp sleep",
+    "site": "type size fromto group material rgba",
+    "material": (
+        "texture texrepeat texuniform emission specular shininess reflectance metallic roughness"
+    ),
+    "mesh": "smoothnormal maxhullvert texcoord",
+    "connect": "solref solimp",
+    "weld": "solref solimp torquescale",
+    "spatial": "stiffness damping frictionloss springlength width material rgba",
+    "fixed": "stiffness damping frictionloss springlength",
+    **dict.fromkeys(
+        ("general", "motor", "position", "velocity", "intvelocity", "damper", "muscle"),
+        "kp kv dampratio timeconst inheritrange gainprm biasprm dynprm gaintype biastype dyntype",
+    ),
+}
+"""Attributes of elements that MuJoCo gets for which a ``Robot`` has no place."""
+_UNHELD_ELEMENTS = ("option", "flag", "light", "camera", "pair")
+"""Elements that MuJoCo gets for which a ``Robot`` has no place, besides ``_LEFT_OUT``."""
 _FILES = re.compile(r"file|file(back|down|front|left|right|up)|(asset|mesh|texture)dir")
 """Attributes that name files or folders."""
 _ALLOCATING = ("user", "act", "actdim", "nsample", "delay", "interp")
@@ -82,7 +108,7 @@ class MjcfDocument:
     includes: tuple[Path, ...] = ()
     """Files whose content is inserted."""
     findings: tuple[Finding, ...] = ()
-    """Repairs without which the document could not be parsed."""
+    """Repairs without which the document could not be parsed, and what is left out."""
 
     def error(self, why: str) -> FormatError:
         """Return an error about the document, without the lines of the text with includes."""
@@ -167,6 +193,7 @@ class _Includes:
         data = read_bytes(path, self._bytes_left)
         self._bytes_left -= len(data)
         root, findings = parse_description(data, str(path))
+        findings = (*findings, *_left_out_findings(root, path))
         _keep_known(root, path)
         for element in [*root.iter("include")]:
             included = self._file(element, path)
@@ -229,6 +256,47 @@ def _keep_known(root: etree._Element, path: Path) -> None:
             raise FormatError(
                 f"{path}:{element.sourceline}: <{element.tag}> is no element of MJCF that is read"
             )
+
+
+def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
+    """Count what is left out of a file: elements by their parent, attributes by their element."""
+    elements: dict[tuple[str, str], list[etree._Element]] = {}
+    attributes: dict[str, list[tuple[etree._Element, str]]] = {}
+    skipped = frozenset([*_LEFT_OUT, *_UNHELD_ELEMENTS])
+    todo = [root]
+    while todo:
+        element = todo.pop()
+        tag, names = str(element.tag), [str(name) for name in element.attrib]
+        unheld = (*_UNHELD.get(tag, "").split(), *_ALLOCATING)
+        if found := [(element, name) for name in names if name in unheld]:
+            attributes.setdefault(tag, []).extend(found)
+        for child in element:
+            if child.tag in skipped:
+                elements.setdefault((tag, str(child.tag)), []).append(child)
+        todo += reversed([child for child in element if child.tag not in skipped])
+    for (tag, name), children in elements.items():
+        inside = sum(sum(1 for _ in child.iterdescendants()) for child in children)
+        what = f"{len(children)} <{name}> of <{tag}>" + (
+            f" with {inside} elements inside" if inside else ""
+        )
+        yield _left_out("element-unread", f"{path}:{children[0].sourceline}", what)
+    for tag, places in attributes.items():
+        counts = Counter(name for _, name in places)
+        what = ", ".join(f"{n} {name}=..." for name, n in sorted(counts.items()))
+        yield _left_out(
+            "attribute-unread", f"{path}:{places[0][0].sourceline}", f"{what} of <{tag}>"
+        )
+
+
+def _left_out(code: str, where: str, what: str) -> Finding:
+    return Finding(
+        code,
+        "info",
+        where,
+        f"a robot has no place for {what}",
+        "none is needed",
+        f"left out: {what}",
+    )
 
 
 def _require_plain(root: etree._Element, path: Path) -> None:

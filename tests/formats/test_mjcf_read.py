@@ -369,3 +369,24 @@ def test_names_are_unique_and_sites_do_not_take_those_of_links(tmp_path):
     assert [link.name for link in robot.links] == ["a", "b_b_joint_2", "b", "body_3"]
     assert [joint.name for joint in robot.joints] == ["b_joint_2", "b_joint", "body_3_joint"]
     assert [frame.name for frame in robot.frames] == ["a_site"]
+
+
+def test_what_a_robot_has_no_place_for_is_counted(tmp_path):
+    body = """<option timestep="0.001"><flag gravity="disable"/></option>
+        <default><geom condim="4"/></default>
+        <worldbody><light/><body name="base"><geom size="0.1" friction="1 1 1" solref="1 1"/>
+        <body name="tip" gravcomp="1"><joint name="a" stiffness="3"/><geom size="0.1" friction="1"/>
+        </body></body></worldbody>
+        <actuator><position joint="a" kp="9" ctrlrange="-1 1"/></actuator>
+        <sensor><jointpos joint="a"/><jointvel joint="a"/></sensor>"""
+    findings = read(tmp_path, body).source_findings
+    assert {finding.severity for finding in findings} == {"info"}
+    assert [finding.repair for finding in findings] == [
+        "left out: 1 <option> of <mujoco> with 1 elements inside",
+        "left out: 1 <sensor> of <mujoco> with 2 elements inside",
+        "left out: 1 <light> of <worldbody>",
+        "left out: 1 condim=..., 2 friction=..., 1 solref=... of <geom>",
+        "left out: 1 gravcomp=... of <body>",
+        "left out: 1 stiffness=... of <joint>",
+        "left out: 1 kp=... of <position>",
+    ]
