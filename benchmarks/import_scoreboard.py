@@ -30,6 +30,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import traceback
 from collections import Counter
 from collections.abc import Iterator
@@ -95,6 +96,7 @@ def main() -> int:
         for path in _files(root)
         if args.only in str(path)
     ]
+    tqdm.set_lock(threading.RLock())  # by default it is one for all processes
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(args.jobs) as pool:
         jobs = [
             pool.submit(_outcome, package, root, path, Path(scratch) / str(i), args.conform)
@@ -139,6 +141,7 @@ def _outcome(package: str, root: Path, path: Path, out: Path, conform: bool) -> 
 
 
 def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool) -> None:
+    tqdm.set_lock(threading.RLock())  # the fork may have copied a lock that a thread holds
     printed, errors = io.StringIO(), io.StringIO()
     words = ["import", str(path), "--root", str(root), "--no-picture", "--out", str(out)]
     try:

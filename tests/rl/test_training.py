@@ -88,6 +88,9 @@ def test_a_stopped_run_keeps_its_updates(tmp_path, number):
 
 
 def test_a_second_signal_acts_at_once(tmp_path):
+    # A shell starts processes in the background with SIGINT ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
     def show(part):
         def told(report, updates):
             if report.update == 2:
@@ -98,8 +101,11 @@ def test_a_second_signal_acts_at_once(tmp_path):
 
         return told
 
-    with pytest.raises(StoppedError):
-        train(tmp_path / "run", small_config(), execution=QUIET, show=show)
+    try:
+        with pytest.raises(StoppedError):
+            train(tmp_path / "run", small_config(), execution=QUIET, show=show)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def untimed(folder):
