@@ -56,7 +56,7 @@ from morphgen.fitting.replace_collision import as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import write_file
 from morphgen.formats.fits import are_primitives
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics, random_configurations

@@ -22,7 +22,7 @@ from importlib.util import find_spec
 
 from tabulate import tabulate
 
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose, join
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request

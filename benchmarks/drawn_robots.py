@@ -24,15 +24,14 @@ from itertools import product
 import torch
 from tabulate import tabulate
 
-from morphgen.rl import drawn_robots
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.drawn_robots import draw, drawn_source
-from morphgen.rl.learner_state import use_batch
 from morphgen.rl.ppo import Learner
-from morphgen.rl.robot_source import RobotSource
-from morphgen.rl.runs import RunConfig
-from morphgen.rl.training_batches import SLICE_STEPS, TrainingBatches
-from morphgen.tasks.env_specs import GoalConfig, default_configs
+from morphgen.rl.runs import drawn_robots
+from morphgen.rl.runs.checkpoint import RunConfig
+from morphgen.rl.runs.drawn_robots import draw, drawn_source
+from morphgen.rl.runs.robot_source import RobotSource
+from morphgen.rl.runs.training import SLICE_STEPS, TrainingBatches, use_batch
+from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig
 
 NUM_STEPS = 32

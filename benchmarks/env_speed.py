@@ -61,9 +61,9 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.benchmark.split_file import read_split
-from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.sim import bullet_scene
+from morphgen.tasks.scenes.make import make_batch, make_split_batch
+from morphgen.tasks.sim import bullet_batch as bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
 from morphgen.tasks.speed import measure_speed, random_actions
 
@@ -182,7 +182,7 @@ def _single_rows(task: str, robot: str, peer: str) -> list[Row]:
         makes["panda-gym"] = partial(_panda, peer)
         makes[f"panda-gym, episodes of {EPISODE} steps"] = partial(_panda, peer, EPISODE)
     for name, sim in (("PyBullet", "pybullet"), ("MuJoCo", "mujoco")):
-        env_id = f"morphgen.tasks.gym_env:morphgen/{task.capitalize()}-v0"
+        env_id = f"morphgen.tasks.gym.env:morphgen/{task.capitalize()}-v0"
         makes[f"morphgen, {name}"] = partial(gymnasium.make, env_id, robot=robot, sim=sim)
     return [Row(case, name, partial(_single, make)) for name, make in makes.items()]
 

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from import_scoreboard import PACKAGES, _folder
 from morphgen.errors import MorphgenError
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import read_urdf
+from morphgen.formats.urdf.read import read_urdf
 from morphgen.model.geometry import IDENTITY, Mesh
 from morphgen.model.robot import Robot
 

@@ -28,10 +28,9 @@ from tabulate import tabulate
 
 import morphgen
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model import kinematics, kinematics_torch
-from morphgen.model.frame_positions import frame_positions
-from morphgen.model.kinematics import movable_positions, random_configurations
+from morphgen.model.kinematics import frame_positions, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 

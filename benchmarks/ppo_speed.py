@@ -8,7 +8,8 @@ A row is one update: a rollout of 128 control steps in every environment, and fo
 minibatches. Within a simulator and number of threads all rows share:
 
 - the environments: reach of one robot, a new batch with the same padding and the same staggered
-  episodes; stable-baselines3 gets it through ``morphgen.tasks.sb3.sb3_vector``. Continuous actions.
+  episodes; stable-baselines3 gets it through ``morphgen.tasks.gym.sb3.sb3_vector``. Continuous
+  actions.
 - rollout length, environments, epochs, minibatches and minibatch size, and thus gradient steps;
   clip range, discount, GAE lambda, entropy weight, Adam; separate value and policy networks.
 - torch threads, and as many workers of the simulator (PyBullet processes, MuJoCo threads).
@@ -57,8 +58,7 @@ from morphgen.benchmark.tokens import MAX_LINKS, TOKEN_SIZE
 from morphgen.model.robot import Robot
 from morphgen.rl.agents import mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.heads import INITIAL_LOG_STD
-from morphgen.rl.observation_layout import layout_of
+from morphgen.rl.observation_layout import INITIAL_LOG_STD, layout_of
 from morphgen.rl.ppo import Learner
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
@@ -108,8 +108,8 @@ def main() -> int:
 
 def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Iterator[Row]:  # noqa: ANN401
     """Return the rows of a simulator and a number of threads."""
-    from morphgen.tasks.env_specs import load_robot
-    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.scenes.env_specs import load_robot
+    from morphgen.tasks.scenes.make import make_batch
 
     body = load_robot(robot)
     torch.set_num_threads(threads)
@@ -221,8 +221,8 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
 
 def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not be installed
     """Return the batch for stable-baselines3, with staggered episodes like a learner's."""
-    from morphgen.tasks.sb3 import SB3Vector
-    from morphgen.tasks.vector import TaskVector, numpy_observation
+    from morphgen.tasks.gym.sb3 import SB3Vector
+    from morphgen.tasks.gym.vector import TaskVector, numpy_observation
 
     class Spread(SB3Vector):
         def reset(self) -> dict[str, Any]:

@@ -38,11 +38,11 @@ from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.env_specs import GoalConfig, member_spec
-from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS, installed_simulators
+from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
+from morphgen.tasks.scenes.make import batch_from_specs
 
 Row = dict[str, float | str]
 

@@ -28,7 +28,7 @@ from typing import Any
 from tabulate import tabulate
 
 from morphgen.formats.files import write_atomic
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint
 
 REAL_ARMS = (
     *("ur5", "panda", "kinova_gen3", "xarm7", "iiwa14"),

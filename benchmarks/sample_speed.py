@@ -26,10 +26,10 @@ from typing import ParamSpec, TypeVar
 
 from tabulate import tabulate
 
-from morphgen.grammar import compose, conditions, robot_set, sampling
+from morphgen.grammar import compose, robot_set, sampling
+from morphgen.grammar import values as conditions
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
-from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
-from morphgen.grammar.workers import make_in_processes
+from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_serially, make_set
 
 P = ParamSpec("P")
 T = TypeVar("T")

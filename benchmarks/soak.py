@@ -25,8 +25,8 @@ from morphgen.benchmark.split_file import read_split
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import default_library
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.registry import SIMULATORS
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.speed import random_actions
 
 GROWTH = 1.05

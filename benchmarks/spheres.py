@@ -41,9 +41,8 @@ from tqdm import tqdm
 
 from fit_quality import FOUR, Task, link_tasks
 from morphgen.fitting.quality import quality
-from morphgen.fitting.search import sample_solid
+from morphgen.fitting.search import best_spheres, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.fitting.sphere_search import best_spheres
 from morphgen.model.geometry import Pose, Shape, Sphere
 
 T = TypeVar("T")

@@ -348,8 +348,9 @@ def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
-    from morphgen.viewer import page_robot_show, scene_population
-    from morphgen.viewer.app import serve
+    from morphgen.viewer.app.app import serve
+    from morphgen.viewer.pages import robot_show as page_robot_show
+    from morphgen.viewer.scene import population as scene_population
 
     times: dict[str, list[float]] = {"robot": [], "population": []}
 

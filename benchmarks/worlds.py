@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.formats.mjcf import TIMESTEP, to_spec
+from morphgen.formats.mjcf.write import TIMESTEP, to_spec
 from morphgen.formats.quiet import quiet
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Robot

@@ -25,10 +25,9 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.formats.data_files import read_json
-from morphgen.rl.intervals import Interval
-from morphgen.rl.runs import read_config
-from morphgen.rl.scores import Score, score_from_json, success_of
-from morphgen.rl.study_cells import stored_cell, tuned_name
+from morphgen.rl.runs.checkpoint import read_config
+from morphgen.rl.scores.scores import Interval, Score, score_from_json, success_of
+from morphgen.rl.scores.study import stored_cell, tuned_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from viewer_pictures import WAIT, hide_notice, served, started_browser
 
-from morphgen.tasks.renderer import Frame, write_video
+from morphgen.tasks.render.renderer import Frame, write_video
 
 SIZE = (1280, 800)
 """Size of the browser's window [pixels]."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from morphgen.viewer.app import serve
+from morphgen.viewer.app.app import serve
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from viewer_speed import started_browser

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
-from morphgen.tasks.renderer import write_video
+from morphgen.tasks.render.renderer import write_video
 
 ROBOTS = (
     "arm=ur5 ee=stick",

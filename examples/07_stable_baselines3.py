@@ -14,8 +14,8 @@ import numpy as np
 from stable_baselines3 import PPO
 
 import morphgen
+from morphgen.tasks.gym.sb3 import SB3Vector
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.sb3 import SB3Vector
 
 # %%
 # Robots share one space: observations are padded and masked, actions of missing joints are ignored.

@@ -11,7 +11,7 @@ import time
 from contextlib import suppress
 
 import morphgen
-from morphgen.viewer.app import serve
+from morphgen.viewer.app.app import serve
 
 
 def main() -> None:

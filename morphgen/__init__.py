@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
     from morphgen.api.environments import make_env
-    from morphgen.api.fitting import fit
-    from morphgen.api.robots import compose, read, sample, write
+    from morphgen.api.robots import compose, fit, read, sample, write
     from morphgen.api.splits import split
     from morphgen.errors import MorphgenError
     from morphgen.model.robot import Robot
@@ -48,7 +47,7 @@ _MODULES = {
     "check": "morphgen.api.checks",
     "compose": "morphgen.api.robots",
     "conform": "morphgen.api.checks",
-    "fit": "morphgen.api.fitting",
+    "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
     "make_env": "morphgen.api.environments",
     "read": "morphgen.api.robots",

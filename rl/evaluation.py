@@ -17,15 +17,14 @@ from morphgen.model.kinematics import reach
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
-from morphgen.rl.intervals import episode_interval
-from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
-from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
-from morphgen.rl.scores import Score
-from morphgen.rl.training import checkpoint_files
-from morphgen.tasks.env_specs import GoalConfig, default_configs
-from morphgen.tasks.make import batch_from_specs
+from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
+from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
+from morphgen.rl.runs.training import checkpoint_files
+from morphgen.rl.scores.scores import Score, episode_interval
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
+from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
+from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 MAX_ENVS_PER_ROBOT = 34

@@ -13,13 +13,13 @@ from morphgen.processes import one_torch_thread
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
-from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.renderer import Frame
+from morphgen.tasks.render.renderer import Frame
+from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import TaskConfig
 

@@ -1,19 +1,14 @@
-"""Proximal policy optimisation over a batch of robots: the whole algorithm, top to bottom.
-
-An update (``Learner.iterate``) collects a rollout into preallocated buffers, estimates advantages
-and returns (GAE), and then takes gradient steps on minibatches of the rollout.
-
-Shapes: T control steps of n environments with R robots; m transitions in a minibatch.
-"""
+"""Advantages of a rollout: generalised estimation, and normalisation."""
 
 from __future__ import annotations
 
 import copy
 import math
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from itertools import chain
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -21,20 +16,227 @@ from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
-from morphgen.rl.advantages import gae, normalized_advantages
-from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import ALONE, ProcessGroup, merged_metrics
-from morphgen.rl.final_observations import FinalObservations
-from morphgen.rl.heads import joint_entropy
-from morphgen.rl.learning_rate import next_actor_lr_scale
-from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
-from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
+from morphgen.rl.distributed import (
+    ALONE,
+    Metrics,
+    ProcessGroup,
+    UpdateMetrics,
+    explained_variance,
+    merged_metrics,
+)
+from morphgen.rl.observation_layout import joint_entropy, layout_of, pad_links, truncate_links
 from morphgen.rl.policies import entries_unneeded, make_networks, rows_needed
-from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.host import is_host
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.step_graph import StepGraph, can_record
+
+
+def gae(
+    rewards: torch.Tensor,
+    values: torch.Tensor,
+    next_values: torch.Tensor,
+    terminated: torch.Tensor,
+    truncated: torch.Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> torch.Tensor:
+    """Return advantages by generalised estimation (Schulman et al. 2016, equation 16).
+
+    After a termination the return is zero. After a truncation it is the value of the episode's last
+    observation (Pardo et al. 2018), and the sum stops there. The critic learns advantages plus
+    values. All tensors have the shape (T, n).
+
+    Args:
+        rewards: Rewards of T control steps in n environments.
+        values: Values of the observations that were acted upon.
+        next_values: Values of the observations that the actions led to, before any new episode.
+        terminated: Where the task ended the episode, bool.
+        truncated: Where the time limit ended the episode, bool.
+        gamma: Discount factor.
+        gae_lambda: Weight of longer estimates.
+    """
+    delta = rewards + gamma * torch.where(terminated, 0.0, next_values) - values
+    carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
+    advantages = torch.empty_like(delta)
+    advantage = torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        advantage = delta[t] + carry[t] * advantage
+        advantages[t] = advantage
+    return advantages
+
+
+def normalized_advantages(
+    advantages: torch.Tensor, robots: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return advantages with mean 0 and standard deviation 1, over all or robot by robot.
+
+    Args:
+        advantages: Advantages, shape (T, n).
+        robots: Robot of each advantage, shape (T, n), int64; None to normalize over all of them.
+    """
+    if robots is None:
+        return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    index, values = robots.flatten(), advantages.flatten()
+    count = torch.bincount(index)
+    mean = torch.zeros_like(count, dtype=values.dtype).index_add_(0, index, values) / count
+    centred = values - mean[index]
+    squares = torch.zeros_like(mean).index_add_(0, index, centred.square())
+    deviation = (squares / (count - 1).clamp(min=1)).sqrt()
+    return (centred / (deviation[index] + 1e-8)).reshape(advantages.shape)
+
+
+def symlog(x: torch.Tensor) -> torch.Tensor:
+    """Return ``sign(x) ln(1 + |x|)`` (Hafner et al. 2023, DreamerV3, equation 9)."""
+    return torch.sign(x) * torch.log1p(torch.abs(x))
+
+
+def symexp(x: torch.Tensor) -> torch.Tensor:
+    """Return ``sign(x) (exp |x| - 1)``, the inverse of ``symlog``."""
+    return torch.sign(x) * torch.expm1(torch.abs(x))
+
+
+def matching_loss(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Return the loss of predictions ``x`` of ``symlog(y)``: 0 if ``symexp(x)`` is ``y``.
+
+    Its derivative in ``x`` is ``symexp(x) - y``. It is convex; for many ``y`` its minimum is the
+    symlog of their mean. The squared error of symlogs would learn the mean of the symlogs,
+    which is nearer to zero. This is the matching loss of the transfer function ``symexp`` (Auer,
+    Herbster and Warmuth 1996, "Exponentially many local minima for single neurons").
+    """
+    best = symlog(y)
+    return _potential(x) - _potential(best) - y * (x - best)
+
+
+def half_square(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Return half the squared error, the ``matching_loss`` of a critic without symlog."""
+    return 0.5 * (x - y).square()
+
+
+def _potential(x: torch.Tensor) -> torch.Tensor:
+    """Return the integral of ``symexp`` from 0 to x."""
+    return torch.expm1(torch.abs(x)) - torch.abs(x)
+
+
+KL_FACTOR = 1.2
+"""Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
+MIN_ACTOR_LR_SCALE = 0.01
+"""Smallest factor on the actor's learning rate, so that it rises again soon (rsl_rl: 1e-5/1e-3)."""
+FINETUNING_ACTOR_LR_SCALE = 0.1
+"""Factor with which fine-tuning begins if it has a ``desired_kl``."""
+
+
+def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
+    """Return the factor on the actor's learning rate in the next update.
+
+    Args:
+        config: The algorithm; without a ``desired_kl`` the factor is 1.
+        scale: Factor in the last update.
+        kl: Mean divergence of the last update's gradient steps [nats].
+    """
+    if not config.desired_kl:
+        return 1.0
+    if kl > config.desired_kl:
+        return max(scale / KL_FACTOR, MIN_ACTOR_LR_SCALE)
+    return min(scale * KL_FACTOR, 1.0)
+
+
+class FinalObservations:
+    """Collects observations step by step, and returns the rows of truncated episodes at the end.
+
+    On a GPU nothing is read before the end, so that a rollout never waits for it; until then the
+    observations of all environments stay in memory.
+    """
+
+    def __init__(self) -> None:
+        self._observations: list[Observation] = []
+        self._truncated: list[torch.Tensor] = []
+
+    def add(self, observation: Observation, truncated: torch.Tensor) -> None:
+        """Add a step.
+
+        Args:
+            observation: Observation after the action, tensors (n, ...), which are copied.
+            truncated: Whether the episode was truncated, shape (n,), bool.
+        """
+        reads = is_host(truncated.device)
+        self._observations.append(
+            {n: value[truncated] if reads else value.clone() for n, value in observation.items()}
+        )
+        self._truncated.append(truncated.clone())
+
+    def gather(self) -> Observation:
+        """Return the rows of the k truncated episodes, tensors (k, ...) in the order of steps."""
+        steps = self._observations
+        if is_host(self._truncated[0].device):
+            return {name: torch.cat([step[name] for step in steps]) for name in steps[0]}
+        truncated = torch.stack(self._truncated)
+        counts = truncated.sum(dim=1).tolist()
+        rows = torch.split(torch.nonzero(truncated)[:, 1], counts)
+        return {
+            name: torch.cat([step[name][row] for step, row in zip(steps, rows, strict=True)])
+            for name in steps[0]
+        }
+
+
+MAX_COMPILED = 64
+"""Functions and input shapes that a process may compile."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def prepared(
+    function: Callable[P, T], device: torch.device, *, bf16: bool, compiled: bool
+) -> Callable[P, T]:
+    """Return a function that runs another one in bfloat16, or compiled.
+
+    On a GPU the compiled function is a CUDA graph: a gradient step of a small network is hundreds
+    of kernels, and to launch them one by one takes longer than they run. The next call of any graph
+    overwrites what a graph returned; copy results that you keep.
+
+    Args:
+        function: A network, or a function that calls networks.
+        device: Device of the function's tensors.
+        bf16: Compute matrix products in bfloat16, by autocast.
+        compiled: Compile the function by ``torch.compile``.
+    """
+    graphs = compiled and device.type == "cuda"
+    inner = _compiled(function, graphs) if compiled else function
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        if graphs:
+            torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+            return inner(*args, **kwargs)
+
+    return call
+
+
+def _compiled(function: Callable[P, T], graphs: bool) -> Callable[P, T]:
+    """Return the function compiled by ``torch.compile``.
+
+    By default torch stops compiling after eight functions and shapes; four learners of a study have
+    as many. Calls raise TaskError if torch cannot compile, for example without a C++ compiler.
+    """
+    from torch._dynamo import config  # takes a second to load
+    from torch._dynamo.exc import TorchDynamoException
+
+    config.recompile_limit = max(config.recompile_limit, MAX_COMPILED)
+    mode = "reduce-overhead" if graphs else None
+    compiled = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return compiled(*args, **kwargs)
+        except TorchDynamoException as error:
+            why = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise TaskError(f"--compile: torch cannot compile here: {why}") from error
+
+    return call
+
 
 LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")

@@ -13,10 +13,9 @@ from morphgen.rl.evaluation import (
     evaluate_checkpoints,
     require_trained_tasks,
 )
-from morphgen.rl.intervals import Interval, success_interval
-from morphgen.rl.robot_source import RobotSource
-from morphgen.rl.runs import read_checkpoint
-from morphgen.rl.scores import Score
+from morphgen.rl.runs.checkpoint import read_checkpoint
+from morphgen.rl.runs.robot_source import RobotSource
+from morphgen.rl.scores.scores import Interval, Score, success_interval
 from morphgen.rl.shipped_policies import name_of
 
 Progress = Callable[[str, float, int], None]

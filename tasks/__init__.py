@@ -2,7 +2,7 @@
 
 Importing this package registers ``morphgen/Reach-v0`` and ``morphgen/Push-v0`` with Gymnasium if
 Gymnasium has been imported before: to import it here would cost every worker process 0.1 s.
-``gymnasium.make("morphgen.tasks.gym_env:morphgen/Reach-v0")`` works in any order.
+``gymnasium.make("morphgen.tasks.gym.env:morphgen/Reach-v0")`` works in any order.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from morphgen.tasks.make import make_batch, make_split_batch
+    from morphgen.tasks.scenes.make import make_batch, make_split_batch
 
 __all__ = ["make_batch", "make_split_batch"]
 
@@ -23,7 +23,7 @@ if "gymnasium" in sys.modules:
 
 def __getattr__(name: str) -> object:
     if name in __all__:
-        from morphgen.tasks import make
+        from morphgen.tasks.scenes import make
 
         return getattr(make, name)
     raise AttributeError(f"module 'morphgen.tasks' has no attribute {name!r}")

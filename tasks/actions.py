@@ -11,7 +11,7 @@ from morphgen.errors import TaskError
 from morphgen.tasks.host import is_host
 
 if TYPE_CHECKING:
-    from morphgen.tasks.robot_tables import RobotTables
+    from morphgen.tasks.scenes.robot_tables import RobotTables
 
 ActionKind = Literal["continuous", "discrete"]
 

@@ -11,18 +11,17 @@ import torch
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
-from morphgen.tasks.batch_observation import BatchObservation, PhysicsState, copied
-from morphgen.tasks.episode_layouts import EpisodeLayouts
+from morphgen.tasks.batch_observation import BatchObservation, PhysicsState, StraightPaths, copied
 from morphgen.tasks.host import is_host
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
 from morphgen.tasks.reset_options import EpisodePlacer
-from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
+from morphgen.tasks.scenes.episode_layouts import EpisodeLayouts
+from morphgen.tasks.scenes.obstacles import LayoutSide
+from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
 from morphgen.tasks.step_result import TaskState
-from morphgen.tasks.straight_paths import StraightPaths
 from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 

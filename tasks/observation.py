@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
+from morphgen.benchmark.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
 from morphgen.tasks.channels import CHANNELS, KINEMATIC_CHANNELS
-from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Scene
 
 Observation = dict[str, torch.Tensor]

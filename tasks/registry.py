@@ -216,7 +216,7 @@ def register_gym_envs() -> None:
         if env_id not in registry:
             register(
                 id=env_id,
-                entry_point="morphgen.tasks.gym_env:TaskEnv",
-                vector_entry_point="morphgen.tasks.vector:task_vector",
+                entry_point="morphgen.tasks.gym.env:TaskEnv",
+                vector_entry_point="morphgen.tasks.gym.vector:task_vector",
                 kwargs={"task": task},
             )

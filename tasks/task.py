@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
 from morphgen.typing import Array
 
-if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
+if TYPE_CHECKING:
     import torch
 
     from morphgen.tasks.free_space import FreeSpace
@@ -436,3 +437,38 @@ class Task(ABC, Generic[C, G]):
     def points_in_view(self, goals: G) -> Array:
         """Return points that a camera should see besides robot and obstacles, shape (m, 3)."""
         return goals.goal_poses[:, :3]
+
+
+def require_task_config(config: TaskConfig) -> None:
+    """Require valid values of the constants that every task has, and only finite numbers or text.
+
+    Raises:
+        TaskError: If a constant is out of its range.
+    """
+    name = type(config).__name__
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, str) and isinstance(field.default, str):
+            continue
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
+            raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
+    # The largest are far above all uses: a file from elsewhere shall not fill the memory.
+    for field_name, minimum, maximum in (
+        ("max_episode_steps", 1, 1_000_000),
+        ("num_goals", 1, 1_000_000),
+        ("obstacles", 0, 1_000),
+        ("train_layouts", 1, 1_000_000),
+        ("eval_layouts", 1, 1_000_000),
+    ):
+        value = getattr(config, field_name)
+        if not isinstance(value, int) or not minimum <= value <= maximum:
+            raise TaskError(
+                f"{name}: {field_name} {value!r}: expected an integer >= {minimum} and "
+                f"<= {maximum:,}"
+            )
+    low, high = config.obstacle_size
+    if not 0 < low <= high:
+        raise TaskError(
+            f"{name}: obstacle_size {config.obstacle_size}: expected 0 < lowest <= highest"
+        )

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 import morphgen
-from morphgen.api.loaded_split import LoadedSplit
+from morphgen.api.splits import LoadedSplit
 from morphgen.cli import main
 from morphgen.errors import MorphgenError
 

@@ -172,7 +172,7 @@ def test_pybullet_processes_load_few_packages():
         "fitting.token_shapes",
         "model.kinematics",
         "model.inverse_kinematics",
-        "tasks.env_specs",
+        "tasks.scenes.env_specs",
     ],
 )
 def test_splits_and_goals_do_not_import_torch(module):

@@ -13,15 +13,15 @@ import pytest
 
 from morphgen.cli import main
 from morphgen.grammar.library import default_library
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer.address import Address
+from morphgen.viewer.app.address import Address
 from morphgen.viewer.episode import episode_bytes, read_episode
-from morphgen.viewer.episode_export import record_scene
-from morphgen.viewer.page_play_controls import parse_rollout
+from morphgen.viewer.pages.play import parse_rollout
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
+from morphgen.viewer.scene.rollout import record_scene
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CUSTOM_TASK = EXAMPLES / "09_custom_task.py"

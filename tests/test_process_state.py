@@ -70,9 +70,9 @@ for name in {MODULES!r}:
     except ModuleNotFoundError as error:
         if error.name.startswith("morphgen"):
             raise
-from morphgen.formats.xacro_expressions import expression
+from morphgen.formats.xacro.evaluator import expression
 expression("2if 1 else 3").evaluate({{}})
-from morphgen.viewer.app import serve
+from morphgen.viewer.app.app import serve
 serve([], "127.0.0.1", 0, []).stop()
 after = state()
 print("changed:", *(kind for kind in STATE if before[kind] != after[kind]))

@@ -14,8 +14,8 @@ import pytest
 from morphgen.benchmark.split import sided_members
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.cli import main
-from morphgen.rl.leaderboard import relative_scores
-from morphgen.rl.score_tables import read_submissions
+from morphgen.rl.scores.leaderboard import relative_scores
+from morphgen.rl.scores.score_tables import read_submissions
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = re.findall(

@@ -9,8 +9,7 @@ from morphgen.checks import check
 from morphgen.grammar.compose import join
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import default_library
-from morphgen.grammar.manifest import Manifest
-from morphgen.grammar.parameters import resolve_values
+from morphgen.grammar.manifest import Manifest, resolve_values
 from morphgen.grammar.part import load_part
 from morphgen.model.inertia import inertial_from_density, union_integrals
 from morphgen.model.kinematics import forward_kinematics, random_configurations

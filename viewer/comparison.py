@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.benchmark.similarity import MEASURES, features
-from morphgen.benchmark.token_layout import default_max_links
-from morphgen.benchmark.tokens import tokens
+from morphgen.benchmark.tokens import default_max_links, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
-from morphgen.formats.npz_files import read_all
+from morphgen.formats.zip_files import read_all
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot

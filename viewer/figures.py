@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.typing import Array
-from morphgen.viewer.address import Address
+from morphgen.viewer.app.address import Address
 from morphgen.viewer.population_layout import spread
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from html import escape
 
 from morphgen.model.findings import Finding
-from morphgen.viewer.address import Address
+from morphgen.viewer.app.address import Address
 
 SELECTED = "#00bedc"
 """Colour of what belongs to the selected link: ``scene_selection.SELECTED``."""

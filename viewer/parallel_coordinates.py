@@ -8,7 +8,7 @@ from html import escape
 
 from matplotlib.ticker import MaxNLocator
 
-from morphgen.viewer.address import Address, AddressError
+from morphgen.viewer.app.address import Address, AddressError
 from morphgen.viewer.figures import CHOSEN, NOT_CHOSEN, SIDE_COLOURS
 from morphgen.viewer.robot_rows import Row, facts_line
 

@@ -10,6 +10,7 @@ import viser
 
 from morphgen.benchmark.split_file import split_names
 from morphgen.grammar.robot_source import is_set_folder
+from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
 from morphgen.viewer.robot_uri import (
     WORDS,
@@ -18,7 +19,6 @@ from morphgen.viewer.robot_uri import (
     parent_folder,
     resolve_split,
 )
-from morphgen.viewer.session import Session, set_value
 
 ARMS = "arms with a plate"
 MAX_CHOICES = 500

@@ -2,39 +2,36 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import viser
 
 from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import (
-    COMPOSED,
-    HOLD_OUT,
-    REGIMES,
-    SIDES,
-    Member,
-    Regime,
-    Side,
-    Split,
-)
+from morphgen.benchmark.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Side, Split
 from morphgen.benchmark.split_file import require_split_name, write_split
-from morphgen.benchmark.statistics import summarize_survey
 from morphgen.benchmark.survey import (
     Fault,
     MeasuredRobot,
     SplitSurvey,
     SurveyedRobot,
     measure_robot,
+    summarize_survey,
 )
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
+from morphgen.viewer import markup
+from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import (
     MEMBER,
@@ -44,7 +41,6 @@ from morphgen.viewer.robot_uri import (
     resolve_member,
     shorten,
 )
-from morphgen.viewer.workers import Workers
 
 SAVED_REGIMES = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
 """Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
@@ -222,3 +218,61 @@ def conclude_study(
         tuple(members[i] for i in sound),
         matrices,
     )
+
+
+ChooseSides = Callable[[], tuple[list[Row], list[Row]]]
+"""Function that returns the robots to train on and those to test on."""
+
+
+def add_split_form(
+    session: Session,
+    add_choice: Callable[[], ChooseSides],
+    hint: str = "",
+    *,
+    expanded: bool = False,
+) -> None:
+    """Add controls that save a new split.
+
+    Args:
+        session: The browser.
+        add_choice: Adds the controls that choose the sides; returns the function that reads them.
+        hint: Text above the controls.
+        expanded: Whether the controls are shown before the user opens their folder.
+    """
+    gui = session.client.gui
+    with gui.add_folder("New split", expand_by_default=expanded):
+        if hint:
+            gui.add_html(markup.framed(markup.dim(hint)))
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", SAVED_REGIMES)
+        task = gui.add_dropdown("task", tuple(TASKS))
+        obstacles = gui.add_checkbox("obstacles", False)
+        choose_sides = add_choice()
+        text = gui.add_html("")
+        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+
+    def save() -> None:
+        """Compose the robots in the worker processes, and write the split."""
+        train, test = (
+            make_members(
+                rows,
+                task.value,
+                obstacles.value,
+                session.files,
+                session.workers,
+                lambda done, total: session.set_status(f"composing {total} robots", done / total),
+            )
+            for rows in choose_sides()
+        )
+        session.set_status("")
+        path = save_split(name.value, regime.value, train, test, session.files)
+        show_saved(session, path, text)
+
+    session.on_change(button, lambda: session.run_in_background(save))
+
+
+def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
+    """Show that a split was written, and the command that audits it."""
+    name = str(path.relative_to(session.files.roots[0]))
+    text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(name)}"))
+    session.notify("Saved", name)

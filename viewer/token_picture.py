@@ -14,7 +14,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from morphgen.benchmark.token_layout import LAYOUT
+from morphgen.benchmark.tokens import LAYOUT
 from morphgen.typing import Array
 from morphgen.viewer import markup
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from morphgen.arguments import checked_signature, text_argument
 from morphgen.benchmark import tokens as encoding
 from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
-from morphgen.benchmark.token_layout import default_max_links
+from morphgen.benchmark.tokens import default_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.token_shapes import token_shapes

@@ -15,7 +15,7 @@ from morphgen.checks.home_pose import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import UnsoundError
+from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import (
     RobotLike,

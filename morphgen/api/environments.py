@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from morphgen.grammar.robot_source import RobotLike
     from morphgen.processes import Progress
     from morphgen.tasks.actions import ActionKind
-    from morphgen.tasks.gym_env import TaskEnv
+    from morphgen.tasks.gym.env import TaskEnv
+    from morphgen.tasks.gym.vector import TaskVector
     from morphgen.tasks.observation import ObservationConfig
-    from morphgen.tasks.obstacles import LayoutSide
+    from morphgen.tasks.scenes.obstacles import LayoutSide
     from morphgen.tasks.sim.base import Contacts
     from morphgen.tasks.task import TaskConfig
-    from morphgen.tasks.vector import TaskVector
 
 
 class SharedOptions(TypedDict, total=False):
@@ -125,12 +125,12 @@ def make_env(
         if name in texts and (name, texts[name]) != ("sim", None):
             text_argument(name, texts[name], TaskError)
     if num_envs is None:
-        from morphgen.tasks.gym_env import TaskEnv
+        from morphgen.tasks.gym.env import TaskEnv
 
         if not is_one_robot(robot):
             raise TaskError(f"robot {robot!r}: expected one robot; name several with num_envs")
         return TaskEnv(task, robot, **options)
-    from morphgen.tasks.vector import task_vector
+    from morphgen.tasks.gym.vector import task_vector
 
     several = robot_list(robot)
     if not several:

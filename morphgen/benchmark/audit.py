@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.extrapolation import parse_bound
-from morphgen.benchmark.hold_out_audit import has_hold_out_rules, hold_out_findings
+from morphgen.benchmark.generate import parse_bound
+from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES, most_alike

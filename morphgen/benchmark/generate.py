@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from morphgen.benchmark.near_duplicates import NearReason
+from morphgen.benchmark.regimes import (
+    HULLS,
+    NOTHING,
+    ON_HULL,
+    combination,
+    hull_distance,
+    parameters,
+    parts,
+    pattern_robots,
+    structure,
+)
 from morphgen.benchmark.robot_factory import (
     Candidate,
+    ComposedRecipe,
     Progress,
     RobotFactory,
     SampledRecipe,
     UnfitRobotError,
+    make_robots,
     members,
     numbered_name,
     stream_seed,
 )
+from morphgen.benchmark.similarity import cosine
 from morphgen.benchmark.split import MAX_LINKS_KEY, Member, Regime, Split
-from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
-from morphgen.errors import BenchmarkError
-from morphgen.grammar.choosers import RandomChooser, RecordedChooser
+from morphgen.benchmark.tokens import MAX_LINKS, require_max_links
+from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import TooManyPartsError, derive
+from morphgen.grammar.derive import RandomChooser, RecordedChooser, TooManyPartsError, derive
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 
@@ -265,3 +280,515 @@ def assemble_drawn(
         provenance,
         per_robot=len(request.tasks),
     )
+
+
+def interpolation(
+    request: SplitRequest,
+    grammar: Grammar,
+    library: Library,
+    *,
+    hull: str = "any",
+    jobs: int = 1,
+    progress: Progress = lambda done: None,
+) -> tuple[Split, ...]:
+    """Return splits whose test robots have the structure of a train robot.
+
+    Train robots are numbers 0, 1, ... of the grammar with one seed; test robots are sampled with
+    another seed.
+
+    Args:
+        request: Sizes, tasks and seed.
+        grammar: Grammar of all robots.
+        library: The library of parts.
+        hull: ``inside``, ``outside`` or ``any``: position of the parameters of test robots relative
+            to the convex hull of the train robots of their structure. With several sizes it is
+            the hull of the smallest split for ``inside``, of the largest one for ``outside``.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
+
+    Returns:
+        A split for each size.
+
+    Raises:
+        BenchmarkError: If ``MAX_DRAWS`` draws give too few test robots.
+        SamplingError: If the grammar gives no valid robot.
+    """
+    require_size(request)
+    if hull not in HULLS:
+        raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
+    train_stream = RobotStream.of(grammar, grammar.name, request)
+    test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
+    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
+    recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
+    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    criterion = StructureAndHull(train, request.train[0], hull, library)
+    search = TestRobotSearch(request, train, factory, progress)
+    if not search.find([test_stream], criterion, NearReason(train)):
+        raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
+    where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
+    return assemble_drawn(
+        request,
+        "interpolation",
+        f"{{n}} robots of {grammar.name}; test: {request.test} {where[hull]}",
+        train,
+        search.robots,
+        {
+            "grammar": {grammar.name: grammar.digest},
+            "hull": hull,
+            "seeds": {stream.prefix: stream.seed for stream in (train_stream, test_stream)},
+        },
+    )
+
+
+class StructureAndHull:
+    """Reject derivations of another structure, or on the wrong side of the convex hull."""
+
+    def __init__(
+        self, train: Sequence[Candidate], smallest: int, hull: str, library: Library
+    ) -> None:
+        self._hull, self._library = hull, library
+        self._structures = {structure(robot.derivation, library) for robot in train[:smallest]}
+        self._points: dict[str, list[list[float]]] = {}
+        # A point inside the smallest hull is inside all; one outside the largest is outside all.
+        for robot in train[:smallest] if hull == "inside" else train:
+            points = self._points.setdefault(structure(robot.derivation, library), [])
+            points.append(self._point(robot.derivation))
+
+    def __call__(self, derivation: Derivation) -> str:
+        """Return the reason why a derivation is rejected; empty if it is accepted."""
+        kind = structure(derivation, self._library)
+        if kind not in self._structures:
+            return "a structure that no train robot has"
+        if self._hull == "any":
+            return ""
+        is_inside = hull_distance(self._point(derivation), self._points[kind]) <= ON_HULL
+        if is_inside == (self._hull == "inside"):
+            return ""
+        return f"parameters {'inside' if is_inside else 'outside'} the hull of the train robots"
+
+    def _point(self, derivation: Derivation) -> list[float]:
+        return list(parameters(derivation, self._library).values())
+
+    def advice(self) -> str:
+        """Return what to change if a search finds too few robots."""
+        if self._hull == "any":
+            return "ask for fewer test robots, or more train robots"
+        spans = [np.ptp(np.array(points), axis=0) for points in self._points.values()]
+        varied = max(int((span > 0).sum()) for span in spans)
+        size = min(len(points) for points in self._points.values())
+        other = "more" if self._hull == "inside" else "fewer"
+        return (
+            f"{varied} parameters vary, and the smallest hull is that of {size} robots: ask for "
+            f"{other} train robots, or for --hull any"
+        )
+
+
+NUM_ATTEMPTS = 50
+"""Number of random orders in which candidates are held out before the search fails."""
+
+
+def composition(
+    request: SplitRequest,
+    patterns: Sequence[str],
+    library: Library,
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda done: None,
+) -> tuple[Split, ...]:
+    """Return splits whose test robots have only trained parts, in an untrained combination.
+
+    With several tasks, a candidate is a robot with one task, and the split composes robots with
+    tasks: the outermost part of a test robot is in no train robot of its task, but in others.
+
+    Args:
+        request: Sizes, tasks and seed. Without a size, all remaining candidates are train robots.
+        patterns: Patterns of the candidates, see ``pattern_robots``.
+        library: The library of parts.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
+
+    Returns:
+        A split for each size.
+
+    Raises:
+        BenchmarkError: If the candidates allow no such split; the message gives the reason.
+        MorphgenError: If a pattern names an unknown part, or parts do not fit.
+    """
+    candidates = list(_candidates(patterns, request.tasks, library))
+    sequence = np.random.SeedSequence(request.seed)
+    test, train = hold_out(candidates, request.test, max(request.train, default=1), sequence)
+    shortest = num_covering(train, test)
+    if request.train and request.train[0] < shortest:
+        names = ", ".join(candidate.name for candidate in train[:shortest])
+        raise BenchmarkError(
+            f"--train {request.train[0]}: {shortest} robots at least are needed so that every part "
+            f"of the test robots is trained, such as {names}"
+        )
+    members = [*train[: request.train[-1] if request.train else None], *test]
+    unique = {
+        candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
+    }
+    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
+    composed_robots = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
+    robot_of = dict(zip(unique, composed_robots, strict=True))
+    _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
+    robots = []
+    for candidate in members:
+        robot = robot_of[candidate.text]
+        name = f"{candidate.name}-{candidate.task}" if len(request.tasks) > 1 else candidate.name
+        task = (candidate.task, request.obstacles)
+        robots.append(Member(name, robot.category, str(robot.derivation), *task, robot.hash))
+    kinds = len({candidate.combination for candidate in candidates})
+    return assemble(
+        request,
+        "composition",
+        f"{{n}} robots out of {kinds} combinations; test: {request.test} of combinations unseen",
+        robots[: -len(test)],
+        robots[-len(test) :],
+        {"from": list(patterns), "tasks": list(request.tasks)},
+    )
+
+
+def _require_no_near(
+    test: Sequence[HoldOutCandidate],
+    train: Sequence[HoldOutCandidate],
+    robot_of: Mapping[str, Candidate],
+) -> None:
+    """Require that no test robot is nearly a train robot of its task, as the audit does.
+
+    Raises:
+        BenchmarkError: If one is.
+    """
+    for each in test:
+        others = [robot_of[other.text] for other in train if other.task == each.task]
+        if reason := NearReason(others)(robot_of[each.text]):
+            raise BenchmarkError(
+                f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
+                "--from, or name another --seed"
+            )
+
+
+def _candidates(
+    patterns: Sequence[str], tasks: Sequence[str], library: Library
+) -> Iterator[HoldOutCandidate]:
+    """Yield every robot of the patterns once for each task."""
+    name_by_derivation: dict[str, str] = {}
+    for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
+        derivation, name = robot.derivation, robot.name
+        if str(derivation) in name_by_derivation:
+            continue
+        if name in name_by_derivation.values():
+            name = f"{name}-{derivation.digest[:8]}"
+        name_by_derivation[str(derivation)] = name
+        *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
+        properties = (str(derivation), combination(derivation), parts(derivation), last)
+        for task in tasks:
+            yield HoldOutCandidate(name, robot.words, *properties, task)
+
+
+@dataclass(frozen=True)
+class HoldOutCandidate:
+    """A robot with a task, which may become a train or a test member."""
+
+    name: str
+    words: tuple[str, ...]
+    """Arguments of ``morphgen compose``."""
+    text: str
+    """Derivation of the robot."""
+    combination: str
+    """Parts and ports, see ``regimes.combination``."""
+    parts: frozenset[str]
+    outermost: str
+    """Last part of the robot, usually the end-effector."""
+    task: str
+
+    @property
+    def covers(self) -> set[str]:
+        """The parts and the task that training with this robot covers."""
+        return {*self.parts, f"task {self.task}"}
+
+
+def hold_out(
+    candidates: Sequence[HoldOutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
+) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
+    """Choose test candidates, of as many different combinations as possible.
+
+    Candidates with the combination of a test candidate are excluded from training, for all tasks.
+    With several tasks, candidates with the outermost part and the task of a test candidate are
+    excluded, too. The remaining candidates cover every part and task of the test candidates.
+
+    Args:
+        candidates: The candidates.
+        n: Number of test candidates.
+        min_train: Smallest number of candidates that remain for training.
+        seed: Seed of the random orders in which candidates are tried.
+
+    Returns:
+        Test candidates, and train candidates in an order such that the first few cover each part
+        and task of the test candidates.
+
+    Raises:
+        BenchmarkError: If too few candidates can be held out; the message gives the reason.
+    """
+    rng = np.random.default_rng(seed)
+    max_held = 0
+    for _ in range(NUM_ATTEMPTS):
+        pool = _TrainPool(candidates)
+        order = [int(i) for i in rng.permutation(len(candidates))]
+        for fresh in (True, False):
+            for i in order:
+                if len(pool.held) < n and pool.is_fresh(i) == fresh:
+                    pool.hold(i, min_train)
+        if len(pool.held) == n:
+            test = [candidates[i] for i in pool.held]
+            train = [candidates[i] for i in order if i in pool.remaining]
+            return test, _covering_first(train, pool.needed)
+        max_held = max(max_held, len(pool.held))
+    raise BenchmarkError(_why_not(candidates, n, min_train, max_held))
+
+
+def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutCandidate]) -> int:
+    """Return how many of the first candidates cover each part and task of the test ones."""
+    needed = {item for candidate in test for item in candidate.covers}
+    n = 0
+    while needed:
+        needed -= candidates[n].covers
+        n += 1
+    return n
+
+
+class _TrainPool:
+    """The candidates that remain for training while others are held out, by their index."""
+
+    def __init__(self, candidates: Sequence[HoldOutCandidate]) -> None:
+        self._candidates = candidates
+        self._mixed = len({candidate.task for candidate in candidates}) > 1
+        self._same_combination: dict[str, list[int]] = defaultdict(list)
+        self._pairs: dict[tuple[str, str], list[int]] = defaultdict(list)
+        for i, candidate in enumerate(candidates):
+            self._same_combination[candidate.combination].append(i)
+            for part in candidate.parts:
+                self._pairs[part, candidate.task].append(i)
+        self.remaining = set(range(len(candidates)))
+        self._covered = Counter(item for candidate in candidates for item in candidate.covers)
+        self.held: list[int] = []
+        self.needed: set[str] = set()
+        """Parts and tasks of the candidates that are held out."""
+
+    def is_fresh(self, i: int) -> bool:
+        """Test that no candidate of the same combination is held out."""
+        return all(
+            self._candidates[i].combination != self._candidates[j].combination for j in self.held
+        )
+
+    def hold(self, i: int, min_train: int) -> None:
+        """Hold a candidate out, if the rest still covers all that is needed and is large enough."""
+        candidate = self._candidates[i]
+        excluded = set(self._same_combination[candidate.combination])
+        if self._mixed:
+            excluded.update(self._pairs[candidate.outermost, candidate.task])
+        excluded &= self.remaining
+        lost = Counter(item for j in excluded for item in self._candidates[j].covers)
+        needed = self.needed | candidate.covers
+        is_covered = all(self._covered[item] > lost[item] for item in needed)
+        if i in self.held or not is_covered or len(self.remaining) - len(excluded) < min_train:
+            return
+        self.held.append(i)
+        self.needed = needed
+        self.remaining -= excluded
+        self._covered -= lost
+
+
+def _covering_first(
+    candidates: Sequence[HoldOutCandidate], needed: set[str]
+) -> list[HoldOutCandidate]:
+    """Move candidates that cover all that is needed to the front (greedy set cover)."""
+    first: list[HoldOutCandidate] = []
+    rest = list(candidates)
+    missing = set(needed)
+    while missing:
+        best = max(rest, key=lambda candidate: len(missing & candidate.covers))
+        missing -= best.covers
+        rest.remove(best)
+        first.append(best)
+    return first + rest
+
+
+def _why_not(candidates: Sequence[HoldOutCandidate], n: int, min_train: int, max_held: int) -> str:
+    combinations = {candidate.combination: candidate.parts for candidate in candidates}
+    counts = Counter(part for parts in combinations.values() for part in parts)
+    alone = sorted(part for part, times in counts.items() if times == 1)
+    text = (
+        f"{max_held} of {n} test robots can be held out of {len(combinations)} combinations such "
+        "that their parts are trained in others"
+    )
+    if len({candidate.task for candidate in candidates}) > 1:
+        text += ", the outermost at another task only,"
+    text += f" and at least {min_train} are left to train on"
+    if alone:
+        text += f"; in one combination only: {', '.join(alone)}"
+    return f"{text}; give --from more choices, or ask for fewer robots"
+
+
+_BOUND = re.compile(r"\s*([<>])\s*(\d+\.?\d*|\.\d+)\s*")
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Bound on the cosine similarity of a test robot to the nearest train robot.
+
+    It is the largest cosine, because a mean would hide one near duplicate among other robots.
+    """
+
+    is_upper: bool
+    """Whether the cosine must be below ``value``; above it otherwise."""
+    value: float
+
+    def __str__(self) -> str:
+        return f"{'<' if self.is_upper else '>'}{self.value:g}"
+
+    def holds(self, largest: float) -> bool:
+        """Test if the cosine to the nearest train robot meets the bound."""
+        return largest < self.value if self.is_upper else largest > self.value
+
+
+def parse_bound(text: str) -> Bound:
+    """Read a bound such as ``<0.6``.
+
+    Raises:
+        BenchmarkError: If the text is malformed.
+    """
+    match = _BOUND.fullmatch(text)
+    if match is None or float(match[2]) > 1:
+        raise BenchmarkError(
+            f"--similarity {text!r}: expected '<' or '>' and a number from 0 to 1, such as '<0.6'"
+        )
+    return Bound(match[1] == "<", float(match[2]))
+
+
+def extrapolation(
+    request: SplitRequest,
+    train_grammars: Sequence[Grammar],
+    test_grammars: Sequence[Grammar],
+    library: Library,
+    *,
+    similarity: Bound | None = None,
+    jobs: int = 1,
+    progress: Progress = lambda done: None,
+) -> tuple[Split, ...]:
+    """Return splits whose test robots share no grammar and no structure with a train robot.
+
+    Robots are sampled from the grammars in turn, so each grammar gives equally many.
+
+    Args:
+        request: Sizes, tasks and seed.
+        train_grammars: Grammars of the train robots.
+        test_grammars: Grammars of the test robots.
+        library: The library of parts.
+        similarity: Bound that test robots must meet in the split of every size.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
+
+    Returns:
+        A split for each size.
+
+    Raises:
+        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of which
+            ``MAX_COMPOSED`` are composed, give too few test robots.
+        SamplingError: If a grammar gives no valid robot.
+    """
+    require_size(request)
+    _require_apart(train_grammars, test_grammars)
+    train_streams, test_streams = (
+        [RobotStream.of(grammar, grammar.name, request) for grammar in grammars]
+        for grammars in (train_grammars, test_grammars)
+    )
+    factory = RobotFactory(
+        library.folders, with_features=similarity is not None, max_links=request.max_links
+    )
+    turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
+    recipes = [train_streams[stream].recipe(number) for number, stream in turns]
+    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    reject_trained = UntrainedStructure(train, library)
+    reject_by_similarity = SimilarityBound(train, request.train[0], similarity)
+    search = TestRobotSearch(request, train, factory, progress)
+    targets = ", ".join(grammar.name for grammar in test_grammars)
+    if not search.find(test_streams, reject_trained, reject_by_similarity):
+        raise BenchmarkError(f"{targets}: {search.failure()}; {reject_by_similarity.advice()}")
+    sources = ", ".join(grammar.name for grammar in train_grammars)
+    return assemble_drawn(
+        request,
+        "extrapolation",
+        f"{{n}} robots of {sources}; test: {request.test} of {targets}",
+        train,
+        search.robots,
+        {
+            "train_categories": {grammar.name: grammar.digest for grammar in train_grammars},
+            "test_categories": {grammar.name: grammar.digest for grammar in test_grammars},
+            **({"similarity": str(similarity)} if similarity else {}),
+            "seeds": {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)},
+        },
+    )
+
+
+class UntrainedStructure:
+    """Reject derivations that have the structure of a train robot."""
+
+    def __init__(self, train: Sequence[Candidate], library: Library) -> None:
+        self._library = library
+        self._names = {structure(each.derivation, library): each.name for each in reversed(train)}
+
+    def __call__(self, derivation: Derivation) -> str:
+        """Return the reason why a derivation is rejected; empty if it is accepted."""
+        twin = self._names.get(structure(derivation, self._library))
+        return f"the structure of train robot {twin}" if twin else ""
+
+
+class SimilarityBound:
+    """Reject robots whose cosine to the nearest train robot violates the bound."""
+
+    def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:
+        # The largest cosine grows with the set.
+        self._train = train[:smallest] if bound and not bound.is_upper else train
+        self._bound = bound
+        self._nearest: list[tuple[float, str, str]] = []
+
+    def __call__(self, robot: Candidate) -> str:
+        """Return the reason why a robot is rejected; empty if it is accepted."""
+        if self._bound is None or robot.features is None:
+            return ""
+        cosines = [
+            cosine(robot.features, other.features) for other in self._train if other.features
+        ]
+        nearest = int(np.argmax(cosines))
+        if self._bound.holds(cosines[nearest]):
+            return ""
+        self._nearest.append((cosines[nearest], robot.name, self._train[nearest].name))
+        return f"a cosine to the nearest train robot that is not {self._bound}"
+
+    def advice(self) -> str:
+        """Return what to change if a search finds too few robots."""
+        if self._bound is None or not self._nearest:
+            return "choose other categories, or fewer test robots"
+        best = min(self._nearest) if self._bound.is_upper else max(self._nearest)
+        return (
+            f"the nearest to the bound was {best[1]}, with {best[0]:.3f} to {best[2]}: choose "
+            "another bound, or other categories"
+        )
+
+
+def _require_apart(train: Sequence[Grammar], test: Sequence[Grammar]) -> None:
+    """Require that no grammar is named twice, on one side or on both."""
+    for option, grammars, excluded in (
+        ("--train-category", train, ()),
+        ("--test-category", test, train),
+    ):
+        names = {grammar.name for grammar in excluded}
+        for grammar in grammars:
+            if grammar.name in names:
+                where = "on both sides" if excluded else "there twice"
+                raise BenchmarkError(
+                    f"{option} {grammar.name}: the category is {where}; a test category must not "
+                    "be trained, and none be named twice"
+                )
+            names.add(grammar.name)

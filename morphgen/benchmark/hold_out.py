@@ -1,25 +1,857 @@
-"""Generate splits from what they hold out: test robots have it, train robots do not.
+"""Rules that say which robots a split keeps for its test side.
 
-The draws are stratified: each arm, then each end-effector, appears before one appears twice. Apart
-from what is held out, a test robot has only parts of train robots.
+A rule holds out parts, a manufacturer, a range of a parameter, or a combination. It is written as
+on the command line: ``arm=kinova*`` holds out parts, ``manufacturer=Kinova``
+the parts of a manufacturer, ``arm3.length=0.3..0.4`` a range of a parameter, and
+``arm=ur5+ee=plane`` a combination. A robot is held out if one rule holds for it.
 """
 
 from __future__ import annotations
 
+import hashlib
+import heapq
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from itertools import product
+from typing import TypeAlias, cast
 
-from morphgen.benchmark.generate import RobotStream, SplitRequest, assemble_drawn, require_size
-from morphgen.benchmark.hold_out_pool import DraftMaker, make_pool
-from morphgen.benchmark.hold_out_rules import parse_rules
-from morphgen.benchmark.hold_out_search import ComposeDraft, HoldOutSearch
-from morphgen.benchmark.member_names import unique_names
-from morphgen.benchmark.robot_factory import Progress, RobotFactory
-from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Split
-from morphgen.errors import BenchmarkError
+import numpy as np
+
+from morphgen.benchmark.generate import (
+    MAX_COMPOSED,
+    MAX_DRAWS,
+    RobotStream,
+    SplitRequest,
+    assemble_drawn,
+    require_size,
+)
+from morphgen.benchmark.near_duplicates import is_near
+from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_robots
+from morphgen.benchmark.robot_factory import (
+    Candidate,
+    DerivedRecipe,
+    Progress,
+    RobotFactory,
+    SampledRecipe,
+    UnfitRobotError,
+    category_of,
+)
+from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
+from morphgen.errors import BenchmarkError, PartError, nearest
+from morphgen.formats.rounding import format_number
+from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, PartKind, parse_value
+from morphgen.model.findings import Finding
+from morphgen.processes import parallel_map
+
+MANUFACTURER = "manufacturer"
+"""Key of conditions on the manufacturer of a part."""
+EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
+"""Examples of rules, for messages."""
+
+
+@dataclass(frozen=True)
+class PartCondition:
+    """The part has a kind and a name: ``arm=kinova*``."""
+
+    kind: PartKind
+    pattern: str
+    """Name of the part, with shell wildcards."""
+
+    def __str__(self) -> str:
+        return f"{self.kind}={self.pattern}"
+
+    def matches(self, node: Derivation, library: Library) -> bool:
+        """Test a part of a robot."""
+        return fnmatchcase(node.part, self.pattern) and library.manifest(node.part).kind == (
+            self.kind
+        )
+
+
+@dataclass(frozen=True)
+class ManufacturerCondition:
+    """The part is made by a manufacturer: ``manufacturer=Kinova``, ``arm.manufacturer=Kinova``."""
+
+    kind: PartKind | None
+    """Kind of the part; None for any."""
+    pattern: str
+    """Name of the manufacturer in any case, with shell wildcards."""
+
+    def __str__(self) -> str:
+        prefix = f"{self.kind}." if self.kind else ""
+        return f"{prefix}{MANUFACTURER}={self.pattern}"
+
+    def matches(self, node: Derivation, library: Library) -> bool:
+        """Test a part of a robot."""
+        return self.matches_manifest(library.manifest(node.part))
+
+    def matches_manifest(self, manifest: Manifest) -> bool:
+        """Test a part."""
+        name = manifest.manufacturer.lower()
+        is_kind = self.kind in (None, manifest.kind)
+        return is_kind and bool(name) and fnmatchcase(name, self.pattern.lower())
+
+
+@dataclass(frozen=True)
+class RangeCondition:
+    """A parameter of the part is in a range, bounds included: ``arm3.length=0.3..0.4``."""
+
+    owner: str
+    """Kind of the part, or its name with shell wildcards."""
+    parameter: str
+    low: float
+    """Lower bound [SI unit of the parameter]."""
+    high: float
+    """Upper bound [SI unit of the parameter]."""
+
+    def __str__(self) -> str:
+        low, high = format_number(self.low), format_number(self.high)
+        return f"{self.owner}.{self.parameter}={low}..{high}"
+
+    def applies_to(self, manifest: Manifest) -> bool:
+        """Test if the part is one whose parameter has a held-out range."""
+        return _is_owner(self.owner, manifest) and self.parameter in manifest.attached_parameters
+
+    def matches(self, node: Derivation, library: Library) -> bool:
+        """Test a part of a robot."""
+        manifest = library.manifest(node.part)
+        if not self.applies_to(manifest):
+            return False
+        default = manifest.attached_parameters[self.parameter].default
+        return self.low <= dict(node.parameters).get(self.parameter, default) <= self.high
+
+
+Condition = PartCondition | ManufacturerCondition | RangeCondition
+
+
+@dataclass(frozen=True)
+class HoldOutRule:
+    """Conditions that hold together for a held-out robot, each for one of its parts."""
+
+    conditions: tuple[Condition, ...]
+
+    def __str__(self) -> str:
+        return "+".join(map(str, self.conditions))
+
+    @property
+    def holds_out_parts(self) -> bool:
+        """Whether parts are held out as such, rather than a combination or a range."""
+        return len(self.conditions) == 1 and not isinstance(self.conditions[0], RangeCondition)
+
+    def holds(self, derivation: Derivation, library: Library) -> bool:
+        """Test if a robot is held out."""
+        return all(
+            any(condition.matches(node, library) for node in derivation.walk())
+            for condition in self.conditions
+        )
+
+    def matching_parts(self, derivation: Derivation, library: Library) -> frozenset[str]:
+        """Return the parts of a robot for which a condition holds."""
+        return frozenset(
+            node.part
+            for node in derivation.walk()
+            if any(condition.matches(node, library) for condition in self.conditions)
+        )
+
+
+def parse_rules(
+    texts: Sequence[str], library: Library, origin: str = "--hold-out"
+) -> tuple[HoldOutRule, ...]:
+    """Parse rules; each text has one, or several that are separated by commas.
+
+    Args:
+        texts: The texts.
+        library: Library of the parts that rules may name.
+        origin: Option or key that has the texts, for messages.
+
+    Raises:
+        BenchmarkError: If a rule is malformed, names nothing in the library, or is there twice.
+    """
+    rules: list[HoldOutRule] = []
+    for text in texts:
+        for entry in text.split(","):
+            terms = [term.strip() for term in entry.split("+")]
+            rule = HoldOutRule(tuple(_condition(term, text, library, origin) for term in terms))
+            if rule in rules:
+                raise BenchmarkError(f"{origin} {text}: {rule} is there twice")
+            rules.append(rule)
+    if not rules:
+        raise BenchmarkError(f"{origin}: nothing is held out; expected such as {EXAMPLES}")
+    return tuple(rules)
+
+
+def held_out_parts(
+    rules: Sequence[HoldOutRule], derivation: Derivation, library: Library
+) -> frozenset[str]:
+    """Return the parts of a robot that are held out as such; no train robot has them."""
+    whole = [rule for rule in rules if rule.holds_out_parts]
+    return frozenset[str]().union(*(rule.matching_parts(derivation, library) for rule in whole))
+
+
+def _condition(term: str, text: str, library: Library, origin: str) -> Condition:
+    where = f"{origin} {text}" if term == text else f"{origin} {text}: {term or 'empty rule'}"
+    key, _, value = term.partition("=")
+    if not key or not value:
+        raise BenchmarkError(f"{where}: expected KEY=VALUE, such as {EXAMPLES}")
+    owner, dot, name = key.rpartition(".")
+    if key in PART_KINDS:
+        _require_match(value, library.names(key), key, where)
+        return PartCondition(key, value)
+    if name == MANUFACTURER and (not dot or owner in PART_KINDS):
+        condition = ManufacturerCondition(cast(PartKind, owner) if dot else None, value)
+        manifests = library.manifests(condition.kind)
+        if not any(map(condition.matches_manifest, manifests)):
+            valid = {manifest.manufacturer for manifest in manifests} - {""}
+            raise BenchmarkError(f"{where}: no manufacturer {value!r}{nearest(value, valid)}")
+        return condition
+    if dot:
+        return _range(owner, name, value, library, where)
+    keys = [*PART_KINDS, MANUFACTURER]
+    raise BenchmarkError(
+        f"{where}: unknown key {key!r}{nearest(key, keys)}, or PART.PARAMETER=LOW..HIGH"
+    )
+
+
+def _range(owner: str, name: str, value: str, library: Library, where: str) -> RangeCondition:
+    manifests = [manifest for manifest in library.manifests() if _is_owner(owner, manifest)]
+    if not manifests:
+        _require_match(owner, [*PART_KINDS, *library.paths], "part", where)
+    known = [m.attached_parameters[name] for m in manifests if name in m.attached_parameters]
+    if not known:
+        valid = {parameter for manifest in manifests for parameter in manifest.attached_parameters}
+        raise BenchmarkError(f"{where}: {owner} has no parameter {name!r}{nearest(name, valid)}")
+    if len({parameter.unit for parameter in known}) > 1:
+        raise BenchmarkError(f"{where}: {name!r} has several units in {owner}; name one part")
+    low, dots, high = value.partition("..")
+    if not dots:
+        raise BenchmarkError(
+            f"{where}: {value!r} is no range; expected LOW..HIGH, such as 0.3..0.4"
+        )
+    widest = Parameter(
+        known[0].default,
+        min(parameter.minimum for parameter in known),
+        max(parameter.maximum for parameter in known),
+        known[0].unit,
+        integer=all(parameter.integer for parameter in known),
+    )
+    try:
+        bounds = [parse_value(bound, widest, f"{owner}.{name}") for bound in (low, high)]
+    except PartError as error:
+        raise BenchmarkError(f"{where}: {error}") from error
+    if bounds[0] > bounds[1]:
+        raise BenchmarkError(f"{where}: {low} is above {high}; expected LOW..HIGH")
+    return RangeCondition(owner, name, *bounds)
+
+
+def _is_owner(owner: str, manifest: Manifest) -> bool:
+    if owner in PART_KINDS:
+        return manifest.kind == owner
+    return fnmatchcase(manifest.name, owner)
+
+
+def _require_match(pattern: str, names: Sequence[str], what: str, where: str) -> None:
+    if not any(fnmatchcase(name, pattern) for name in names):
+        raise BenchmarkError(f"{where}: no {what} matches {pattern!r}{nearest(pattern, names)}")
+
+
+MAX_VALUE_DRAWS = 100
+"""Draws of the values of one robot until it is one that no rule holds out; then it has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A robot that may be drawn; it is composed when it is."""
+
+    recipe: SampledRecipe | DerivedRecipe
+    derivation: Derivation
+    """Parts and values; those of a sampled robot may change when it is composed."""
+    category: str
+    rules: tuple[int, ...]
+    """Numbers of the rules that hold for the robot; none if it may be trained on."""
+    parts: frozenset[str]
+    held_out: frozenset[str]
+    """Parts that are held out as such."""
+    matching: frozenset[str]
+    """Parts that the rules hold for, alone or in a combination."""
+    parts_by_kind: Mapping[str, frozenset[str]]
+    order: str
+    """Random text that decides between robots that are equally good."""
+
+    @property
+    def required(self) -> frozenset[str]:
+        """Parts that some train robot must have if this is a test robot."""
+        return self.parts - self.held_out
+
+
+@dataclass(frozen=True)
+class DraftMaker:
+    """Convert derivations to drafts."""
+
+    rules: tuple[HoldOutRule, ...]
+    library: Library
+    seed: int
+
+    def draft(
+        self, recipe: SampledRecipe | DerivedRecipe, derivation: Derivation, category: str
+    ) -> Draft:
+        """Return the draft of a derivation."""
+        holding = tuple(
+            number for number, rule in enumerate(self.rules) if rule.holds(derivation, self.library)
+        )
+        by_kind: dict[str, frozenset[str]] = {}
+        for node in derivation.walk():
+            kind = self.library.manifest(node.part).kind
+            by_kind[kind] = by_kind.get(kind, frozenset()) | {node.part}
+        matching = (self.rules[n].matching_parts(derivation, self.library) for n in holding)
+        return Draft(
+            recipe,
+            derivation,
+            category,
+            holding,
+            parts(derivation),
+            held_out_parts(self.rules, derivation, self.library),
+            frozenset[str]().union(*matching),
+            by_kind,
+            hashlib.sha256(f"{self.seed} {derivation}".encode()).hexdigest(),
+        )
+
+    def composed(self, draft: Draft, robot: Candidate) -> Draft:
+        """Return the draft with the derivation that its composed robot has."""
+        return self.draft(draft.recipe, robot.derivation, draft.category)
+
+
+def make_pool(
+    request: SplitRequest,
+    maker: DraftMaker,
+    patterns: Sequence[str],
+    grammars: Sequence[Grammar],
+) -> list[Draft]:
+    """Return every robot that may be drawn, each derivation once.
+
+    Args:
+        request: Sizes and seed.
+        maker: Converts derivations to drafts.
+        patterns: Patterns of robots, see ``pattern_robots``.
+        grammars: Grammars that robots are sampled from.
+
+    Raises:
+        MorphgenError: If a pattern is malformed or names an unknown part.
+    """
+    drafts: dict[str, Draft] = {}
+    for draft in (
+        *_from_patterns(request, maker, patterns),
+        *_from_grammars(request, maker, grammars),
+    ):
+        drafts.setdefault(str(draft.derivation), draft)
+    return list(drafts.values())
+
+
+def _from_patterns(
+    request: SplitRequest, maker: DraftMaker, patterns: Sequence[str]
+) -> Iterator[Draft]:
+    robots = [robot for p in patterns for robot in pattern_robots(p, maker.library)]
+    varied = [_varied(robot, maker) for robot in robots]
+    wanted = max(request.train) + request.test
+    # The draws take turns between robots, so few values of each are enough, if not too few.
+    num_values = min(wanted, 4 + 4 * wanted // max(sum(map(bool, varied)), 1))
+    for robot, choices in zip(robots, varied, strict=True):
+        category = category_of(robot.words, maker.library)
+        for derivation in _with_values(robot.derivation, choices, num_values, maker):
+            yield maker.draft(DerivedRecipe(derivation, robot.name, category), derivation, category)
+
+
+def _from_grammars(
+    request: SplitRequest, maker: DraftMaker, grammars: Sequence[Grammar]
+) -> Iterator[Draft]:
+    for grammar in grammars:
+        stream = RobotStream.of(grammar, grammar.name, request)
+        for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):
+            derivation = stream.derivation(number, maker.library)
+            if derivation is not None:
+                yield maker.draft(stream.recipe(number), derivation, grammar.name)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A parameter whose value is drawn, because a range of it is held out."""
+
+    label: str
+    """Label of the part in the derivation."""
+    parameter: Parameter
+    condition: RangeCondition
+
+    def draw(self, rng: np.random.Generator, *, inside: bool) -> float:
+        """Draw a value inside of the held-out range, or from all that are valid."""
+        low, high = self.parameter.minimum, self.parameter.maximum
+        if inside:
+            low, high = max(low, self.condition.low), min(high, self.condition.high)
+        if self.parameter.integer:
+            return float(rng.integers(round(low), round(high), endpoint=True))
+        return float(format_number(rng.uniform(low, high)))
+
+
+def _varied(robot: PatternRobot, maker: DraftMaker) -> list[_Choice]:
+    """Return the parameters with held-out ranges, except those that the pattern sets."""
+    given = {word.partition("=")[0].replace(".", "_") for word in robot.words}
+    conditions = [condition for rule in maker.rules for condition in rule.conditions]
+    choices: list[_Choice] = []
+    for node in robot.derivation.walk():
+        manifest = maker.library.manifest(node.part)
+        for condition in conditions:
+            if not (isinstance(condition, RangeCondition) and condition.applies_to(manifest)):
+                continue
+            parameter = manifest.attached_parameters[condition.parameter]
+            overlaps = condition.low <= parameter.maximum and condition.high >= parameter.minimum
+            if overlaps and f"{node.label}_{condition.parameter}" not in given:
+                choices.append(_Choice(node.label, parameter, condition))
+    return choices
+
+
+def _with_values(
+    derivation: Derivation, choices: Sequence[_Choice], num_values: int, maker: DraftMaker
+) -> Iterator[Derivation]:
+    """Yield a derivation with drawn values: as many held-out ones as others, if there are any."""
+    if not choices:
+        yield derivation
+        return
+    rng = np.random.default_rng(np.random.SeedSequence([maker.seed, *str(derivation).encode()]))
+    for i in range(num_values):
+        # Of several ranges of one parameter the last one counts: each takes its turn.
+        turn = i % len(choices)
+        in_turn = [*choices[turn:], *choices[:turn]]
+        yield _replace_values(derivation, in_turn, rng, inside=True)
+        for _ in range(MAX_VALUE_DRAWS):
+            drawn = _replace_values(derivation, choices, rng, inside=False)
+            if not any(rule.holds(drawn, maker.library) for rule in maker.rules):
+                yield drawn
+                break
+
+
+def _replace_values(
+    derivation: Derivation,
+    choices: Sequence[_Choice],
+    rng: np.random.Generator,
+    *,
+    inside: bool,
+) -> Derivation:
+    values: dict[str, dict[str, float]] = {}
+    for choice in choices:
+        by_name = values.setdefault(choice.label, {})
+        by_name[choice.condition.parameter] = choice.draw(rng, inside=inside)
+    return _updated(derivation, values)
+
+
+def _updated(node: Derivation, values: Mapping[str, Mapping[str, float]]) -> Derivation:
+    """Return the derivation with some values replaced, by label and parameter."""
+    return replace(
+        node,
+        parameters=tuple({**dict(node.parameters), **values.get(node.label, {})}.items()),
+        children=tuple((port, _updated(child, values)) for port, child in node.children),
+    )
+
+
+STRATA = ("arm", "ee", "body", "base")
+"""Kinds of parts whose use is balanced, the most important first. Segments are repeated at will."""
+
+Key: TypeAlias = tuple[int, ...]
+Item: TypeAlias = tuple[str, object]
+
+
+class Balance:
+    """How often the parts and categories of the robots chosen so far occur."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[Item] = Counter()
+
+    def _items(self, draft: Draft) -> list[list[Item]]:
+        """Return what is balanced, the most important first; each is an alternative in a group."""
+        groups: list[list[Item]] = [[("category", draft.category)]]
+        return groups + [
+            [(kind, part) for part in draft.parts_by_kind.get(kind, ())] for kind in STRATA
+        ]
+
+    def key(self, draft: Draft) -> Key:
+        """Return how often the items of a robot occur already; the smallest is the best robot."""
+        return tuple(
+            max((self._counts[item] for item in group), default=0) for group in self._items(draft)
+        )
+
+    def add(self, draft: Draft) -> None:
+        """Count a chosen robot."""
+        self._counts.update(item for group in self._items(draft) for item in group)
+
+
+class TestBalance(Balance):
+    """Balance the rules, then the parts that they hold for, then all parts."""
+
+    def _items(self, draft: Draft) -> list[list[Item]]:
+        rules: list[Item] = [("rule", number) for number in draft.rules]
+        held: list[Item] = [("held out", part) for part in draft.matching]
+        return [rules, held, *super()._items(draft)]
+
+
+class TrainBalance(Balance):
+    """Balance the parts; of equally good robots, prefer one with parts that test robots need."""
+
+    def __init__(self, needed: frozenset[str]) -> None:
+        super().__init__()
+        self._needed = set(needed)
+
+    def key(self, draft: Draft) -> Key:
+        """Return the key of the balance, then how many needed parts the robot has, negated."""
+        return (*super().key(draft), -len(self._needed & draft.parts))
+
+    def add(self, draft: Draft) -> None:
+        """Count a chosen robot; its parts are needed no more."""
+        super().add(draft)
+        self._needed -= draft.parts
+
+
+def stratified(drafts: Mapping[int, Draft], n: int, balance: Balance) -> list[int]:
+    """Return the numbers of up to n drafts, each the best one after those before it."""
+    # Keys never become better while robots are chosen, so only the first of the heap is updated.
+    heap = [(balance.key(draft), draft.order, number) for number, draft in drafts.items()]
+    heapq.heapify(heap)
+    chosen: list[int] = []
+    while heap and len(chosen) < n:
+        key, order, number = heapq.heappop(heap)
+        current = balance.key(drafts[number])
+        if current > key:
+            heapq.heappush(heap, (current, order, number))
+            continue
+        chosen.append(number)
+        balance.add(drafts[number])
+    return chosen
+
+
+MAX_REJECTED = 500
+"""Number of rejected robots after which the search fails."""
+
+
+@dataclass(frozen=True)
+class _Unfit:
+    """A draft whose robot cannot be a member."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class ComposeDraft:
+    """Compose drafts; can be pickled and sent to a worker process."""
+
+    factory: RobotFactory
+
+    def __call__(self, draft: Draft) -> Candidate | _Unfit:
+        """Return the composed robot, or why it cannot be a member."""
+        try:
+            return self.factory(draft.recipe)
+        except UnfitRobotError as error:
+            return _Unfit(error.reason)
+
+
+@dataclass
+class HoldOutSearch:
+    """Choose robots, compose them, reject those that do not do, and choose again."""
+
+    request: SplitRequest
+    maker: DraftMaker
+    compose: ComposeDraft
+    pool: dict[int, Draft]
+    robots: dict[int, Candidate] = field(default_factory=dict)
+    """Composed robots by their number in the pool."""
+    rejected: dict[int, str] = field(default_factory=dict)
+    """Reason by number of the robot."""
+    _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
+
+    def run(self, jobs: int, progress: Progress) -> tuple[list[Candidate], list[Candidate]]:
+        """Return the test and the train robots.
+
+        Raises:
+            BenchmarkError: If there are too few.
+        """
+        while True:
+            test, train = self._choose()
+            unknown = [number for number in (*test, *train) if number not in self.robots]
+            self._require_enough(test, train, unknown)
+            self._compose(unknown, len(test) + len(train), jobs, progress)
+            num_rejected = len(self.rejected)
+            self._reject_repeated([*test, *train])
+            self._reject_near(test, train)
+            if not unknown and len(self.rejected) == num_rejected:
+                self._require_all_rules(test)
+                self._require_covered(test, train)
+                return [self.robots[i] for i in test], [self.robots[i] for i in train]
+
+    def _compose(
+        self, unknown: Sequence[int], num_chosen: int, jobs: int, progress: Progress
+    ) -> None:
+        """Compose robots, or reject them."""
+        num_known = num_chosen - len(unknown)
+
+        def report(done: int, total: int) -> None:
+            progress(num_known + done)
+
+        drafts = [self.pool[number] for number in unknown]
+        results = parallel_map(self.compose, drafts, jobs, report)
+        for number, result in zip(unknown, results, strict=True):
+            if isinstance(result, _Unfit):
+                self.rejected[number] = result.reason
+                continue
+            self.robots[number] = result
+            # The conditions of a grammar may have replaced the derivation that was drawn.
+            self.pool[number] = self.maker.composed(self.pool[number], result)
+
+    def _choose(self) -> tuple[list[int], list[int]]:
+        """Return the numbers of the best test and train robots that are not rejected."""
+        drafts = {n: draft for n, draft in self.pool.items() if n not in self.rejected}
+        trainable = {n: draft for n, draft in drafts.items() if not draft.rules}
+        train_parts = frozenset[str]().union(*(draft.parts for draft in trainable.values()))
+        testable = {
+            n: draft for n, draft in drafts.items() if draft.rules and draft.required <= train_parts
+        }
+        test = stratified(testable, self.request.test, TestBalance())
+        needed = frozenset[str]().union(*(drafts[n].required for n in test))
+        train = stratified(trainable, max(self.request.train), TrainBalance(needed))
+        return test, train
+
+    def _require_enough(
+        self, test: Sequence[int], train: Sequence[int], unknown: Sequence[int]
+    ) -> None:
+        """Raise if the robots are too few, once it is known how many differ."""
+        if len(self.rejected) > MAX_REJECTED:
+            raise BenchmarkError(
+                f"{MAX_REJECTED} robots were rejected before enough were found{self._reasons()}"
+            )
+        # Composing shows which robots are the same; for many robots that takes too long.
+        is_final = not unknown or len(unknown) > MAX_COMPOSED
+        rules = " or ".join(map(str, self.maker.rules))
+        for option, numbers, wanted, what in (
+            ("--train", train, max(self.request.train), f"without {rules}"),
+            ("--test", test, self.request.test, f"with {rules}"),
+        ):
+            if len(numbers) < wanted and (is_final or not numbers):
+                count = f"{'at most' if unknown else 'only'} {len(numbers)}" if numbers else "no"
+                what += ", whose other parts can be trained," if option == "--test" else ""
+                raise BenchmarkError(
+                    f"{option} {wanted}: {count} different robots {what} exist{self._reasons()}; "
+                    "ask for fewer, or name more robots with --from or --grammar"
+                )
+
+    def _require_all_rules(self, test: Sequence[int]) -> None:
+        """Raise if a rule holds for no test robot."""
+        for number, rule in enumerate(self.maker.rules):
+            if not any(number in self.pool[n].rules for n in test):
+                raise BenchmarkError(
+                    f"--hold-out {rule}: no robots with it, whose other parts can be trained, "
+                    f"exist{self._reasons()}; name more robots with --from or --grammar"
+                )
+
+    def _require_covered(self, test: Sequence[int], train: Sequence[int]) -> None:
+        """Raise if the smallest split does not train all other parts of its test robots."""
+        smallest = self.request.train[0]
+        required = frozenset[str]().union(*(self.pool[n].required for n in test))
+        trained = [self.pool[n].parts for n in train]
+        missing = required.difference(*trained[:smallest])
+        if not missing:
+            return
+        sizes = range(smallest + 1, len(train) + 1)
+        enough = next((size for size in sizes if not required.difference(*trained[:size])), None)
+        raise BenchmarkError(
+            f"--train {smallest}: no train robot has {', '.join(sorted(missing))}, which test "
+            "robots have and --hold-out does not name; ask for "
+            f"{f'{enough} or more' if enough else 'more'} train robots, or for fewer test robots"
+        )
+
+    def _reasons(self) -> str:
+        """Return why robots were rejected, the most common reasons first."""
+        counts = Counter(self.rejected.values()).most_common(2)
+        reasons = ", ".join(f"{count} with {reason}" for reason, count in counts)
+        links = f"more than {self.request.max_links} links"
+        hint = "; see --max-links" if any(reason == links for reason, _ in counts) else ""
+        return f" ({len(self.rejected)} rejected: {reasons}{hint})" if counts else ""
+
+    def _reject_repeated(self, chosen: Sequence[int]) -> None:
+        """Reject robots that are physically the same as an earlier one."""
+        first: dict[str, int] = {}
+        for number in chosen:
+            if number in self.robots and number not in self.rejected:
+                earlier = first.setdefault(self.robots[number].hash, number)
+                if earlier != number:
+                    self.rejected[number] = "the same hash as another robot"
+
+    def _reject_near(self, test: Sequence[int], train: Sequence[int]) -> None:
+        """Reject train robots that the audit would call nearly the same as a test robot."""
+        for pair in product(test, train):
+            if pair not in self._compared and all(n in self.robots for n in pair):
+                self._compared[pair] = self._is_near(*pair)
+            if self._compared.get(pair) and not self.rejected.keys() & set(pair):
+                self.rejected[pair[1]] = "almost the sizes of a test robot"
+
+    def _is_near(self, a: int, b: int) -> bool:
+        x, y = self.robots[a].features, self.robots[b].features
+        assert x is not None
+        assert y is not None
+        return is_near(x, y)
+
+
+_UNNAMED = frozenset(("fixed", NOTHING))
+"""Parts that a name leaves out: the usual base, and no end-effector."""
+_MAX_LENGTH = 150
+"""Longest name of parts [characters]; a suffix and a task still fit into a file's name."""
+
+
+def parts_name(derivation: Derivation) -> str:
+    """Return the parts of a robot, from the base outwards.
+
+    Equal parts are counted, ``slides+5xbead+claw``, and those of a limb have its name,
+    ``left-ur5+left-plane``. The base ``fixed`` is left out.
+    """
+    counts: Counter[str] = Counter()
+    for node in derivation.walk():
+        if node.part not in _UNNAMED:
+            limb, _, kind = node.label.rpartition("_")
+            counts[f"{limb}-{node.part}" if limb and kind in ("arm", "ee") else node.part] += 1
+    words = [f"{n}x{part}" if n > 1 else part for part, n in counts.items()]
+    return "+".join(words)[:_MAX_LENGTH] or derivation.part
+
+
+def unique_names(derivations: Iterable[Derivation]) -> list[str]:
+    """Return a name per robot; the second of a name ends in ``-2``, the third in ``-3``."""
+    counts: Counter[str] = Counter()
+    names: list[str] = []
+    for derivation in derivations:
+        name = parts_name(derivation)
+        counts[name] += 1
+        names.append(name if counts[name] == 1 else f"{name}-{counts[name]}")
+    return names
+
+
+def has_hold_out_rules(split: Split) -> bool:
+    """Return whether a split claims to hold something out."""
+    return split.regime == HOLD_OUT or HOLD_OUT_KEY in split.provenance
+
+
+def hold_out_rules(split: Split, library: Library) -> tuple[HoldOutRule, ...]:
+    """Return the rules of what a split holds out.
+
+    Raises:
+        BenchmarkError: If they are missing or malformed, or name nothing in the library.
+    """
+    origin = f"split {split.name!r}: made: {HOLD_OUT_KEY}"
+    texts = split.provenance.get(HOLD_OUT_KEY)
+    if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
+        raise BenchmarkError(f"{origin}: {texts!r}; expected a list such as ['arm=kinova*']")
+    return parse_rules(texts, library, origin)
+
+
+def hold_out_findings(split: Split, library: Library) -> tuple[Finding, ...]:
+    """Return the violations of what a split says is held out; all are errors.
+
+    - ``held-out-trained``: a train robot has what is held out;
+    - ``held-out-absent``: a test robot does not have it;
+    - ``held-out-untested``: a rule holds for no test robot;
+    - ``part-unseen``: a part of a test robot is not held out as such, but no train robot has it.
+
+    Raises:
+        BenchmarkError: If the rules are missing or malformed.
+        GrammarError: If a derivation is malformed.
+        PartError: If the library lacks a part.
+    """
+    rules = hold_out_rules(split, library)
+    train, test = (
+        [(m, parse_derivation(m.derivation, f"derivation of {m.name!r}")) for m in members]
+        for members in (split.train, split.test)
+    )
+    return (
+        *_train_findings(rules, train, library),
+        *_test_findings(rules, train, test, library),
+        *_untested(rules, test, library),
+    )
+
+
+def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
+    """Return train parts of the kind and manufacturer of parts that are held out by their names.
+
+    ``arm=kinova*`` does not hold out ``mico``, which is Kinova's, too: users may not expect that.
+
+    Returns:
+        The parts by the rule that holds them out, such as ``arm.manufacturer=Kinova``.
+    """
+    named = [rule for rule in hold_out_rules(split, library) if rule.holds_out_parts]
+    held = {
+        part
+        for member in split.test
+        for part in held_out_parts(named, parse_derivation(member.derivation), library)
+    }
+    trained = {
+        part for member in split.train for part in parts(parse_derivation(member.derivation))
+    }
+    related: dict[str, tuple[str, ...]] = {}
+    for manifest in map(library.manifest, sorted(held)):
+        same = [
+            part
+            for part in sorted(trained)
+            if (library.manifest(part).kind, library.manifest(part).manufacturer)
+            == (manifest.kind, manifest.manufacturer)
+        ]
+        if manifest.manufacturer and same:
+            related[f"{manifest.kind}.manufacturer={manifest.manufacturer}"] = tuple(same)
+    return related
+
+
+Parsed = tuple[Member, Derivation]
+
+
+def _train_findings(
+    rules: Sequence[HoldOutRule], train: Sequence[Parsed], library: Library
+) -> Iterator[Finding]:
+    for member, derivation in train:
+        for rule in rules:
+            if rule.holds(derivation, library):
+                names = ", ".join(sorted(rule.matching_parts(derivation, library)))
+                why = f"it has {names}, and the split holds out {rule}"
+                yield _finding("held-out-trained", "train", member, why, "leave it out of train")
+
+
+def _test_findings(
+    rules: Sequence[HoldOutRule],
+    train: Sequence[Parsed],
+    test: Sequence[Parsed],
+    library: Library,
+) -> Iterator[Finding]:
+    trained = frozenset[str]().union(*(parts(derivation) for _, derivation in train))
+    for member, derivation in test:
+        if not any(rule.holds(derivation, library) for rule in rules):
+            why = f"it has nothing that the split holds out: {', '.join(map(str, rules))}"
+            yield _finding("held-out-absent", "test", member, why, "leave it out of test")
+        unseen = parts(derivation) - trained - held_out_parts(rules, derivation, library)
+        if unseen:
+            why = f"no train robot has {', '.join(map(repr, sorted(unseen)))}, which no rule names"
+            fix = "train on a robot that has it, or hold it out, too"
+            yield _finding("part-unseen", "test", member, why, fix)
+
+
+def _untested(
+    rules: Sequence[HoldOutRule], test: Sequence[Parsed], library: Library
+) -> Iterator[Finding]:
+    for rule in rules:
+        if not any(rule.holds(derivation, library) for _, derivation in test):
+            yield Finding(
+                "held-out-untested",
+                "error",
+                f"rule {rule}",
+                "no test robot has what it holds out",
+                "add a test robot that has it, or delete the rule",
+            )
+
+
+def _finding(code: str, side: Side, member: Member, why: str, fix: str) -> Finding:
+    return Finding(code, "error", f"{side} robot {member.name}", why, fix)
+
 
 DEFAULT_PATTERN = "arm=* ee=*"
 """Robots that are drawn from if nothing is named."""

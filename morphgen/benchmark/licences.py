@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from morphgen.benchmark.part_patterns import NOTHING
+from morphgen.benchmark.regimes import NOTHING
 from morphgen.benchmark.split import SIDES, Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import parse_derivation

@@ -7,11 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from morphgen.benchmark.composition import composition
-from morphgen.benchmark.extrapolation import extrapolation, parse_bound
-from morphgen.benchmark.generate import SplitRequest
+from morphgen.benchmark.generate import (
+    SplitRequest,
+    composition,
+    extrapolation,
+    interpolation,
+    parse_bound,
+)
 from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.interpolation import interpolation
 from morphgen.benchmark.robot_factory import Progress
 from morphgen.benchmark.split import HOLD_OUT, REGIMES, Regime, Split
 from morphgen.errors import BenchmarkError, nearest

@@ -8,7 +8,7 @@ difficulty.csv     size, nearest train robots and reference scores of every robo
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
 scores.json        reference scores, if there are any
 submissions/       the reference submissions that the scores were computed from
-goals/             goal sets, see ``morphgen.tasks.split_goals``
+goals/             goal sets, see ``morphgen.tasks.goals.split_goals``
 
 An archive is a zip of this folder.
 """
@@ -78,7 +78,7 @@ class Release(Record, frozen=True):
     morphgen: str
     """Version of morphgen that made it."""
     evaluation: dict[str, Any]
-    """How submissions are evaluated, see ``morphgen.tasks.eval_protocol``."""
+    """How submissions are evaluated, see ``morphgen.tasks.goals.eval_protocol``."""
     format: int = FORMAT
     date: str = ""
     """Date of publication, such as ``2027-01-31``; empty if it is not given."""

@@ -12,7 +12,7 @@ import numpy as np
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import Features, features
 from morphgen.benchmark.split import COMPOSED, Member
-from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
+from morphgen.benchmark.tokens import MAX_LINKS, require_max_links
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes

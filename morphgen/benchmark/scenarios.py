@@ -20,11 +20,11 @@ from morphgen.benchmark.robot_factory import (
 )
 from morphgen.benchmark.split import Member, Regime, Split
 from morphgen.benchmark.split_file import SUFFIX, write_split
-from morphgen.benchmark.statistics import statistics
+from morphgen.benchmark.survey import statistics
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import Library, default_library
-from morphgen.grammar.pinning import pin
+from morphgen.grammar.request import pin
 
 SEED = 0
 """Seed of all scenarios."""

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from typing import Literal
 
 from morphgen.benchmark.robot_hash import digest, robot_hash
-from morphgen.benchmark.token_layout import LARGEST_MAX_LINKS, MAX_LINKS
+from morphgen.benchmark.tokens import LARGEST_MAX_LINKS, MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation

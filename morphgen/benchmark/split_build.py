@@ -14,17 +14,17 @@ from morphgen.benchmark.split import Member, Split, compose_member
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_folder import (
     BUILD_FILE,
+    BUNDLED,
     README_FILE,
     ROBOTS_DIR,
     ROBOTS_FILE,
     SPLIT_FILE,
     SUMS_FILE,
     TOKENS_FILE,
-)
-from morphgen.benchmark.split_folder_files import (
-    BUNDLED,
     BuildSettings,
     RobotData,
+    differences,
+    is_current,
     readme_text,
     records_text,
     robot_data,
@@ -33,9 +33,9 @@ from morphgen.benchmark.split_folder_files import (
     sums_text,
     tokens_npz,
     unique_robots,
+    write_robot,
 )
-from morphgen.benchmark.split_folder_robots import differences, is_current, write_robot
-from morphgen.benchmark.token_layout import require_max_links
+from morphgen.benchmark.tokens import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json

@@ -12,20 +12,34 @@ SHA256SUMS         hashes of all these files, written last, for ``sha256sum -c``
 
 from __future__ import annotations
 
+import io
+import json
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import SIDES, Side
-from morphgen.benchmark.token_layout import TOKEN_SIZE
+from morphgen.benchmark.split import SIDES, Member, Side, Split, sided_members, split_id
+from morphgen.benchmark.survey import robot_stats
+from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, tokens
+from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
-from morphgen.formats.data_files import parse_json, read_text
-from morphgen.formats.npz_files import read_npz
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.bundle import CARD, PICTURE, URDF, file_findings, split_colours, write_bundle
+from morphgen.formats.card import card_text, robot_card
+from morphgen.formats.data_files import parse_json, read_json, read_text
+from morphgen.formats.files import replacing_folder
+from morphgen.formats.urdf.write import urdf_text
+from morphgen.formats.zip_files import read_npz
+from morphgen.grammar.robot_set import DERIVATION, light_urdf
+from morphgen.model.robot import Robot
+from morphgen.typing import Array
 
 SPLIT_FILE = "split.yaml"
 ROBOTS_FILE = "robots.jsonl"
@@ -224,3 +238,290 @@ def _text(path: Path) -> str:
         raise BenchmarkError(f"{path}: no such file") from error
     except OSError as error:
         raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+_README = """\
+# {name}
+
+{summary}
+
+A split of robots for cross-embodiment learning ({regime}): {train} robots to train on, {test} to
+test on. `{split}` says how they were chosen; its id is `{id}`.
+
+- `{robots}`: a line of JSON a robot: name, side (train or test), task, obstacles, category,
+  derivation (parts and parameters), hash of the body, links, movable joints, those between root and
+  tool, degrees of freedom, reach (m), mass (kg), and path of its folder
+- `{tokens}`: tokens (n, max_links, 48) at home, mask (n, max_links), names (n,), in the order of
+  `{robots}`; layout and columns say what the 48 numbers are
+- `{bundles}/`: {bundle}
+- `{settings}`: how this folder was built
+- `{sums}`: of every file, for `sha256sum -c {sums}`; `morphgen split verify .` also tests that the
+  robots are those of `{split}`
+
+```python
+
+split = load_split_folder(".")
+for robot in split.train:
+    print(robot["name"], robot["tokens"].shape, split.folder / robot["path"] / "robot.urdf")
+```
+
+Without morphgen: `datasets.load_dataset("json", data_files="{robots}")` and
+`numpy.load("{tokens}")`.
+"""
+_BUNDLE = (
+    "a folder a body: `robot.urdf`, `robot.xml` (MJCF), `meshes/`, and `card.json` with the\n"
+    "  sources and licences of its parts"
+)
+_LIGHT = (
+    "a folder a body: `robot.urdf`, whose meshes are named where their data packages have\n"
+    "  them, and `derivation.txt`"
+)
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """Settings of a build."""
+
+    light: bool = False
+    """Write only URDF and derivation; the URDF refers to the meshes of the data packages."""
+    picture: bool = False
+    """Add ``preview.png`` to the bundles."""
+
+    def __post_init__(self) -> None:
+        """Check that both can be done.
+
+        Raises:
+            BenchmarkError: If a light build is to have pictures.
+        """
+        if self.light and self.picture:
+            raise BenchmarkError("a light build has no pictures; choose one of light and picture")
+
+
+BUNDLED = BuildSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class RobotData:
+    """The measurements and tokens of a robot."""
+
+    facts: Mapping[str, object]
+    """Numbers of links and joints, reach and mass, see ``survey.RobotStats``."""
+    tokens: Array
+    """Tokens, shape (n_links, 48)."""
+
+
+def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotData:
+    """Measure a robot.
+
+    Args:
+        robot: The robot.
+        folders: Folders of parts, for their stored fits.
+        max_links: Largest number of links in the split.
+
+    Raises:
+        BenchmarkError: If the robot has more links.
+    """
+    table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
+    return RobotData(robot_stats(robot).as_dict(), table)
+
+
+def unique_robots(split: Split) -> list[Member]:
+    """Return the first member of each robot, train first; its name is that of the folder.
+
+    Raises:
+        BenchmarkError: If two different robots have the same name.
+    """
+    firsts: dict[str, Member] = {}
+    hash_by_name: dict[str, str] = {}
+    for _, member in sided_members(split):
+        firsts.setdefault(member.robot_hash, member)
+        if hash_by_name.setdefault(member.name, member.robot_hash) != member.robot_hash:
+            raise BenchmarkError(
+                f"split {split.name!r}: a train and a test robot of different bodies are both "
+                f"named {member.name!r}; rename one"
+            )
+    return list(firsts.values())
+
+
+def robot_paths(split: Split) -> dict[str, str]:
+    """Return the path of each robot's folder in the split folder, by the robot's hash."""
+    return {member.robot_hash: f"{ROBOTS_DIR}/{member.name}" for member in unique_robots(split)}
+
+
+def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
+    """Return the lines of ``robots.jsonl``.
+
+    Args:
+        split: The split.
+        known: Data of each robot by its hash.
+    """
+    paths = robot_paths(split)
+    return [
+        {
+            "name": member.name,
+            "side": side,
+            "task": member.task,
+            "obstacles": member.obstacles,
+            "category": member.category,
+            "derivation": member.derivation,
+            "hash": member.robot_hash,
+            **known[member.robot_hash].facts,
+            "path": paths[member.robot_hash],
+        }
+        for side, member in sided_members(split)
+    ]
+
+
+def records_text(split: Split, known: Mapping[str, RobotData]) -> str:
+    """Return the text of ``robots.jsonl``."""
+    lines = (json.dumps(record, ensure_ascii=False) for record in records(split, known))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
+    """Return tokens (n, max_links, 48) and mask (n, max_links) of all members."""
+    tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
+    padded = [pad_tokens(table, split.max_links) for table in tables]
+    return np.array([table for table, _ in padded]), np.array([mask for _, mask in padded])
+
+
+def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
+    """Return the bytes of ``tokens.npz``."""
+    tables, mask = token_tables(split, known)
+    content = io.BytesIO()
+    np.savez(
+        content,
+        tokens=tables,
+        mask=mask,
+        names=np.array([member.name for _, member in sided_members(split)]),
+        layout=np.array([field.name for field in LAYOUT]),
+        columns=np.array([(field.start, field.columns.stop) for field in LAYOUT]),
+    )
+    return content.getvalue()
+
+
+def settings_text(split: Split, settings: BuildSettings) -> str:
+    """Return the text of ``build.json``; a build is continued only with the same settings."""
+    data = {
+        "format": FORMAT,
+        "split": split_id(split),
+        "light": settings.light,
+        "picture": settings.picture,
+    }
+    return json.dumps(data, indent=2) + "\n"
+
+
+def readme_text(split: Split, settings: BuildSettings) -> str:
+    """Return the text of ``README.md``."""
+    return _README.format(
+        name=split.name,
+        summary=split.summary or "(no summary)",
+        regime=split.regime,
+        train=len(split.train),
+        test=len(split.test),
+        id=split_id(split),
+        bundle=_LIGHT if settings.light else _BUNDLE,
+        split=SPLIT_FILE,
+        robots=ROBOTS_FILE,
+        tokens=TOKENS_FILE,
+        bundles=ROBOTS_DIR,
+        settings=BUILD_FILE,
+        sums=SUMS_FILE,
+    )
+
+
+def sums_text(sums: Mapping[str, str]) -> str:
+    """Return the text of ``SHA256SUMS`` for hexadecimal hashes by path."""
+    return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
+
+
+_MESH = re.compile(r'(<mesh filename=")[^"]*"')
+_IGNORED_KEYS = {"findings", "versions"}
+"""Keys of a card that are not compared."""
+_REL_TOL, _ABS_TOL = 1e-6, 1e-9
+"""Tolerances of the numbers of two cards, which may be rounded on different machines."""
+
+
+def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
+    """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation.
+
+    Raises:
+        FormatError: If the folder cannot be written.
+    """
+    if light:
+        with replacing_folder(folder) as partial:
+            for name, text in _light_files(robot).items():
+                (partial / name).write_text(text, encoding="utf-8")
+        return
+    write_bundle(robot, folder, check(robot), picture=picture, edits_kept=False)
+
+
+def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
+    """Return the differences between a robot's folder and the robot, one line each.
+
+    The URDF (without the names of meshes) and the card (without findings and versions) are compared
+    with the robot, all other files with the hashes on the card.
+    """
+    if not folder.is_dir():
+        return ["its folder is missing"]
+    return list(_light_differences(folder, robot) if light else _differences(folder, robot))
+
+
+def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
+    """Test if this version of morphgen would write a folder without differences in the same way."""
+    if light:
+        return True
+    card = read_json(folder / CARD)
+    has_picture = (folder / PICTURE).is_file()
+    return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
+
+
+def _light_files(robot: Robot) -> dict[str, str]:
+    return {URDF: light_urdf(robot), DERIVATION: f"{robot.provenance['derivation']}\n"}
+
+
+def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
+    files = _light_files(robot)
+    for name, text in files.items():
+        path = folder / name
+        if not path.is_file():
+            yield f"file {name} is missing"
+        elif path.read_bytes() != text.encode():
+            yield f"file {name} is not the robot's"
+    yield from _extra(folder, files)
+
+
+def _differences(folder: Path, robot: Robot) -> Iterator[str]:
+    try:
+        findings = file_findings(folder)
+    except FormatError as error:
+        yield str(error)
+        return
+    yield from (f"{finding.where}: {finding.why}" for finding in findings)
+    card = read_json(folder / CARD)
+    if (folder / URDF).is_file():
+        stored_urdf = (folder / URDF).read_text("utf-8", "replace")
+        # Compared without the names of meshes, which depend on where the meshes are stored.
+        if _MESH.sub(r'\1"', stored_urdf) != urdf_text(split_colours(robot), lambda mesh: ""):
+            yield f"file {URDF} is not the robot's"
+    expected = json.loads(card_text(robot_card(robot, (), card["hashes"], {})))
+    for key in sorted(expected.keys() - _IGNORED_KEYS):
+        if not same(card.get(key), expected[key]):
+            yield f"file {CARD}: its {key!r} is not the robot's"
+    yield from _extra(folder, (*card["hashes"], CARD, PICTURE))
+
+
+def _extra(folder: Path, known: Iterable[str]) -> Iterator[str]:
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    yield from (f"file {name} does not belong to it" for name in sorted(names - set(known)))
+
+
+def same(a: object, b: object) -> bool:
+    """Test if two values read from JSON are equal up to rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=_REL_TOL, abs_tol=_ABS_TOL)
+    return a == b

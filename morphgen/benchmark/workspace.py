@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.model.frame_positions import frame_positions
 from morphgen.model.kinematics import (
     forward_kinematics,
+    frame_positions,
     joint_axes,
     joint_limits,
     reach,

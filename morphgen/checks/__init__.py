@@ -23,14 +23,18 @@ from morphgen.checks.joints import (
 )
 from morphgen.checks.loaders import (
     check_capsules,
+    check_frame_names,
     check_link_count,
     check_mesh_scales,
     check_mimic_loaders,
+    check_names,
+    check_reserved,
     check_root,
+    check_shapes,
+    check_tool,
+    check_units,
 )
-from morphgen.checks.names import check_frame_names, check_names, check_reserved, check_tool
 from morphgen.checks.repairs import repaired
-from morphgen.checks.shapes import check_shapes, check_units
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 

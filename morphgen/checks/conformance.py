@@ -17,15 +17,14 @@ from lxml import etree
 
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
-from morphgen.checks.joint_readings import Reading, compare_joints
-from morphgen.checks.readers import LOADERS, Loader, Quirk, refusal_causes
+from morphgen.checks.readers import LOADERS, Loader, Quirk, Reading, compare_joints, refusal_causes
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import PackageFinder, default_finder
-from morphgen.formats.urdf import robot_from_xml
-from morphgen.formats.urdf_text import BOUND_MASS
+from morphgen.formats.urdf.read import robot_from_xml
+from morphgen.formats.urdf.write import BOUND_MASS
 from morphgen.model.dynamics import gravity_load, mass_matrix
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.checks.joints import is_axis_valid
+from morphgen.checks.loaders import has_hull, is_readable
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
-from morphgen.checks.shapes import has_hull, is_readable
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Primitive, Shape, Sphere
 from morphgen.model.inertia import solid_mesh

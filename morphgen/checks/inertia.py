@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morphgen.checks.shapes import unit_density_inertial
+from morphgen.checks.loaders import unit_density_inertial
 from morphgen.model.findings import Finding
 from morphgen.model.inertia import bounding_box
 from morphgen.model.robot import Inertial, Link, Robot

@@ -22,8 +22,7 @@ from morphgen.checks.joints import (
     is_positive,
     position_range,
 )
-from morphgen.checks.names import all_names, safe_names, safe_robot_name
-from morphgen.checks.shapes import unit_density_inertial
+from morphgen.checks.loaders import all_names, safe_names, safe_robot_name, unit_density_inertial
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import (
     DEFAULT_EFFORT,

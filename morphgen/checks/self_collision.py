@@ -296,8 +296,8 @@ def _compile(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
     import mujoco
     from lxml import etree
 
-    from morphgen.formats.mjcf import MJCF_COMPILER
-    from morphgen.formats.mjcf_elements import (
+    from morphgen.formats.mjcf.write import (
+        MJCF_COMPILER,
         Meshes,
         geom_attributes,
         joint_attributes,

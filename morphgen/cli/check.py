@@ -76,7 +76,7 @@ def _findings(
     from morphgen.api.checks import bundle_of, check_source
     from morphgen.checks import check, fix
     from morphgen.formats.bundle import bundle_folder, write_bundle
-    from morphgen.formats.urdf import UnsoundError
+    from morphgen.formats.urdf.read import UnsoundError
     from morphgen.grammar.robot_source import read_source
 
     if args.fix is None:

@@ -6,23 +6,23 @@ from morphgen.cli import (
     doctor,
     evaluate,
     export,
-    finetune,
     fit,
-    goals,
-    grammar,
-    import_robots,
     play,
     robots,
     sample,
-    score,
     similarity,
     split,
     study,
-    tokens,
     train,
     view,
-    zeroshot,
 )
+from morphgen.cli import play as zeroshot
+from morphgen.cli import robots as import_robots
+from morphgen.cli import sample as grammar
+from morphgen.cli import similarity as tokens
+from morphgen.cli import split as goals
+from morphgen.cli import study as score
+from morphgen.cli import train as finetune
 from morphgen.cli.command import Command
 
 COMMANDS: tuple[Command, ...] = (

@@ -1,4 +1,4 @@
-"""``morphgen eval``: score a policy or a baseline on each robot."""
+"""``morphgen eval --submission``: rules, recording and file of a submission."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
-from morphgen.cli.eval_submission import plan_submission, rules_of
 from morphgen.cli.progress import TrainingProgress
-from morphgen.cli.training_robots import (
+from morphgen.cli.train import (
     GOAL_SEED,
     SIDES,
     require_split_for_options,
@@ -29,10 +28,95 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
     from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.robot_source import RobotSource
-    from morphgen.rl.runs import RunConfig
-    from morphgen.rl.scores import Score
+    from morphgen.rl.runs.checkpoint import RunConfig
+    from morphgen.rl.runs.robot_source import RobotSource
+    from morphgen.rl.scores.scores import Score
+    from morphgen.rl.scores.submission import SubmissionRecorder, Training
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol
     from morphgen.tasks.task import TaskConfig
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSubmission:
+    """A submission whose episodes are still to be run."""
+
+    path: Path
+    method: str
+    mode: str
+    training_seed: int | None
+    evaluation: dict[str, Any]
+    training: Training | None
+    record: SubmissionRecorder
+    """Callback for the episodes of every robot."""
+
+    def write(self) -> None:
+        """Write the submission of the recorded episodes."""
+        from morphgen.rl.scores.submission import write_submission
+
+        submission = self.record.submission(
+            self.method, self.mode, self.training_seed, self.evaluation, self.training
+        )
+        write_submission(self.path, submission)
+
+
+def rules_of(words: Sequence[str]) -> EvalProtocol:
+    """Return the rules of the release that ``--split`` names, else the default ones."""
+    from morphgen.benchmark.release_file import is_release, read_release
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
+
+    folder = Path(words[0]) if len(words) == 1 else None
+    if folder is None or not is_release(folder):
+        return EvalProtocol()
+    return protocol_from(read_release(folder).evaluation, str(folder))
+
+
+def plan_submission(
+    args: argparse.Namespace,
+    source: RobotSource,
+    config: EvalConfig,
+    *,
+    method: str,
+    mode: str = "",
+    training_seed: int | None = None,
+    training: Training | None = None,
+) -> PlannedSubmission | None:
+    """Return the submission that the arguments ask for, or None.
+
+    Args:
+        args: Arguments of ``morphgen eval``.
+        source: The robots, any side of a split.
+        config: Configuration of the evaluation.
+        method: Name of the method unless ``--method`` is given.
+        mode: How the policy acts; empty for a baseline.
+        training_seed: Seed of the training; None for a baseline.
+        training: How the policy was trained, if it is known.
+
+    Raises:
+        TaskError: If the robots are not those of a split, or the test side is left out.
+        BenchmarkError: If the evaluation does not follow the rules, or the name is invalid.
+    """
+    from morphgen.formats.files import require_writable_file
+    from morphgen.rl.runs.robot_source import split_of
+    from morphgen.rl.scores.submission import SubmissionRecorder, require_rules
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol
+
+    if args.submission is None:
+        return None
+    if not source.split:
+        raise TaskError(f"--submission: {source.name} is no split; name one with --split")
+    if args.on == "train":
+        raise TaskError("--submission: the test robots are needed; leave --on train out")
+    require_writable_file(args.submission, "--submission")
+    split = split_of(source)
+    rules = rules_of(args.words)
+    goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)
+    followed = EvalProtocol(config.sim, config.episodes, config.seed, goals).as_data(split)
+    require_rules(followed, rules.as_data(split), "--submission")
+    name = method if args.method is None else args.method
+    record = SubmissionRecorder(split)
+    # Refuses an invalid name or seed now, not after hours of episodes.
+    record.submission(name, mode, training_seed, followed)
+    return PlannedSubmission(args.submission, name, mode, training_seed, followed, training, record)
 
 
 @command(
@@ -87,8 +171,13 @@ if TYPE_CHECKING:
 )
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate and print the scores."""
-    from morphgen.rl.eval_report import require_table, score_table, summary, write_scores
-    from morphgen.rl.scores import scores_to_json
+    from morphgen.rl.scores.scores import (
+        require_table,
+        score_table,
+        scores_to_json,
+        summary,
+        write_scores,
+    )
 
     if args.out is not None:
         require_table(args.out)
@@ -107,7 +196,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, no_record
-    from morphgen.tasks.env_specs import default_configs
+    from morphgen.tasks.scenes.env_specs import default_configs
 
     name = args.checkpoint
     if not args.words:
@@ -135,15 +224,15 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
 
 
 def _sources_of(source: RobotSource, sides: Sequence[Side]) -> list[RobotSource]:
-    from morphgen.rl.robot_source import other_side
+    from morphgen.rl.runs.robot_source import other_side
 
     return [other_side(source, side) for side in sides]
 
 
 def _prepare(sources: Sequence[RobotSource], config: EvalConfig, display: TrainingProgress) -> None:
     """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
-    from morphgen.rl.robot_source import specs_of
-    from morphgen.tasks.env_specs import GoalConfig
+    from morphgen.rl.runs.robot_source import specs_of
+    from morphgen.tasks.scenes.env_specs import GoalConfig
 
     for source in sources:
         specs_of(source, GoalConfig(tasks=config.tasks), display.goal_sets)
@@ -158,9 +247,9 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         require_trained_tasks,
     )
     from morphgen.rl.inference import MODES
-    from morphgen.rl.runs import read_checkpoint, read_config
-    from morphgen.rl.submission import Training
-    from morphgen.rl.training import checkpoint_files
+    from morphgen.rl.runs.checkpoint import read_checkpoint, read_config
+    from morphgen.rl.runs.training import checkpoint_files
+    from morphgen.rl.scores.submission import Training
     from morphgen.tasks.device import require_device
 
     require_split_for_options(args)
@@ -232,8 +321,8 @@ def _given_robots(
     display: TrainingProgress,
 ) -> list[RobotSource]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
-    from morphgen.rl.drawn_robots import fresh_source
-    from morphgen.tasks.env_specs import GoalConfig
+    from morphgen.rl.runs.drawn_robots import fresh_source
+    from morphgen.tasks.scenes.env_specs import GoalConfig
 
     if args.words:
         return _sources(args)
@@ -265,7 +354,7 @@ def _simulator(args: argparse.Namespace) -> str | None:
 
 def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
-    from morphgen.rl.drawn_robots import FILE, trained_on
+    from morphgen.rl.runs.drawn_robots import FILE, trained_on
 
     if not (folder / FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"
@@ -283,7 +372,7 @@ def _sides(args: argparse.Namespace, *, has_test: bool) -> tuple[Side, ...]:
 
 
 def _sources(args: argparse.Namespace) -> list[RobotSource]:
-    from morphgen.rl.robot_source import other_side
+    from morphgen.rl.runs.robot_source import other_side
 
     source = robots_to_train(args.words, argparse.Namespace(**{**vars(args), "on": "train"}))
     return [other_side(source, side) for side in _sides(args, has_test=bool(source.split))]
@@ -293,14 +382,14 @@ def _with_goal(
     configs: Iterable[TaskConfig], sources: list[RobotSource], args: argparse.Namespace
 ) -> tuple[TaskConfig, ...]:
     """Return configs with the goal of ``--goal``, which must be for a robot of the sources."""
-    from morphgen.rl.robot_source import tasks_of
+    from morphgen.rl.runs.robot_source import tasks_of
 
     return opt.with_goal(configs, args.goal, (task for each in sources for task in tasks_of(each)))
 
 
 def _num_episodes(args: argparse.Namespace) -> int:
     from morphgen.rl.evaluation import episodes_for
-    from morphgen.tasks.env_specs import default_configs
+    from morphgen.tasks.scenes.env_specs import default_configs
 
     if args.episodes is not None:
         return int(args.episodes)

@@ -230,7 +230,7 @@ def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
     Raises:
         BenchmarkError: If a robot has more links than ``--max-links``.
     """
-    from morphgen.benchmark.token_layout import default_max_links, require_max_links
+    from morphgen.benchmark.tokens import default_max_links, require_max_links
 
     if args.max_links is None:
         return default_max_links(len(robot.links) for robot in robots)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+    from morphgen.rl.distributed import UpdateMetrics
     from morphgen.rl.evaluation import Progress
-    from morphgen.rl.metrics import UpdateMetrics
-    from morphgen.rl.training import ShowMetrics, Subrun
+    from morphgen.rl.runs.training import ShowMetrics, Subrun
 
 T = TypeVar("T")
 

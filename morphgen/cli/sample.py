@@ -1,16 +1,18 @@
-"""``morphgen sample``, ``derive`` and ``mutate``: robots from grammars, and their derivations."""
+"""``morphgen grammar``: list, check, count, enumerate and print grammars."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
+import math
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option, repeated
-from morphgen.cli.grammar import GRAMMAR
+from morphgen.cli.command import Command, command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import FormatError
 
@@ -18,6 +20,111 @@ if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
+
+
+GRAMMAR = option("grammar", help="name of a grammar (see: morphgen grammar list), or its file")
+
+
+@command("list", "list the grammars that come with morphgen", opt.JSON)
+def list_grammars(args: argparse.Namespace) -> None:
+    """Print the names and summaries."""
+    from tabulate import tabulate
+
+    from morphgen.grammar.grammar_file import grammar_names, grammar_summary
+
+    rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
+    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
+
+
+@command(
+    "check",
+    "check a grammar for faults",
+    GRAMMAR,
+    *opt.LIBRARY_JSON,
+    details="The exit code is 1 if it has any.",
+)
+def check(args: argparse.Namespace) -> int:
+    """Print every fault."""
+    from morphgen.grammar.analysis import check_grammar
+
+    library = opt.library_of(args)
+    grammar = opt.load_grammar_named(args.grammar, library)
+    faults = check_grammar(grammar, library)
+    opt.print_result(args, faults, lambda: "\n".join(faults) or f"{grammar.name}: sound")
+    return int(bool(faults))
+
+
+@command(
+    "count",
+    "count the structures of a grammar, and list the values that are sampled",
+    GRAMMAR,
+    *opt.LIBRARY_JSON,
+)
+def count(args: argparse.Namespace) -> None:
+    """Print the number of structures and the sampled values."""
+    from morphgen.grammar.analysis import count_structures, variables
+    from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT
+
+    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
+    structures, sampled = count_structures(grammar), variables(grammar)
+    data = {
+        "structures": int(structures) if structures <= MAX_COUNT else None,
+        "finite": structures != math.inf,
+        "variables": [
+            {"where": v.location, "draw": v.text, "continuous": v.distribution.is_continuous}
+            for v in sampled
+        ],
+    }
+
+    def text() -> str:
+        number = f"{structures}" if structures <= MAX_COUNT else f"more than 10^{COUNT_DIGITS}"
+        number = "infinitely many" if structures == math.inf else number
+        lines = [f"{grammar.name}: {number} structures, {len(sampled)} values drawn"]
+        for variable in sampled:
+            kind = "continuous" if variable.distribution.is_continuous else "discrete"
+            lines.append(f"  {kind:10}  {variable.location} = {variable.text}")
+        return "\n".join(lines)
+
+    opt.print_result(args, data, text)
+
+
+@command(
+    "enumerate",
+    "print every structure of a grammar, with typical values",
+    GRAMMAR,
+    number("--limit", "largest number of structures", default=50, least=0),
+    *opt.LIBRARY_JSON,
+)
+def enumerate_structures(args: argparse.Namespace) -> None:
+    """Print a derivation per line."""
+    from morphgen.grammar.analysis import enumerate_structures
+
+    library = opt.library_of(args)
+    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
+    structures = enumerate_structures(grammar, library)
+    texts = map(str, itertools.islice(structures, args.limit))
+    if args.json:
+        print(json.dumps(list(texts)))
+        return
+    for text in texts:
+        print(text)
+
+
+@command("print", "print a grammar and its includes as one text", GRAMMAR, *opt.LIBRARY_JSON)
+def print_grammar(args: argparse.Namespace) -> None:
+    """Print the text of the grammar."""
+    from morphgen.grammar.grammar_file import grammar_text
+
+    text = grammar_text(opt.load_grammar_named(args.grammar, opt.library_of(args)))
+    opt.print_result(args, text, lambda: text.removesuffix("\n"))
+
+
+grammar = Command(
+    "grammar",
+    "list, check, count, enumerate or print grammars",
+    commands=(list_grammars, check, count, enumerate_structures, print_grammar),
+)
+
 
 NUMBER = number("-n", "number of robots", default=10)
 
@@ -41,10 +148,16 @@ NUMBER = number("-n", "number of robots", default=10)
 )
 def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
-    from morphgen.grammar.conditions import parse_conditions
     from morphgen.grammar.grammar_file import grammar_text
-    from morphgen.grammar.robot_set import SetConfig, SetWorker, make_serially, make_set
-    from morphgen.grammar.workers import make_in_processes, make_on_ray
+    from morphgen.grammar.robot_set import (
+        SetConfig,
+        SetWorker,
+        make_in_processes,
+        make_on_ray,
+        make_serially,
+        make_set,
+    )
+    from morphgen.grammar.values import parse_conditions
 
     grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
     parse_conditions(args.where, "--where")  # refuses invalid ones
@@ -146,12 +259,12 @@ def mutate(args: argparse.Namespace) -> None:
     """Write neighbours as bundles and print what differs."""
     from morphgen.formats.bundle import write_bundle
     from morphgen.formats.data_files import read_text
-    from morphgen.grammar.conditions import parse_conditions
     from morphgen.grammar.derivation import difference
     from morphgen.grammar.grammar_file import grammar_from_text
-    from morphgen.grammar.limits import MAX_TEXT
     from morphgen.grammar.robot_set import GRAMMAR, read_index, read_settings
     from morphgen.grammar.sampling import mutate
+    from morphgen.grammar.syntax import MAX_TEXT
+    from morphgen.grammar.values import parse_conditions
 
     name, folder = args.robot.name, args.robot.resolve().parent
     if not (folder / GRAMMAR).is_file():
@@ -210,7 +323,7 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
                 "replay the robot that was fitted"
             )
         if "spheres" in primitives:
-            from morphgen.fitting.sphere_robot import as_spheres
+            from morphgen.fitting.collision_geometry import as_spheres
 
             number, cover = primitives["spheres"], primitives.get("cover")
             if not isinstance(number, int) or not isinstance(cover, float | None):
@@ -238,8 +351,8 @@ def _stored_derivation(folder: Path) -> Derivation:
     from morphgen.formats.bundle import CARD
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import parse_derivation
-    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
     from morphgen.grammar.robot_set import DERIVATION
+    from morphgen.grammar.syntax import MAX_DERIVATION_TEXT
 
     _require_folder(folder)
     light, card = folder / DERIVATION, folder / CARD

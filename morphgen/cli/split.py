@@ -1,4 +1,4 @@
-"""``morphgen split``: list, print and release splits of train and test robots."""
+"""``morphgen goals``: goal sets of robots and splits."""
 
 from __future__ import annotations
 
@@ -8,21 +8,480 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, command, flag, option
-from morphgen.cli.progress import bar
-from morphgen.cli.split_checks import audit, build, verify
-from morphgen.cli.split_difficulty import difficulty
-from morphgen.cli.split_regimes import new
-from morphgen.cli.split_release import release, reveal
-from morphgen.cli.split_score import score
-from morphgen.errors import PartError
+from morphgen.cli.command import Command, Option, command, flag, number, option, path_option
+from morphgen.cli.progress import bar, status
+from morphgen.cli.split_new import new
+from morphgen.cli.split_release import release, reveal, score
+from morphgen.errors import BenchmarkError, GrammarError, PartError
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
+    from morphgen.benchmark.audit import Audit
+    from morphgen.benchmark.difficulty import BaselineResults, RobotDifficulty
+    from morphgen.benchmark.near_duplicates import NearThresholds
     from morphgen.benchmark.split import Member, Split
-    from morphgen.benchmark.statistics import PaperRow
+    from morphgen.benchmark.survey import PaperRow
+    from morphgen.benchmark.verify import Difference
+    from morphgen.model.findings import Finding
+    from morphgen.tasks.goals.split_goals import GoalResult, SplitGoals
+    from morphgen.tasks.scenes.env_specs import GoalConfig
+
+
+HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
+
+
+@command(
+    "goals",
+    "sample the goal sets of robots, and certify that each goal can be reached",
+    option(
+        "words",
+        nargs="+",
+        metavar="SPLIT",
+        help=f"name of a split, its file or built folder; with --task, a robot: {opt.ROBOT_HELP}",
+    ),
+    option("--task", choices=TASKS, metavar="TASK", help=f"one robot: its task, {opt.TASK_NAMES}"),
+    opt.OBSTACLES,
+    opt.SEED,
+    flag("--certify", "verify every goal with the configuration that it was sampled from"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="Goals of reach and starts of push are kept in the cache. The goals of reach are full "
+    "poses, so the sets are the same for --goal position and --goal pose of other commands. Run "
+    "the command again to continue an interrupted one. The exit code is 1 if a robot has too few "
+    "goals, or if a goal fails --certify.",
+    examples=("goals extrapolation/arms/reach --certify", "goals arm=ur5 ee=plane --task reach"),
+)
+def goals(args: argparse.Namespace) -> int:
+    """Sample goal sets and print a table with the failures."""
+    from morphgen.tasks.scenes.env_specs import GoalConfig
+
+    if args.task is None:
+        if args.obstacles:
+            raise BenchmarkError(
+                "--obstacles goes with --task; a split says which robots have obstacles"
+            )
+        if len(args.words) > 1:
+            raise BenchmarkError(
+                f"{' '.join(args.words)}: name one split, or say --task for a robot"
+            )
+        from morphgen.benchmark.split_source import read_split_or_folder
+
+        split, _ = read_split_or_folder(args.words[0])
+        results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
+    else:
+        results = [_robot_goals(args, GoalConfig(args.seed))]
+    passed = all(result.goals is not None and not result.certificate_errors for result in results)
+    data = _data(results, args.seed) | {"passed": passed}
+    opt.print_result(args, data, lambda: _goals_text(results, args.seed))
+    return int(not passed)
+
+
+def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
+    from morphgen.benchmark.split_file import split_names
+    from morphgen.tasks.goals.split_goals import sample_robot_goals
+    from morphgen.tasks.scenes.env_specs import load_robot
+
+    words = " ".join(args.words)
+    if words in split_names():
+        raise BenchmarkError(f"--task {args.task}: is for a robot; {words} is a split")
+    with status(args, f"sampling goals of {args.task} for {words}"):
+        robot = load_robot(words, library=args.library)
+        return sample_robot_goals(
+            robot, args.task, config, obstacles=args.obstacles, certified=args.certify
+        )
+
+
+def make_goals(
+    args: argparse.Namespace, split: Split, config: GoalConfig, *, certify: bool = False
+) -> list[GoalResult]:
+    """Sample the goal sets of a split's robots, or read them from the cache."""
+    from morphgen.tasks.goals.split_goals import sample_split_goals
+
+    with bar(args, "sampling goals") as update:
+        return sample_split_goals(
+            split, opt.library_of(args), config, jobs=args.jobs, certified=certify, progress=update
+        )
+
+
+def _goals_text(results: Sequence[GoalResult], seed: int) -> str:
+    from tabulate import tabulate
+
+    lines = [tabulate([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
+    for result in results:
+        robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
+        if result.goals is None:
+            lines.append(f"{robot}: {result.error}")
+        elif result.certificate_errors:
+            more = (
+                f" (and {len(result.certificate_errors) - 1} more)"
+                if result.certificate_errors[1:]
+                else ""
+            )
+            lines.append(f"{robot}: {result.certificate_errors[0]}{more}")
+    complete = sum(result.goals is not None for result in results)
+    return "\n".join([*lines, f"{complete} of {len(results)} goal sets are complete, seed {seed}"])
+
+
+def _goals_row(result: GoalResult) -> tuple[str, ...]:
+    goals, certificate_errors = result.goals, result.certificate_errors
+    certified = (
+        "not tested" if certificate_errors is None else "NO" if certificate_errors else "yes"
+    )
+    rate = "" if result.acceptance is None else f"{result.acceptance:.3g}"
+    count = "none" if goals is None else str(len(goals.q))
+    boxes = str(len(goals.obstacles)) if goals else "yes" if result.obstacles else "0"
+    return (result.robot, result.side or "", result.task, count, rate, boxes, certified)
+
+
+def _data(results: Sequence[GoalResult], seed: int) -> dict[str, object]:
+    from morphgen.tasks.goals.split_goals import goal_record
+
+    sets = [
+        goal_record(result)
+        | {
+            "certified": None
+            if result.certificate_errors is None
+            else not result.certificate_errors,
+            "unproven": list(result.certificate_errors or ()),
+        }
+        for result in results
+        if result.goals
+    ]
+    failures = [
+        {"robot": result.robot, "side": result.side, "task": result.task, "why": result.error}
+        for result in results
+        if result.goals is None
+    ]
+    return {"seed": seed, "sets": sets, "failures": failures}
+
+
+MAX_LISTED = 10
+"""Largest number of findings of one code, or of differences, that are printed."""
+
+
+def _goal_seed(help: str) -> Option:
+    return number("--goal-seed", help, least=0)
+
+
+@command(
+    "audit",
+    "look for leaks between train and test robots",
+    option("split", metavar="SPLIT", help="name of a split, its file, or its built folder"),
+    option(
+        "--near",
+        metavar="TREE,COSINE[,WORKSPACE]",
+        help="robots are nearly the same if their tree distance is below, and their cosine "
+        "similarity or, at one reach, their workspace overlap above "
+        "(default: 0.001,0.99999,0.999)",
+    ),
+    flag("--strict", "fail on warnings, too"),
+    flag("--goals", "audit goal sets even if the split ships none"),
+    _goal_seed("seed that the goal sets must have (default: as shipped, else 0)"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="The audit checks the rules of the split's regime, and names the nearest train robot "
+    "of each test robot. If a built split ships goal sets, it also looks for goals that are on "
+    "both sides, or out of reach. The exit code is 1 if there is an error that the split does not "
+    "accept, or a warning with --strict.",
+)
+def audit(args: argparse.Namespace) -> int:
+    """Audit a split and print the findings."""
+    from morphgen.benchmark.audit import audit
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
+    from morphgen.benchmark.split_source import read_split_or_folder
+
+    near = _near(args.near)
+    split, folder = read_split_or_folder(args.split)
+    library = opt.library_of(args)
+    with bar(args, "auditing") as update:
+        result = audit(split, library, near=near, jobs=args.jobs, progress=update)
+    result, goals = _audit_goals(args, result, split, folder)
+    passed = result.passed(strict=args.strict)
+    sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
+    try:
+        parts = licenced_parts(split, library)
+    except (GrammarError, PartError):  # the audit has a finding about it
+        parts = ()
+    limited = [part.as_dict() for part in restricted(parts)]
+    data = {**result.as_dict(), "goals": sets, "restricted": limited, "passed": passed}
+    line = restriction_line(parts)
+    opt.print_result(args, data, lambda: _audit_text(result, passed, goals, line))
+    return int(not passed)
+
+
+def _near(text: str | None) -> NearThresholds:
+    from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds
+
+    if text is None:
+        return NEAR_THRESHOLDS
+    try:
+        tree, cosine, *more = map(float, text.split(","))
+        near = NearThresholds(tree, cosine, *more)
+    except (ValueError, TypeError) as error:
+        raise BenchmarkError(
+            f"--near {text}: expected a tree distance and a cosine, such as 0.001,0.99999; a third "
+            "number is the workspace overlap"
+        ) from error
+    if not (0 <= tree <= 1 and -1 <= cosine <= 1 and 0 <= near.workspace <= 1):
+        raise BenchmarkError(
+            f"--near {text}: a tree distance is from 0 to 1, a cosine from -1 to 1, and a "
+            "workspace overlap from 0 to 1"
+        )
+    return near
+
+
+def _audit_goals(
+    args: argparse.Namespace, result: Audit, split: Split, folder: Path | None
+) -> tuple[Audit, SplitGoals | None]:
+    """Add the findings about goal sets to an audit; return the goal sets, too."""
+    from morphgen.tasks.goals.goal_audit import audit_goals, goals_to_audit, with_goal_findings
+
+    sample = partial(make_goals, args, split) if args.goals else None
+    goals = goals_to_audit(folder, args.goal_seed, sample)
+    findings = None
+    if goals is not None:
+        with bar(args, "auditing goals") as update:
+            library = opt.library_of(args)
+            findings = audit_goals(split, goals, library, jobs=args.jobs, progress=update)
+    return with_goal_findings(result, split, findings), goals
+
+
+def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
+    from tabulate import tabulate
+
+    from morphgen.benchmark.similarity import MEASURES
+
+    nearest: dict[str, list[str]] = {}
+    for neighbour in result.neighbours:
+        cell = f"{neighbour.train} {neighbour.value:.3f}"
+        nearest.setdefault(neighbour.test, []).append(cell)
+    rows = [(test, *cells) for test, cells in nearest.items()]
+    headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
+    lines = [tabulate(rows, headers, disable_numparse=True)] if rows else []
+    for code, findings in _by_code(result.findings).items():
+        lines.append(f"{findings[0].severity} {code} ({len(findings)})")
+        lines += _listed(findings)
+        lines.append(f"    fix: {findings[0].fix}")
+    reasons = {finding.code: reason for finding, reason in result.accepted}
+    for code, findings in _by_code([finding for finding, _ in result.accepted]).items():
+        lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
+        lines += _listed(findings)
+    if goals:
+        lines.append(f"{len(goals.sets)} goal sets were audited, seed {goals.config.seed}")
+    if limits:
+        lines.append(limits)
+    counts = ", ".join(
+        f"{sum(finding.severity == severity for finding in result.findings)} {severity}"
+        for severity in ("error", "warning")
+    )
+    verdict = "passed" if passed else "FAILED"
+    lines.append(f"{result.split}: {verdict}: {counts}, {len(result.accepted)} accepted")
+    return "\n".join(lines)
+
+
+def _by_code(findings: Sequence[Finding]) -> dict[str, list[Finding]]:
+    groups: dict[str, list[Finding]] = {}
+    for finding in findings:
+        groups.setdefault(finding.code, []).append(finding)
+    return groups
+
+
+def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
+    """Return a line per finding, and how many more there are."""
+    more = len(findings) - MAX_LISTED
+    lines = [f"  {finding.where}: {finding.why}" for finding in findings[:MAX_LISTED]]
+    return [*lines, *([f"  and {more} more (--json lists all)"] if more > 0 else [])]
+
+
+@command(
+    "build",
+    "write every robot of a split and its tokens into a folder",
+    option("split", metavar="SPLIT", help="name of a split, or its file"),
+    path_option("--out", "DIR", "folder where the split's folder goes", default=Path("data")),
+    flag("--light", "write the URDF and the derivation only"),
+    flag("--picture", "draw preview.png of every robot"),
+    flag("--goals", "ship the goal set of every robot"),
+    _goal_seed("with --goals: seed of the goal sets (default: 0)"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="The same split gives the same bytes, with any number of jobs. Run the command again "
+    "to continue an interrupted one.",
+    examples=("split build interpolation/panda/reach --out data --goals --jobs 4",),
+)
+def build(args: argparse.Namespace) -> None:
+    """Build a split and print where it is."""
+    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder import BuildSettings
+    from morphgen.tasks.goals.split_release import build_with_goals
+    from morphgen.tasks.scenes.env_specs import GoalConfig
+
+    settings = BuildSettings(light=args.light, picture=args.picture)
+    if not args.goals:
+        opt.reject_idle({"--goal-seed": args.goal_seed is not None}, "only with --goals")
+    split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
+    goals = make_goals(args, split, config) if args.goals else []
+    with bar(args, "building") as update:
+        report = build_with_goals(
+            split,
+            args.out,
+            opt.library_of(args),
+            settings,
+            goals,
+            config,
+            jobs=args.jobs,
+            progress=update,
+        )
+    written, kept = report.num_written, report.num_kept
+    data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
+    lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
+    if args.goals:
+        data["goals"] = len(goals)
+        lines.append(f"{len(goals)} goal sets, seed {config.seed}")
+    if limited := restricted(licenced_parts(split, opt.library_of(args))):
+        data["restricted"] = [part.as_dict() for part in limited]
+        lines += [f"restricted: {restriction_text(part)}" for part in limited]
+    lines.append(f"verify it anywhere: morphgen split verify {report.folder}")
+    opt.print_result(args, data, lambda: "\n".join(lines))
+
+
+@command(
+    "verify",
+    "verify that a split, its built folder or its release has the robots that it claims",
+    option(
+        "path",
+        metavar="PATH",
+        help="name of a split, its file, its built folder, or the archive of a release",
+    ),
+    *opt.JOBS_LIBRARY_JSON,
+    details="Every robot is composed anew and compared: with the hashes of the split, or with all "
+    "files of a built folder or a release. The exit code is 1 if something differs.",
+)
+def verify(args: argparse.Namespace) -> int:
+    """Verify a split and print what differs."""
+    from morphgen.benchmark.verify import verify
+
+    with bar(args, "verifying") as update:
+        result = verify(args.path, opt.library_of(args), jobs=args.jobs, progress=update)
+    differences, split = result.differences, result.split
+    data = {
+        "split": split.name,
+        "id": result.id,
+        "differences": [{"where": each.where, "why": each.why} for each in differences],
+        "passed": not differences,
+        **({"content": result.content} if result.content else {}),
+    }
+
+    def text() -> str:
+        verdict = f"{len(differences)} difference{'' if len(differences) == 1 else 's'}"
+        if not differences:
+            verdict = f"all {len(split.train) + len(split.test)} robots are the same"
+        lines = [f"{split.name}, id {result.id}: {verdict}", *_listed(differences)]
+        if result.content and not differences:
+            lines.append(f"  content: {result.content}")
+        return "\n".join(lines)
+
+    opt.print_result(args, data, text)
+    return int(bool(differences))
+
+
+@command(
+    "difficulty",
+    "print how hard each robot of splits is: size, nearest train robots, baselines",
+    option(
+        "splits",
+        nargs="+",
+        metavar="SPLIT",
+        help="names of splits, their files, or their built folders",
+    ),
+    path_option(
+        "--study",
+        "FOLDER",
+        "output folder of morphgen study, for score and success of the baselines",
+    ),
+    path_option("--csv", "FILE", "write a row per robot"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="The columns are the movable joints between root and tool, links, reach, and by each "
+    "similarity measure the nearest other train robot with its value. With --study, score and "
+    "success rate of each baseline of the study follow; scores of reach are relative to the random "
+    "policy.",
+    examples=(
+        "split difficulty interpolation/arm3/reach --csv arm3.csv",
+        "split difficulty extrapolation/arms/reach --study results/reach-30m",
+    ),
+)
+def difficulty(args: argparse.Namespace) -> None:
+    """Measure the robots of splits, print a table per split and write the file."""
+    from morphgen.benchmark.difficulty import difficulty_csv, split_difficulty
+    from morphgen.formats.files import require_writable_file, write_file
+
+    if args.csv is not None:
+        require_writable_file(args.csv, "--csv", ".csv")
+    splits = _splits(args.splits)
+    results = _results(args.study, splits)
+    library = opt.library_of(args)
+    rows: list[RobotDifficulty] = []
+    for split, known in zip(splits, results, strict=True):
+        with bar(args, split.name) as update:
+            rows += split_difficulty(split, library, results=known, jobs=args.jobs, progress=update)
+    baselines = _baselines(results)
+    if args.csv is not None:
+        write_file(args.csv, difficulty_csv(rows, baselines))
+    files = [] if args.csv is None else [str(args.csv)]
+    data = {"rows": [row.as_dict() for row in rows], "files": files}
+    opt.print_result(args, data, lambda: _difficulty_text(rows, splits, baselines, files))
+
+
+def _splits(names: Sequence[str]) -> list[Split]:
+    """Return the splits; two of one name could not be told apart in the rows."""
+    from morphgen.benchmark.split_source import read_split_or_folder
+
+    words: dict[str, str] = {}
+    splits = []
+    for name in names:
+        split, _ = read_split_or_folder(name)
+        opt.require_other_name(words, split.name, name)
+        splits.append(split)
+    return splits
+
+
+def _results(study: Path | None, splits: Sequence[Split]) -> list[BaselineResults]:
+    """Return the results of the baselines of a study on each split; none without a study."""
+    if study is None:
+        return [{} for _ in splits]
+    from morphgen.rl.scores.reference_scores import study_results
+
+    return [study_results(study, split) for split in splits]
+
+
+def _baselines(results: Sequence[BaselineResults]) -> tuple[str, ...]:
+    """Return the names of all baselines with results, in the order of their registry."""
+    from morphgen.rl.baselines import BASELINES
+
+    return tuple(name for name in BASELINES if any(name in known for known in results))
+
+
+def _difficulty_text(
+    rows: Sequence[RobotDifficulty],
+    splits: Sequence[Split],
+    baselines: Sequence[str],
+    files: Sequence[str],
+) -> str:
+    """Return a table per split, each with the baselines of its tasks, and the written files."""
+    from morphgen.benchmark.difficulty import difficulty_table
+
+    parts = []
+    for split in splits:
+        own = [row for row in rows if row.split == split.name]
+        columns = [name for name in baselines if any(name in row.baselines for row in own)]
+        parts.append(f"{split.name}\n{difficulty_table(own, columns)}")
+    notes = ["nearest: the most similar other train robot and its value by each measure"]
+    if baselines:
+        notes.append("baselines: score, success rate")
+    return "\n".join(["\n\n".join(parts), "", *notes, *files])
+
 
 SHORT_DERIVATION = 60
 """Number of characters of a derivation that ``show`` prints without ``--full``."""
@@ -153,7 +612,7 @@ def stats(args: argparse.Namespace) -> None:
 
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
     from morphgen.benchmark.split_file import read_split, split_names
-    from morphgen.benchmark.statistics import PAPER_TABLE, paper_row, statistics
+    from morphgen.benchmark.survey import PAPER_TABLE, paper_row, statistics
 
     library = opt.library_of(args)
     groups = _by_robots([read_split(name) for name in args.splits or split_names()])

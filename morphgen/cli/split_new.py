@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from morphgen.cli import options as opt
+from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.tasks.registry import TASKS
@@ -25,9 +26,8 @@ def new_split(args: argparse.Namespace) -> None:
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
     from morphgen.benchmark.new_split import choose_robots
     from morphgen.benchmark.split import split_id
-    from morphgen.benchmark.split_file import require_split_name
-    from morphgen.benchmark.split_writing import split_paths, write_new_splits
-    from morphgen.benchmark.statistics import statistics
+    from morphgen.benchmark.split_file import require_split_name, split_paths, write_new_splits
+    from morphgen.benchmark.survey import statistics
 
     request = _request(args)
     require_split_name(request.name)
@@ -65,7 +65,7 @@ def new_split(args: argparse.Namespace) -> None:
 def _request(args: argparse.Namespace) -> SplitRequest:
     from morphgen.benchmark.generate import SplitRequest
     from morphgen.benchmark.new_split import default_name
-    from morphgen.benchmark.token_layout import MAX_LINKS
+    from morphgen.benchmark.tokens import MAX_LINKS
 
     tasks = [text.strip() for text in args.task.split(",")]
     for i, task in enumerate(tasks):
@@ -118,7 +118,7 @@ def _summary(split: Split, path: Path) -> list[str]:
 
 def _hold_out_notes(split: Split, library: Library) -> list[str]:
     """Return what a user of ``--hold-out`` may not expect."""
-    from morphgen.benchmark.hold_out_audit import related_parts
+    from morphgen.benchmark.hold_out import related_parts
     from morphgen.benchmark.split import HOLD_OUT
 
     if split.regime != HOLD_OUT:
@@ -132,3 +132,164 @@ def _hold_out_notes(split: Split, library: Library) -> list[str]:
             for rule, names in related_parts(split, library).items()
         ),
     ]
+
+
+def new_hold_out(args: argparse.Namespace) -> None:
+    """Make a split from what it holds out."""
+    if not args.hold_out:
+        args.parser.error("the following arguments are required: --hold-out, or COMMAND")
+    new_split(args)
+
+
+def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
+    """Return the options of all regimes; ``train`` is the default of ``--train``."""
+    return (
+        option(
+            "--train",
+            metavar="N,...",
+            default=train,
+            help="number of train robots; several numbers give a split each, with the same test "
+            f"robots, the smaller within the larger (default: {train_default or train})",
+        ),
+        option("--test", type=int, default=1, metavar="N", help="number of test robots"),
+        option(
+            "--task", default="reach", metavar="TASK,...", help="one task, or several with commas"
+        ),
+        flag("--obstacles", "tasks have obstacles"),
+        opt.SEED,
+        number(
+            "--max-links",
+            "largest number of links of a robot, and the number that its tokens are padded to "
+            "(default: 23)",
+            least=2,
+        ),
+        option("--name", help="name of the split (default: from the other options)"),
+        path_option(
+            "--out",
+            "FILE.yaml|DIR",
+            "the file, or the folder where NAME.yaml goes (default: this folder)",
+            default=Path(),
+        ),
+        flag("--statistics", "add the statistics of morphgen split stats to the file"),
+        *opt.JOBS_LIBRARY_JSON,
+    )
+
+
+REGIMES = (
+    Command(
+        "interpolation",
+        "test robots have the structure of train robots, in other sizes",
+        (
+            option(
+                "--grammar",
+                required=True,
+                help="name of a grammar (see: morphgen grammar list), or its file",
+            ),
+            option(
+                "--hull",
+                choices=["inside", "outside", "any"],
+                default="any",
+                help="parameters of test robots are inside or outside of the convex hull of those "
+                "of the train robots with the same structure",
+            ),
+            *split_options("10"),
+        ),
+        new_split,
+        examples=("split new interpolation --grammar arm3 --train 10 --test 1 --hull inside",),
+        defaults={"regime": "interpolation"},
+    ),
+    Command(
+        "composition",
+        "test robots join parts that are trained, but not together",
+        (
+            repeated(
+                "--from",
+                "words of morphgen compose with choices in braces and wildcards",
+                dest="patterns",
+                metavar="WORDS",
+                required=True,
+                default=None,
+            ),
+            *split_options("", "all robots that may be trained on"),
+        ),
+        new_split,
+        details="Every part of a test robot is in a train robot; its combination is in none. With "
+        "several tasks, robot and task are combined: the end-effector of a test robot is trained "
+        "at other tasks only.",
+        examples=(
+            'split new composition --from "arm={ur5,panda} ee={plane,stick,cylinder,sake_ez}" '
+            "--train 7 --test 1 --task push",
+        ),
+        defaults={"regime": "composition"},
+    ),
+    Command(
+        "extrapolation",
+        "test robots are of a category that is not trained",
+        (
+            *(
+                option(
+                    f"--{side}-category",
+                    metavar="GRAMMAR,...",
+                    required=True,
+                    help=f"names or files of grammars whose robots are {side} robots, in turn",
+                )
+                for side in ("train", "test")
+            ),
+            option(
+                "--similarity",
+                metavar="BOUND",
+                default="",
+                help="bound on the cosine similarity of each test robot to its nearest train "
+                "robot, such as '<0.6'",
+            ),
+            *split_options("10"),
+        ),
+        new_split,
+        details="Neither the category nor the structure of a test robot is trained.",
+        examples=(
+            "split new extrapolation --train-category stick,nlink,prims --test-category chain "
+            '--similarity "<0.6"',
+        ),
+        defaults={"regime": "extrapolation"},
+    ),
+)
+new = Command(
+    "new",
+    "choose train and test robots, and write them as a split",
+    (
+        repeated(
+            "--hold-out",
+            "what test robots have and train robots do not: names of parts (arm=kinova*), a "
+            "manufacturer (manufacturer=Kinova), a range of a parameter (arm3.length=0.3..0.4), or "
+            "a combination (arm=ur5+ee=plane); several are separated by commas",
+            metavar="RULE,...",
+        ),
+        repeated(
+            "--from",
+            "robots to draw from: words of morphgen compose with choices in braces and wildcards "
+            "(default: 'arm=* ee=*')",
+            dest="patterns",
+            metavar="WORDS",
+        ),
+        option(
+            "--grammar",
+            metavar="GRAMMAR,...",
+            default="",
+            help="draw robots from these grammars instead, or besides those of --from",
+        ),
+        *split_options("10"),
+    ),
+    new_hold_out,
+    commands=REGIMES,
+    details="With --hold-out, say what is held out. Or choose by the rules of a regime: see "
+    "morphgen split new COMMAND --help. The same seed gives the same bytes, with any number of "
+    "jobs.",
+    examples=(
+        "split new --hold-out 'arm=kinova*' --train 12 --test 4 --name my/no-kinova",
+        "split new --hold-out arm=ur5+ee=plane,arm=panda+ee=stick --train 12 --test 2",
+        "split new --hold-out manufacturer=Kinova --from 'arm=* ee={plane,stick}' --test 6",
+        "split new --hold-out arm3.length=0.3..0.4 --grammar arm3 --test 4",
+        'split new composition --from "arm={ur5,panda} ee={plane,stick}" --train 3',
+    ),
+    defaults={"regime": "hold-out"},
+)

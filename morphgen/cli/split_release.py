@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +12,13 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.difficulty import BaselineResults
     from morphgen.benchmark.split import Split
+    from morphgen.rl.scores.reference_scores import References
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
 
 @command(
@@ -74,13 +78,12 @@ if TYPE_CHECKING:
 )
 def release(args: argparse.Namespace) -> None:
     """Make a release and print where it is."""
-    from morphgen.benchmark.private_source import test_grammars
-    from morphgen.benchmark.private_test import make_secret
+    from morphgen.benchmark.private_test import make_secret, test_grammars
     from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.split_folder_files import BuildSettings
+    from morphgen.benchmark.split_folder import BuildSettings
     from morphgen.formats.files import require_writable_folder
-    from morphgen.tasks.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
-    from morphgen.tasks.split_release import ReleaseRequest, release_split
+    from morphgen.tasks.goals.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
+    from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
 
     if (args.private_test is None) != (args.secret_file is None):
         raise BenchmarkError(
@@ -92,8 +95,11 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.rl.baseline_results import submitted_results
-        from morphgen.rl.reference_scores import collect_references, reference_files
+        from morphgen.rl.scores.reference_scores import (
+            collect_references,
+            reference_files,
+            submitted_results,
+        )
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), submitted_results(references)
@@ -165,7 +171,7 @@ def _archives(out: Path) -> set[Path]:
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
     """Return what the release lacks that its users may expect."""
     from morphgen.benchmark.release_file import SUBMISSIONS_DIR
-    from morphgen.tasks.eval_protocol import tasks_of_split
+    from morphgen.tasks.goals.eval_protocol import tasks_of_split
     from morphgen.tasks.registry import TASKS
 
     notes = []
@@ -198,9 +204,8 @@ def reveal(args: argparse.Namespace) -> None:
     """Reveal a private test side and print the split's file."""
     from morphgen.benchmark.private_test import read_secret, reveal
     from morphgen.benchmark.release_file import opened_folder, read_release
-    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_file import read_split, write_new_splits
     from morphgen.benchmark.split_folder import SPLIT_FILE
-    from morphgen.benchmark.split_writing import write_new_splits
 
     secret = read_secret(args.secret_file)
     with opened_folder(args.release) as folder:
@@ -216,3 +221,128 @@ def reveal(args: argparse.Namespace) -> None:
         f"next: morphgen split audit {path}",
     ]
     opt.print_result(args, {"file": str(path), "test": robots}, lambda: "\n".join(lines))
+
+
+@command(
+    "score",
+    "check submissions to a split, compute their scores and rank them",
+    option(
+        "submissions",
+        nargs="+",
+        type=Path,
+        metavar="SUBMISSION",
+        help="file that morphgen eval --submission wrote",
+    ),
+    option(
+        "--split",
+        metavar="SPLIT",
+        help="archive or folder of a release, or name or file of a split (default: the split of "
+        "morphgen that the first submission names)",
+    ),
+    flag("--markdown", "print the table as Markdown"),
+    *opt.JOBS_LIBRARY_JSON,
+    details="Every episode of every test robot must be there, with the goals, simulator and "
+    "constants of the release. Scores and 95% intervals are computed from the episodes: bootstrap "
+    "for scores, Wilson for successes. They are ranked beside the reference scores of the release. "
+    "A submission with a fault is refused with one line, and nothing is ranked; so is a release "
+    "whose files differ from its SHA256SUMS, and so are submissions that disagree about the random "
+    "policy, if the release has no submission of it.",
+    examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
+)
+def score(args: argparse.Namespace) -> None:
+    """Score submissions and print the ranking."""
+    from morphgen.rl.scores.leaderboard import (
+        random_scores,
+        ranking_data,
+        ranking_table,
+        score_submission,
+    )
+    from morphgen.rl.scores.submission import check_submission, read_submission, require_same_random
+    from morphgen.tasks.goals.eval_protocol import expected_robots
+
+    submissions = [read_submission(path) for path in args.submissions]
+    library = opt.library_of(args)
+    name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
+    with ExitStack() as stack:
+        split, protocol, references, version = _open(name, stack)
+    with bar(args, "composing robots") as update:
+        expected = expected_robots(split, protocol, library, jobs=args.jobs, progress=update)
+    named = [
+        *((f"{name}: reference {each.method}", each) for each in references.submissions),
+        *zip(map(str, args.submissions), submissions, strict=True),
+    ]
+    for where, submission in named:
+        check_submission(submission, where, split, protocol, expected, version)
+    random = random_scores(references.random) if references.random else None
+    tasks = sorted({each.member.task for each in expected})
+    relative = [task for task in tasks if TASKS[task].relative_to_random]
+    warnings = []
+    if relative and random is None:
+        require_same_random(named)
+        warnings.append(
+            "random_score was not checked: there is no reference submission of random, so that an "
+            f"edited random_score changes a score of {' and '.join(relative)}; rank submissions in "
+            "a release that has one (split release --scores)"
+        )
+    rows = [score_submission(each, random) for each in submissions] + references.all_rows()
+    data = {
+        "split": split.name,
+        "random": "release" if random else "submission",
+        "warnings": warnings,
+        "rows": ranking_data(rows),
+    }
+    notes = [
+        "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of each robot; "
+        "successes: Wilson"
+    ]
+    if relative:
+        whose = "the release" if random else "each submission"
+        notes.append(
+            f"scores of {' and '.join(relative)} are relative to the random policy, by the "
+            f"episodes of {whose}"
+        )
+    notes += [f"warning: {text}" for text in warnings]
+    style = "github" if args.markdown else "simple"
+    opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
+
+
+def _shipped_split(name: str, where: Path) -> str:
+    """Return the name of a split that comes with morphgen; a submission cannot name other files."""
+    from morphgen.benchmark.split_file import split_names
+    from morphgen.errors import BenchmarkError
+
+    if name not in split_names():
+        raise BenchmarkError(
+            f"{where}: split.name: {name} is not a split that comes with morphgen; name its "
+            "release or file with --split"
+        )
+    return name
+
+
+def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:
+    """Return a split, its rules, reference scores, and the version of morphgen they are of."""
+    from importlib.metadata import version
+
+    from morphgen.benchmark.release_file import (
+        is_archive,
+        is_release,
+        opened_folder,
+        read_release,
+    )
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder import SPLIT_FILE
+    from morphgen.benchmark.verify import require_unchanged
+    from morphgen.rl.scores.reference_scores import References, read_references
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
+
+    path = Path(name)
+    if not path.is_dir() and not is_archive(path):
+        return read_split(name), EvalProtocol(), References(), version("morphgen")
+    folder = stack.enter_context(opened_folder(path))
+    require_unchanged(folder, name)
+    split = read_split(folder / SPLIT_FILE)
+    if not is_release(folder):
+        return split, EvalProtocol(), References(), version("morphgen")
+    release = read_release(folder)
+    protocol = protocol_from(release.evaluation, name)
+    return split, protocol, read_references(folder), release.morphgen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option
 from morphgen.cli.progress import training_progress
-from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
-from morphgen.cli.training_robots import robots_to_train
-from morphgen.errors import TaskError
+from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.agents import AGENTS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 
 if TYPE_CHECKING:
-    from morphgen.rl.runs import RunConfig
-    from morphgen.rl.study import Cell
+    from morphgen.rl.runs.checkpoint import RunConfig
+    from morphgen.rl.scores.study import Cell
+
 
 PAPER = "paper"
 """Word for all splits of the benchmark."""
@@ -75,8 +75,8 @@ PAPER = "paper"
 )
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
-    from morphgen.rl.study import read_scores, require_cells
-    from morphgen.rl.study_report import TABLE, write_tables
+    from morphgen.rl.scores.score_tables import TABLE, write_tables
+    from morphgen.rl.scores.study import read_scores, require_cells
 
     execution_config(args)  # refuses invalid options before the work
     cells = _cells(args)
@@ -96,12 +96,12 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     Raises:
         MorphgenError: If a split, agent or seed is invalid, or a run could not begin.
     """
-    from morphgen.rl.agent_spec import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
-    from morphgen.rl.robot_source import other_side, tasks_of
-    from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.tasks.env_specs import GoalConfig, default_configs
-    from morphgen.tasks.eval_protocol import EvalProtocol
+    from morphgen.rl.runs.agent_spec import parse_agents
+    from morphgen.rl.runs.robot_source import other_side, tasks_of
+    from morphgen.rl.scores.study import agent_cell, baseline_cells, matched_budget
+    from morphgen.tasks.goals.eval_protocol import EvalProtocol
+    from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
@@ -139,8 +139,8 @@ def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) 
     Raises:
         MorphgenError: If they cannot.
     """
-    from morphgen.rl.study import finetuning_run
-    from morphgen.rl.training import is_done, require_runnable, subruns_of
+    from morphgen.rl.runs.training import is_done, require_runnable, subruns_of
+    from morphgen.rl.scores.study import finetuning_run
     from morphgen.tasks.device import require_device
 
     parts = subruns_of(cell.folder, config)
@@ -194,7 +194,7 @@ def _seeds(text: str) -> list[int]:
 
 def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
     """Run the cells and return how many failed."""
-    from morphgen.rl.study_work import run_cells, run_cells_on_ray
+    from morphgen.rl.scores.study import run_cells, run_cells_on_ray
 
     failures = 0
     execution = execution_config(args)
@@ -213,3 +213,64 @@ def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
             print(line, file=sys.stderr, flush=True)
             failures += bool(outcome.error)
     return failures
+
+
+MODES = ("deterministic", "stochastic", "all")
+
+
+@command(
+    "score",
+    "compute tables of results from the episodes of studies and evaluations",
+    option(
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="submission, or a folder with submissions at any depth, such as that of a study",
+    ),
+    option(
+        "--mode",
+        choices=MODES,
+        default=MODES[0],
+        help="policies that act by the mean of their actions, that sample them, or both",
+    ),
+    flag("--markdown", "print the tables as Markdown"),
+    opt.JSON,
+    details="A row has a method over all of its training seeds. IQM is the interquartile mean over "
+    "seeds and robots, with a 95% bootstrap interval over the seeds if there are two or more. A "
+    "success rate has a 95% Wilson interval over all episodes. The last column of a side is the "
+    "difference to jacobian (reach) or scripted (push) in the same episodes, with a 95% bootstrap "
+    "interval over the episodes of each robot. Splits that come with morphgen are compared by "
+    "their id and the hashes of their robots.",
+    examples=("score results", "score results/reach-30m --markdown"),
+    extra="rl",
+)
+def score(args: argparse.Namespace) -> None:
+    """Print a table for every split and task."""
+    from morphgen.rl.scores.score_tables import (
+        cells_without_episodes,
+        read_submissions,
+        result_rows,
+        result_tables,
+    )
+    from morphgen.rl.scores.scores import finite_or_none
+
+    submissions = read_submissions(args.files)
+    if num_left := cells_without_episodes(args.files, submissions):
+        print(
+            f"morphgen: {num_left} cells of studies are left out: they have scores.json and no "
+            "episodes; delete it, and morphgen study evaluates their checkpoints again",
+            file=sys.stderr,
+        )
+    modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
+    found = {where: each for where, each in submissions.items() if each.mode in modes}
+    if not found:
+        raise BenchmarkError(
+            f"--mode {args.mode}: none of the {len(submissions)} submissions acts so; expected "
+            f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
+        )
+    rows = result_rows(found)
+    data = [finite_or_none(asdict(row)) for row in rows]
+    notes = "MT: train robots, ZS: test robots; intervals: 95%"
+    style = "github" if args.markdown else "simple"
+    opt.print_result(args, data, lambda: f"{result_tables(rows, style)}\n{notes}")

@@ -1,4 +1,4 @@
-"""``morphgen train``: train an agent on the robots of a split, on one, or on drawn ones."""
+"""Options of the agent that ``morphgen train`` trains: its switches and observations."""
 
 from __future__ import annotations
 
@@ -6,35 +6,270 @@ import argparse
 import re
 import shlex
 import sys
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.agent_options import AGENT, AGENT_OPTIONS, agent_spec
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
-from morphgen.cli.progress import status, training_progress
-from morphgen.cli.training_robots import (
-    DRAWN_OPTIONS,
-    SIDES,
-    SPLIT_HELP,
-    draw_robots,
-    require_robots_for_options,
-    robots_to_draw,
-    robots_to_train,
-)
-from morphgen.errors import TaskError
+from morphgen.cli.options import reject_idle
+from morphgen.cli.progress import TrainingProgress, status, training_progress
+from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.presets import PRESETS, preset_of
+from morphgen.rl.runs.presets import PRESETS, preset_of
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
+from morphgen.tasks.channels import CHANNELS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
 if TYPE_CHECKING:
-    from morphgen.rl.agent_spec import AgentSpec
-    from morphgen.rl.robot_source import RobotSource
-    from morphgen.rl.runs import RunConfig
-    from morphgen.rl.training import ExecutionConfig
+    from morphgen.rl.runs.agent_spec import AgentSpec
+    from morphgen.rl.runs.checkpoint import RunConfig
+    from morphgen.rl.runs.robot_source import RobotSource
+    from morphgen.rl.runs.training import ExecutionConfig
+    from morphgen.tasks.scenes.env_specs import GoalConfig
     from morphgen.tasks.task import TaskConfig
+
+
+AGENT = option(
+    "--agent", default="me-graph", help=f"one of {', '.join(AGENTS)} (default: me-graph)"
+)
+SWITCHES = {
+    "symlog": ("the critic predicts the symlog of returns", "on"),
+    "slow-critic": ("compute returns with a moving average of the critic", "on"),
+    "discrete": ("discrete actions", "on if the task of all robots is reach"),
+    "task-reweighting": ("weight the robots randomly", "off"),
+    "curriculum": ("push: move the target line from near to far during training", "on"),
+    "fixed-deviation": ("keep the initial standard deviation of continuous actions", "off"),
+    "mask-morphology": ("hide the robot's morphology from the agent", "off"),
+    "tool-position": ("add the tool's position to the observations", "off"),
+    "residual": ("add the actions to the steps that the channel ik shows", "off"),
+    "normalize": ("normalize the kinematic channels of observations", "off"),
+    "robot-advantages": ("normalize advantages robot by robot", "off"),
+    "joint-entropy": ("weigh the mean entropy of the joints instead of their sum", "off"),
+}
+"""Purpose of each switch, and its default without a preset that sets it."""
+
+
+def switch_help(name: str) -> str:
+    """Return the help of a switch, with its default in every preset."""
+    purpose, default = SWITCHES[name]
+    others = [
+        f"{'on' if preset.switches[name] else 'off'} with --preset {label}"
+        for label, preset in PRESETS.items()
+        if name in preset.switches
+    ]
+    return f"{purpose} (default: {'; '.join([default, *others])})"
+
+
+def on_off(name: str, help: str, default: bool | None = None) -> Option:
+    """Return an option ``--name`` with its opposite ``--no-name``."""
+    return Option(
+        (f"--{name}",), {"action": argparse.BooleanOptionalAction, "default": default, "help": help}
+    )
+
+
+OBSERVE = option(
+    "--observe",
+    metavar="A,B,...",
+    default="",
+    help="further channels of the observations: "
+    + ", ".join(CHANNELS).replace("_", "-")
+    + "".join(
+        f"; --preset {label} has {', '.join(names)} already, and --agent AGENT-NAME drops one"
+        for label, preset in PRESETS.items()
+        if (names := [name for name in preset.switches if name.replace("-", "_") in CHANNELS])
+    ),
+)
+AGENT_OPTIONS = (*(on_off(name, switch_help(name)) for name in SWITCHES), OBSERVE)
+
+
+def agent_spec(args: argparse.Namespace) -> AgentSpec:
+    """Return the agent with the switches that were given.
+
+    Raises:
+        TaskError: If the agent is unknown.
+    """
+    from morphgen.rl.runs.agent_spec import OBSERVATION_SWITCHES, parse_agent
+
+    values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
+    spec = parse_agent(args.agent)
+    switches = {name: value for name, value in values.items() if value is not None}
+    observed = [name for name in args.observe.split(",") if name]
+    for name in observed:
+        if name not in OBSERVATION_SWITCHES:
+            raise TaskError(f"--observe {name}{nearest(name, OBSERVATION_SWITCHES)}")
+    return replace(spec, switches={**spec.switches, **switches, **dict.fromkeys(observed, True)})
+
+
+SPLIT_HELP = (
+    "name of a split, its file or built folder; or a robot and its task, such as arm=ur5 ee=stick "
+    "task=reach"
+)
+SIDES = ["train", "test"]
+GOAL_SEED = number(
+    "--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0
+)
+
+DRAWN_OPTIONS = (
+    option(
+        "--robots",
+        metavar="GRAMMAR:N,...",
+        help="train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
+        "processes as --workers; the test robots of the splits of morphgen are never drawn",
+    ),
+    number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0),
+    repeated(
+        "--held-out",
+        "with --robots: a further split whose test robots are never drawn",
+        metavar="SPLIT",
+    ),
+    number(
+        "--slice-updates",
+        "with more --robots than --envs: number of updates after which the next robots take the "
+        "environments (default: those of two episodes)",
+    ),
+)
+"""Options of robots that are drawn from grammars."""
+
+
+def split_option(purpose: str) -> Option:
+    """Return the option ``--split``, whose words ``robots_to_train`` reads.
+
+    Args:
+        purpose: Whose robots the option names.
+    """
+    return option(
+        "--split",
+        dest="words",
+        nargs="+",
+        metavar="SPLIT",
+        default=[],
+        help=f"{purpose}: {SPLIT_HELP}",
+    )
+
+
+def require_split_for_options(args: argparse.Namespace) -> None:
+    """Require ``--split`` with options that describe other robots than the checkpoint's.
+
+    Raises:
+        TaskError: If it is missing.
+    """
+    for name in ("obstacles", "library", "goal_seed"):
+        if not args.words and getattr(args, name) not in (None, False, []):
+            raise TaskError(f"--{name.replace('_', '-')} goes with --split")
+
+
+def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
+    """Return the robots that a split, or a robot and ``task=NAME``, describe.
+
+    Raises:
+        TaskError: If a robot has no task, or the seed of the goals differs from that of the goals
+            that a built split ships.
+        MorphgenError: If the split or the robot is unknown.
+    """
+    from morphgen.benchmark.split_source import read_split_or_folder
+    from morphgen.rl.runs.robot_source import robot_source, split_source
+    from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
+
+    seed, library = args.goal_seed or 0, tuple(args.library)
+    choices = " or ".join(f"task={name}" for name in TASKS)
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    robot = " ".join(word for word in words if not word.startswith("task="))
+    if tasks:
+        if len(tasks) > 1 or not robot:
+            raise TaskError(f"{' '.join(words)}: name a robot and one task, {choices}")
+        TASKS[tasks[0]]  # raises if the task is unknown
+        return robot_source(
+            robot, tasks[0], obstacles=args.obstacles, goal_seed=seed, library=library
+        )
+    if len(words) > 1 or "=" in words[0]:
+        raise TaskError(f"{' '.join(words)}: a robot needs its task, {choices}")
+    if args.obstacles:
+        raise TaskError("--obstacles is for one robot; a split says which robots have obstacles")
+    try:
+        split, folder = read_split_or_folder(words[0])
+    except BenchmarkError as error:
+        if Path(words[0]).exists():
+            raise
+        raise BenchmarkError(f"{error}; a robot needs {choices}") from error
+    goal_folder = folder if folder is not None and has_goals(folder) else None
+    if goal_folder is not None:
+        shipped_seed = read_split_goals(goal_folder).config.seed
+        if args.goal_seed not in (None, shipped_seed):
+            raise TaskError(
+                f"--goal-seed {seed}: the goals in {goal_folder} are of seed {shipped_seed}"
+            )
+        seed = shipped_seed
+    return split_source(split, side=args.on, goal_seed=seed, goals=goal_folder, library=library)
+
+
+def robots_to_draw(args: argparse.Namespace) -> RobotSource:
+    """Return the source that ``--robots`` describes; none of its robots is drawn yet.
+
+    Raises:
+        TaskError: If the positional arguments are not a task, or ``--on`` is given.
+        MorphgenError: If a grammar or a split is unknown or faulty.
+    """
+    from morphgen.rl.runs.drawn_robots import drawn_source
+
+    choices = " or ".join(f"task={name}" for name in TASKS)
+    words, task = " ".join(args.words), args.words[0].removeprefix("task=")
+    if words != f"task={task}":
+        raise TaskError(f"{words}: with --robots, name the task and nothing else: {choices}")
+    if args.on != "train":
+        raise TaskError(f"--on {args.on}: drawn robots have no sides; --on goes with a split")
+    TASKS[task]  # raises if the task is unknown
+    return drawn_source(
+        args.robots,
+        task,
+        seed=args.robot_seed or 0,
+        held_out=args.held_out,
+        obstacles=args.obstacles,
+        goal_seed=args.goal_seed or 0,
+        library=args.library,
+    )
+
+
+def draw_robots(
+    source: RobotSource, config: GoalConfig, args: argparse.Namespace
+) -> tuple[RobotSource, int]:
+    """Draw the robots of a source and print how many were skipped.
+
+    Returns:
+        The source with the hash of its robots, and the number of links that observations are
+        padded to: ``--max-links`` if it is given, else the largest of the benchmark's number, those
+        of the splits of ``--held-out`` and the links of the largest robot.
+    """
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.tokens import default_max_links
+    from morphgen.rl.runs.drawn_robots import draw
+
+    with closing(TrainingProgress()) as display:
+        robots = draw(source, config, jobs=args.workers, progress=display.goal_sets)
+    if robots.skipped:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
+        print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
+    held_out = (read_split(name).max_links for name in source.held_out)
+    max_links = args.max_links or default_max_links([robots.most_links, *held_out])
+    return replace(source, drawn_hash=robots.hash), max_links
+
+
+def require_robots_for_options(args: argparse.Namespace) -> None:
+    """Require ``--robots`` with the other options of drawn robots.
+
+    Raises:
+        MorphgenError: If it is missing.
+    """
+    if args.robots is None:
+        given = {
+            "--robot-seed": args.robot_seed is not None,
+            "--held-out": bool(args.held_out),
+            "--slice-updates": args.slice_updates is not None,
+        }
+        reject_idle(given, "only with --robots")
+
 
 NETWORK_SWITCHES = {
     "bf16": "run the networks in bfloat16",
@@ -141,7 +376,7 @@ MINUTES = number(
 def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
     with status(args, "loading"):
-        from morphgen.rl.robot_source import other_side
+        from morphgen.rl.runs.robot_source import other_side
         from morphgen.tasks.device import batch_device, require_simulator_device
 
     require_robots_for_options(args)
@@ -164,8 +399,8 @@ def train(args: argparse.Namespace) -> None:
 
 def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
     """Train in a folder with a progress bar, and print the paths of the checkpoints."""
-    from morphgen.rl.runs import CHECKPOINT
-    from morphgen.rl.training import is_done, train
+    from morphgen.rl.runs.checkpoint import CHECKPOINT
+    from morphgen.rl.runs.training import is_done, train
 
     with training_progress() as show:
         execution = execution_config(args)
@@ -216,9 +451,9 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     Raises:
         TaskError: If a number is out of its range.
     """
-    from morphgen.rl.agent_spec import configs_of, parse_constants
-    from morphgen.rl.robot_source import tasks_of
-    from morphgen.rl.runs import RunConfig
+    from morphgen.rl.runs.agent_spec import configs_of, parse_constants
+    from morphgen.rl.runs.checkpoint import RunConfig
+    from morphgen.rl.runs.robot_source import tasks_of
 
     preset = preset_of(args.preset, spec.agent)
     changes = {**preset.constants, **parse_constants(args.set)}
@@ -248,9 +483,8 @@ def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
         TaskError: If a number is out of its range or has no effect.
         MorphgenError: If a robot cannot be drawn.
     """
-    from morphgen.rl.training import require_runnable
-    from morphgen.rl.training_batches import default_slice_updates, num_slices
-    from morphgen.tasks.env_specs import GoalConfig
+    from morphgen.rl.runs.training import default_slice_updates, num_slices, require_runnable
+    from morphgen.tasks.scenes.env_specs import GoalConfig
 
     if args.slice_updates is not None and num_slices(config) == 1:
         raise TaskError(
@@ -271,9 +505,9 @@ def _max_links(source: RobotSource) -> int:
     it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    from morphgen.benchmark.token_layout import default_max_links
-    from morphgen.rl.robot_source import split_of
-    from morphgen.tasks.env_specs import load_robot
+    from morphgen.benchmark.tokens import default_max_links
+    from morphgen.rl.runs.robot_source import split_of
+    from morphgen.tasks.scenes.env_specs import load_robot
 
     if source.split:
         return split_of(source).max_links
@@ -289,7 +523,7 @@ def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskCo
     Raises:
         TaskError: If the split ships its own goals, or no robot has the task of ``--goal``.
     """
-    from morphgen.rl.robot_source import tasks_of
+    from morphgen.rl.runs.robot_source import tasks_of
 
     tasks, num_goals = tasks_of(source), args.train_goals
     names = dict.fromkeys((*TASKS.builtin, *tasks))
@@ -312,7 +546,7 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
     Raises:
         TaskError: If an option has no effect.
     """
-    from morphgen.rl.agent_spec import owners_of, parse_constants
+    from morphgen.rl.runs.agent_spec import owners_of, parse_constants
 
     agent = config.policy.agent
     if args.whole and not AGENTS[agent].per_robot:
@@ -335,7 +569,7 @@ def execution_config(args: argparse.Namespace) -> ExecutionConfig:
     Raises:
         MissingDependencyError: If ``--wandb`` is given and Weights & Biases is not installed.
     """
-    from morphgen.rl.training import ExecutionConfig
+    from morphgen.rl.runs.training import ExecutionConfig
 
     minutes = getattr(args, "minutes", None)  # a study has none
     return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb, minutes)
@@ -348,3 +582,81 @@ def _folder_name(source: RobotSource) -> str:
     if source.side != "train":
         name += f"-{source.side}"
     return re.sub(r"[^\w./-]+", "-", name).strip("/.")
+
+
+@command(
+    "finetune",
+    "train a policy further, by default on the test robots of its split",
+    option("checkpoint", help=f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
+    split_option("other robots than those of the checkpoint's split"),
+    option("--on", choices=SIDES, default="test", help="side of the split"),
+    opt.OBSTACLES,
+    opt.SEED,
+    opt.sim_option("that of the training"),
+    GOAL_SEED,
+    opt.goal_option("that of the training"),
+    path_option(
+        "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
+    ),
+    RESUME,
+    MINUTES,
+    *(
+        on_off(name, f"{help} (default: as the checkpoint's run)")
+        for name, help in NETWORK_SWITCHES.items()
+    ),
+    on_off(
+        "curriculum",
+        "push: move the target line from near to far again (default: it stays far)",
+        default=False,
+    ),
+    # 64 is NUM_ENVS of morphgen.rl.runs.training, whose import takes seconds.
+    *learning_options(100_000, 64),
+    opt.LIBRARY,
+    details="The run begins with the networks of the checkpoint, and with a new optimiser and "
+    "schedule. The agent and most hyperparameters are the checkpoint's. The learning rate follows "
+    "the change of the policy, so that little of what it can do is lost.",
+    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 300000",),
+    extra="rl",
+)
+def finetune(args: argparse.Namespace) -> None:
+    """Train and print the path of the checkpoint."""
+    from morphgen.rl.runs.training import checkpoint_files
+
+    require_split_for_options(args)
+    files = list(checkpoint_files(checkpoint_path(args.checkpoint)))
+    if len(files) > 1:
+        raise TaskError(
+            f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
+        )
+    shipped = args.checkpoint in POLICIES
+    parent = Path("runs") / args.checkpoint if shipped else files[0].parent
+    folder = args.out or parent / "finetuned" / f"{args.on}-seed{args.seed}"
+    run_training(folder, _finetuning_config(files[0], args), args)
+
+
+def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
+    from morphgen.rl.config import PPOConfig
+    from morphgen.rl.runs.agent_spec import parse_constants
+    from morphgen.rl.runs.checkpoint import read_checkpoint
+    from morphgen.rl.runs.robot_source import other_side, tasks_of
+    from morphgen.rl.runs.training import finetuning_config
+
+    initial, _ = read_checkpoint(file)
+    if args.words:
+        source = robots_to_train(args.words, args)
+    else:
+        source = other_side(initial.source, args.on)
+    changes: dict[str, Any] = parse_constants(args.set)
+    if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
+        raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
+    switches = {name: getattr(args, name) for name in NETWORK_SWITCHES}
+    changes |= {name: value for name, value in switches.items() if value is not None}
+    changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
+    return replace(
+        finetuning_config(initial, source, str(file.resolve()), changes),
+        seed=args.seed,
+        sim=args.sim or initial.sim,
+        num_envs=args.envs,
+        device=args.device,
+        tasks=opt.with_goal(initial.tasks, args.goal, tasks_of(source)),
+    )

@@ -18,7 +18,7 @@ from morphgen.cli.options import LIBRARY
 from morphgen.processes import STOP_SIGNALS
 
 if TYPE_CHECKING:
-    from morphgen.viewer.app import Viewer
+    from morphgen.viewer.app.app import Viewer
 
 SIGNAL_POLL = 0.5
 """Longest delay before a signal is handled [s]."""
@@ -61,7 +61,7 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 )
 def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    from morphgen.viewer.app import serve
+    from morphgen.viewer.app.app import serve
 
     with suppress(KeyboardInterrupt), warnings.catch_warnings():
         # Work that ends after its browser has disconnected still writes to the page: harmless.

@@ -21,7 +21,7 @@ from morphgen.grammar.library import (
     shipped_folders,
 )
 from morphgen.grammar.manifest import PART_KINDS, PackageSource
-from morphgen.tasks.packaged_sets import FOLDER, packaged_index
+from morphgen.tasks.goals.goal_sets import FOLDER, packaged_index
 
 ROS_VARIABLES = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 """Environment variables with folders in which meshes of imported robots are searched first."""

@@ -22,8 +22,7 @@ import numpy as np
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.benchmark.token_layout import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES
-from morphgen.benchmark.tokens import tokens
+from morphgen.benchmark.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import CARD, write_bundle
 from morphgen.formats.files import file_sha256, folder_hashes
@@ -34,7 +33,7 @@ from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
 from morphgen.rl.shipped_policies import POLICIES
-from morphgen.tasks.packaged_sets import FOLDER, INDEX
+from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP
 
@@ -139,7 +138,7 @@ def score() -> float:
     score. The simulator ``kinematic`` has no library whose version matters.
     """
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
-    from morphgen.rl.robot_source import split_source
+    from morphgen.rl.runs.robot_source import split_source
 
     source = split_source(read_split(SCORED), side="test")
     config = EvalConfig(EPISODES, sim="kinematic")

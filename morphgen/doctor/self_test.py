@@ -166,7 +166,7 @@ def _picture(robot: Robot, bundle: Path) -> Entry:
 
 def _film(folder: Path) -> Entry:
     """Create MuJoCo's offscreen context, and write a film of two frames."""
-    from morphgen.tasks.renderer import write_video
+    from morphgen.tasks.render.renderer import write_video
 
     context = gl_context(*PICTURE_SIZE)
     context.free()

@@ -1,15 +1,103 @@
-"""The geometries that a robot's collision shapes can be replaced by, by name."""
+"""Robots with spheres as their collision shapes; fits are kept in the user's cache."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
 from morphgen.errors import FitError, nearest
-from morphgen.fitting.replace_collision import as_primitives
-from morphgen.model.robot import Robot
+from morphgen.fitting.replace_collision import (
+    as_primitives,
+    cached_fits,
+    fit_and_keep,
+    with_fits,
+    with_primitives,
+)
+from morphgen.formats.fits import FITTER_VERSION, MAX_PRIMITIVES, find_fit, read_stored_fits
+from morphgen.formats.srdf import BoundingSphere, LinkSpheres
+from morphgen.model.geometry import Shape, Sphere
+from morphgen.model.robot import Link, Robot
 from morphgen.processes import Progress, no_progress
+
+SPHERES = 8
+"""Default number of spheres per link."""
+MAX_SPHERES = MAX_PRIMITIVES
+"""Largest number of spheres per link."""
+_CACHE = "spheres-1"
+"""Folders in the cache begin so; the number rises when the same shapes get other spheres."""
+
+
+def as_spheres(
+    robot: Robot,
+    folders: Sequence[Path] = (),
+    *,
+    spheres: int = SPHERES,
+    cover: float | None = None,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> Robot:
+    """Return the robot with spheres as its collision shapes.
+
+    A link whose collision shapes are spheres already keeps them. The spheres of the others come
+    from the user's cache or from a new fit, about two seconds per link, which is then cached.
+    Masses, inertias and visuals stay; the pairs of links whose contacts are ignored are determined
+    again.
+
+    Args:
+        robot: The robot.
+        folders: Folders of parts, for the stored primitives of tokens.
+        spheres: Number of spheres per link.
+        cover: Share of a link's volume that its spheres must cover; None for the largest IoU.
+        jobs: Number of processes; the result does not depend on it.
+        progress: Receives the number of links that are fitted, and of all that need a fit.
+
+    Raises:
+        FitError: If a link has no volume to fit spheres to, or an argument is out of its range.
+        FormatError: If a stored or cached fit is malformed.
+        MeshError: If a mesh cannot be read.
+        RobotError: If a joint axis is zero.
+    """
+    from morphgen.fitting.link_fit import FitOptions  # imports torch, which takes seconds
+
+    options = FitOptions(spheres=spheres, cover=cover)
+    stored = read_stored_fits(folders)
+    links = [link for link in robot.links if link.collisions]
+    others = [link for link in links if not has_only_spheres(link.collisions)]
+    kind = f"{_CACHE}-{spheres}" if cover is None else f"{_CACHE}-{spheres}-{cover!r}"
+    fits = cached_fits(others, kind)
+    if missing := [link for link in others if link.name not in fits]:
+        fits |= fit_and_keep(robot, missing, options, kind, stored, jobs=jobs, progress=progress)
+    for link in links:
+        if has_only_spheres(link.collisions) and (fit := find_fit(link.collisions, robot, stored)):
+            fits[link.name] = fit
+    fitted = with_primitives(robot, {name: fit.collision for name, fit in fits.items()})
+    settings = {"fitter": FITTER_VERSION, "spheres": spheres, "cover": cover}
+    return replace(
+        with_fits(fitted, fits), provenance={**fitted.provenance, "primitives": settings}
+    )
+
+
+def has_only_spheres(shapes: Sequence[Shape]) -> bool:
+    """Return whether there are shapes, and all are spheres."""
+    return bool(shapes) and all(isinstance(shape.geometry, Sphere) for shape in shapes)
+
+
+def link_spheres(robot: Robot) -> tuple[LinkSpheres, ...]:
+    """Return the spheres of the links whose collision shapes are all spheres."""
+    return tuple(
+        LinkSpheres(link.name, tuple(_bounding_spheres(link)))
+        for link in robot.links
+        if has_only_spheres(link.collisions)
+    )
+
+
+def _bounding_spheres(link: Link) -> Iterator[BoundingSphere]:
+    for shape in link.collisions:
+        if isinstance(shape.geometry, Sphere):
+            yield BoundingSphere(shape.T_link_shape.position, shape.geometry.radius)
+
 
 Geometry = Literal["mesh", "primitive", "convex", "sphere"]
 """Collision shapes of a robot. ``mesh``: those of its parts, with meshes whose hulls simulators
@@ -45,7 +133,5 @@ def with_geometry(
 
         return as_convex(robot, folders, progress=progress)
     if geometry == "sphere":
-        from morphgen.fitting.sphere_robot import as_spheres  # reads SRDF
-
         return as_spheres(robot, folders, progress=progress)
     return robot

@@ -10,9 +10,8 @@ from typing import Literal, get_args
 from morphgen.errors import FitError
 from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
-from morphgen.fitting.search import best_several, best_single, sample_solid
+from morphgen.fitting.search import best_several, best_single, best_spheres, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.fitting.sphere_search import best_spheres
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model.geometry import Primitive, Shape, Sphere
 

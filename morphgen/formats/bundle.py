@@ -25,11 +25,11 @@ from morphgen.formats.files import (
     require_writable_folder,
 )
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
-from morphgen.formats.mjcf import mjcf_text
+from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import read_urdf
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.read import read_urdf
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
 from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts

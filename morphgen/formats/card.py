@@ -12,7 +12,7 @@ from msgspec import field
 from morphgen.errors import FormatError
 from morphgen.formats.records import FiniteNumber, Record, read_record
 from morphgen.formats.rounding import round_number
-from morphgen.formats.urdf import with_frames
+from morphgen.formats.urdf.read import with_frames
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.kinematics import arm_reach

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
-from morphgen.errors import FormatError
-from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.errors import FormatError, nearest
+from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.urdf import read_urdf, require_description_file
+from morphgen.formats.urdf.read import read_urdf, require_description_file
 from morphgen.formats.xml import root_tag
 from morphgen.model.robot import Robot
 
@@ -62,3 +66,85 @@ def is_mjcf(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return root_tag(file.read(_MAX_HEAD)) == "mujoco"
+
+
+MENAGERIE, DESCRIPTIONS = "mujoco_menagerie", "robot_descriptions"
+"""Modules of the packages."""
+_PATHS = ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")
+"""Names of the paths in a module of ``robot_descriptions``; the first one that exists is taken."""
+
+
+@dataclass(frozen=True)
+class NamedDescription:
+    """The file of a robot, and what its collection says about it."""
+
+    path: Path
+    args: Mapping[str, str] = field(default_factory=dict)
+    """Arguments of a xacro."""
+    licence: str = ""
+    """SPDX identifier of the robot's licence; empty if the collection does not say."""
+
+
+def find_description(text: str) -> NamedDescription:
+    """Return the file of a robot: of a collection, or the path itself.
+
+    Args:
+        text: ``COLLECTION:NAME`` with a key of ``COLLECTIONS``, or a path.
+
+    Raises:
+        FormatError: If the package is not installed, has no such robot, or cannot download it.
+    """
+    collection, colon, name = text.partition(":")
+    if not colon or collection not in COLLECTIONS:
+        return NamedDescription(Path(text))
+    return COLLECTIONS[collection](name)
+
+
+def _of_menagerie(name: str) -> NamedDescription:
+    """Return a model of MuJoCo Menagerie: ``ROBOT``, or ``ROBOT/MODEL`` of a robot with several."""
+    if find_spec(MENAGERIE) is None:
+        raise FormatError(f"menagerie:{name}: pip install mujoco-menagerie, which has its robots")
+    package = import_module(MENAGERIE)
+    robot_name, _, model = name.partition("/")
+    if robot_name not in package.names():
+        raise FormatError(
+            f"menagerie:{name}: no robot {robot_name!r}{nearest(robot_name, package.names())}"
+        )
+    robot = package.get(robot_name)
+    models = [entry.name for entry in robot.entry_points if entry.kind == "robot"]
+    model = model or robot.default_model
+    if model not in models:
+        raise FormatError(f"menagerie:{name}: no model {model!r}{nearest(model, models)}")
+    try:
+        return NamedDescription(Path(robot.xml(model)), licence=robot.license)
+    except package.MenagerieError as error:
+        raise FormatError(f"menagerie:{name}: {error}") from error
+
+
+def _of_descriptions(name: str) -> NamedDescription:
+    """Return the file of a module of ``robot_descriptions``."""
+    spec = find_spec(DESCRIPTIONS)
+    if spec is None:
+        raise FormatError(
+            f"{DESCRIPTIONS}:{name}: pip install {DESCRIPTIONS}, which has its robots"
+        )
+    modules = pkgutil.iter_modules(spec.submodule_search_locations)
+    names = [module.name for module in modules if module.name.endswith("_description")]
+    if name not in names:
+        raise FormatError(f"{DESCRIPTIONS}:{name}: no such robot{nearest(name, names)}")
+    try:
+        module = import_module(f"{DESCRIPTIONS}.{name}")
+    except Exception as error:  # whatever the package's download raises, such as GitCommandError
+        raise FormatError(f"{DESCRIPTIONS}:{name}: cannot be loaded: {error}") from error
+    for key in _PATHS:
+        if path := getattr(module, key, None):
+            args = getattr(module, "XACRO_ARGS", {}) if key == "XACRO_PATH" else {}
+            return NamedDescription(Path(path), {name: str(args[name]) for name in args})
+    raise FormatError(f"{DESCRIPTIONS}:{name}: the module has none of {', '.join(_PATHS)}")
+
+
+COLLECTIONS: dict[str, Callable[[str], NamedDescription]] = {
+    "menagerie": _of_menagerie,
+    DESCRIPTIONS: _of_descriptions,
+}
+"""Functions that find a robot by its name, by the name of the collection."""

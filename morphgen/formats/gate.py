@@ -18,17 +18,17 @@ from lxml import etree
 from morphgen.formats.bundle import MJCF, URDF, mesh_file
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.description import is_mjcf
-from morphgen.formats.mjcf_compile import compile_document
-from morphgen.formats.mjcf_document import read_document, remove_element
+from morphgen.formats.mjcf.compile import compile_document
+from morphgen.formats.mjcf.document import read_document, remove_element
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
-from morphgen.formats.urdf import (
+from morphgen.formats.urdf.read import (
     MAX_URDF_BYTES,
     require_description_file,
     resolved_meshes,
     robot_from_xml,
 )
-from morphgen.formats.urdf_schema import CHILDREN
-from morphgen.formats.xacro import expand
+from morphgen.formats.urdf.schema import CHILDREN
+from morphgen.formats.xacro.expand import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.geometry import Mesh
 

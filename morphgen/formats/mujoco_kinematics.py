@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array

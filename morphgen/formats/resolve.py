@@ -17,7 +17,7 @@ from typing import Literal
 from urllib.parse import unquote
 
 from morphgen.errors import FormatError
-from morphgen.formats.xacro_functions import RefusedError
+from morphgen.formats.xacro.evaluator import RefusedError
 
 REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
 """pip requirement of each distribution that provides robot files."""

@@ -10,7 +10,7 @@ from lxml import etree
 
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import MESHES, bundle_folder, split_colours, write_meshes
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model.robot import Robot
 
 _FOLDERS = ("config", "launch", "urdf")

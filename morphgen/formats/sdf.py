@@ -8,7 +8,7 @@ from lxml import etree
 
 from morphgen.errors import FormatError
 from morphgen.formats.rounding import format_inertia, format_number, rounded_axis, rounded_pose
-from morphgen.formats.urdf_text import BOUND_INERTIA, BOUND_MASS, MeshUri
+from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS, MeshUri
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from morphgen.errors import FormatError
 from morphgen.formats.quiet import quiet
-from morphgen.formats.urdf_text import BOUND_INERTIA, BOUND_MASS
+from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 
 
 def convert_urdf(urdf: Path, folder: Path) -> Path:

@@ -11,7 +11,7 @@ from morphgen.errors import CompositionError, nearest
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
-from morphgen.grammar.parameters import MOUNT_YAW, MOUNT_YAW_PARAMETER, require_range
+from morphgen.grammar.manifest import MOUNT_YAW, MOUNT_YAW_PARAMETER, require_range
 from morphgen.grammar.part import Part, load_part
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair

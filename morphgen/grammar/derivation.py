@@ -18,7 +18,7 @@ from lark.visitors import Transformer_NonRecursive
 
 from morphgen.errors import GrammarError
 from morphgen.formats.rounding import format_number
-from morphgen.grammar.limits import MAX_DERIVATION_TEXT, MAX_PARTS
+from morphgen.grammar.syntax import MAX_DERIVATION_TEXT, MAX_PARTS
 
 _SYNTAX = r"""
 node: NAME "=" NAME ["(" value ("," value)* ")"] ["[" child ("," child)* "]"]

@@ -10,9 +10,10 @@ from importlib.resources import files
 from pathlib import Path
 
 from morphgen.errors import GrammarError, nearest
-from morphgen.grammar.conditions import require_condition
-from morphgen.grammar.limits import MAX_FILES, MAX_STATEMENTS, MAX_TEXT
 from morphgen.grammar.syntax import (
+    MAX_FILES,
+    MAX_STATEMENTS,
+    MAX_TEXT,
     Alternative,
     Expression,
     Include,
@@ -24,6 +25,7 @@ from morphgen.grammar.syntax import (
     Where,
     parse_grammar,
 )
+from morphgen.grammar.values import require_condition
 
 SUFFIX = ".grammar"
 

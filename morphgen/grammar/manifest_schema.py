@@ -24,9 +24,9 @@ from morphgen.grammar.manifest import (
     FrameSpec,
     Manifest,
     PackageSource,
+    Parameter,
     Scaling,
 )
-from morphgen.grammar.parameters import Parameter
 
 SCHEMA_FILE = Path(__file__).with_name("manifest.schema.json")
 """The schema, as editors read it."""

@@ -14,15 +14,19 @@ from morphgen.checks import check
 from morphgen.errors import GrammarError, MorphgenError
 from morphgen.formats.fits import with_stored_fits
 from morphgen.formats.rounding import round_number
-from morphgen.grammar.choosers import Choices, RandomChooser, RecordedChooser
 from morphgen.grammar.compose import MAX_HOME_OVERLAP, join, survey_contacts
-from morphgen.grammar.conditions import RobotProperties, clauses, holds
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import TooManyPartsError, derive
+from morphgen.grammar.derive import (
+    Choices,
+    RandomChooser,
+    RecordedChooser,
+    TooManyPartsError,
+    derive,
+)
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.limits import MAX_PARTS
-from morphgen.grammar.syntax import Expression
+from morphgen.grammar.syntax import MAX_PARTS, Expression
+from morphgen.grammar.values import RobotProperties, clauses, holds
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 

@@ -11,8 +11,7 @@ from collections.abc import Callable
 import torch
 
 from morphgen.model.inverse_kinematics import DAMPING, MAX_STEP
-from morphgen.model.kinematics_torch import FrameChain, frame_jacobian
-from morphgen.model.rotation_torch import rotvec_from_matrix
+from morphgen.model.kinematics_torch import FrameChain, frame_jacobian, rotvec_from_matrix
 
 ROTATION_DAMPING = 0.1
 """Damping of rotations [joint units per radian]."""

@@ -56,7 +56,7 @@ class Agent:
     proprioceptive_only: bool = False
     """Hide the robot's morphology from the networks; joint positions stay visible."""
     preset: str = "paper"
-    """Name of the preset that training begins with, in ``morphgen.rl.presets.PRESETS``."""
+    """Name of the preset that training begins with, in ``morphgen.rl.runs.presets.PRESETS``."""
     any_size: bool = False
     """Whether no weight belongs to the number of a link, so that a policy acts on larger robots."""
     channels: tuple[str, ...] = ()

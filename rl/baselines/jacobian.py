@@ -10,7 +10,7 @@ import torch
 
 from morphgen.model.inverse_kinematics_torch import pose_task
 from morphgen.model.kinematics_torch import frame_jacobian
-from morphgen.rl.baselines.reach_goals import reach_goals
+from morphgen.rl.baselines.ik import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import joint_to_link

@@ -21,9 +21,8 @@ from morphgen.model.kinematics_torch import frame_pose
 from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner, Tree
 from morphgen.rl.baselines.push_contacts import PreContact, find_contacts, overhang, touches
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.feasibility import sample_tools_in_box
-from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.push.starts import PushStartSet, sample_tools_in_box
+from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import GRAVITY, Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError
-from morphgen.tasks.config_checks import require_task_config
+from morphgen.tasks.task import require_task_config
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goal_choices import GoalChoices
+from morphgen.tasks.goals.goal_choices import GoalChoices
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet, require_pushable

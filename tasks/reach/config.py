@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError, nearest
-from morphgen.tasks.config_checks import require_task_config
 from morphgen.tasks.reach import GOAL_KINDS
+from morphgen.tasks.task import require_task_config
 
 
 @dataclass(frozen=True)

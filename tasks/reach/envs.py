@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
-from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
+from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goal_choices import GoalChoices
+from morphgen.tasks.goals.goal_choices import GoalChoices
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import reachable_configuration

@@ -18,10 +18,14 @@ from morphgen.model.geometry import Pose
 from morphgen.model.inverse_kinematics import solve_pose_ik, solve_position_ik
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
-from morphgen.tasks.cspace_components import cspace_components, in_other_component
-from morphgen.tasks.free_space import FreeSpace, outside_limits
-from morphgen.tasks.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
+from morphgen.tasks.free_space import (
+    FreeSpace,
+    cspace_components,
+    in_other_component,
+    outside_limits,
+)
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 

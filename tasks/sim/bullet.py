@@ -25,8 +25,8 @@ from morphgen.tasks.sim.bullet_workers import (
     send,
     start,
 )
+from morphgen.tasks.sim.motor_law import TensorView, all_finite, mask_of
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
-from morphgen.tasks.sim.short_arrays import TensorView, all_finite, mask_of
 from morphgen.typing import Array
 
 BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]

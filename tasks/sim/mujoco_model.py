@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.dynamics import armature, movable_mass_matrix
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot

@@ -1,9 +1,10 @@
-"""MuJoCo as a simulator: one ``MjData`` for every environment, stepped by threads."""
+"""State of MuJoCo environments as tensors: joints and blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -12,8 +13,10 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.formats.mujoco_warnings import MujocoWarnings
+from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import (
+    CONTROL_PERIOD,
     SUBSTEPS,
     TIMESTEP,
     Contacts,
@@ -21,11 +24,240 @@ from morphgen.tasks.sim.base import (
     Simulator,
     require_reset_shapes,
 )
-from morphgen.tasks.sim.mujoco_control import PositionControl
-from morphgen.tasks.sim.mujoco_model import worlds
-from morphgen.tasks.sim.mujoco_state import MujocoState
-from morphgen.tasks.sim.short_arrays import TensorView, all_finite, mask_of
+from morphgen.tasks.sim.motor_law import (
+    CONTROL_STEP,
+    GAIN,
+    TensorView,
+    all_finite,
+    clamp,
+    farthest_targets,
+    is_within,
+    mask_of,
+)
+from morphgen.tasks.sim.mujoco_model import PASSIVE, World, worlds
 from morphgen.typing import Array
+
+MAX_SPEED = 1e4
+"""Speed above which a simulation counts as diverged [rad/s or m/s]."""
+_TOO_FAST = f"diverged: a velocity is not finite or beyond {MAX_SPEED:g}"
+_NO_MEMORY = "diverged: its contacts do not fit into MuJoCo's memory"
+_FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
+
+
+class GatheredArrays:
+    """Arrays of all environments, copied one after the other into one array.
+
+    One call copies them all: a call for every environment would take a tenth of its physics. The
+    last element is a zero, for padding.
+    """
+
+    def __init__(self, arrays: Sequence[Array]) -> None:
+        """Allocate the memory; ``read`` copies.
+
+        Args:
+            arrays: One-dimensional arrays to copy at every ``read``.
+        """
+        self._arrays = [*arrays, np.zeros(1)]
+        ends = np.cumsum([len(array) for array in self._arrays])
+        self.begin = np.concatenate([[0], ends[:-1]])
+        """Index in ``flat`` where each array begins."""
+        self.flat = np.zeros(ends[-1])
+
+    def read(self) -> None:
+        """Copy the arrays into ``flat``."""
+        np.concatenate(self._arrays, out=self.flat)
+
+
+class MujocoState:
+    """Tensors of joints and blocks, gathered from the data of all environments at once."""
+
+    def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
+        """Prepare; ``read`` fills the tensors.
+
+        Args:
+            worlds: Model of each environment, n of them.
+            data: Data of each environment.
+        """
+        n, joints = len(worlds), max(world.robot.dof for world in worlds)
+        blocks = [i for i, world in enumerate(worlds) if world.block is not None]
+        poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
+        self._positions = GatheredArrays([*(env_data.qpos for env_data in data), *poses])
+        self._velocities = GatheredArrays([env_data.qvel for env_data in data])
+        self._warnings = GatheredArrays([env_data.warning.number for env_data in data])
+        self._q_at = np.full((n, joints), -1)
+        self._qd_at = np.full((n, joints), -1)
+        self._pose_at = np.full((n, 7), -1)
+        self._velocity_at = np.full((n, 6), -1)
+        for i, world in enumerate(worlds):
+            dof = world.robot.dof
+            self._q_at[i, :dof] = self._positions.begin[i] + world.q_at
+            self._qd_at[i, :dof] = self._velocities.begin[i] + world.qd_at
+            if world.block_moves:
+                self._velocity_at[i] = self._velocities.begin[i] + world.block_qd_at + np.arange(6)
+        for k, i in enumerate(blocks):
+            self._pose_at[i, :3] = self._positions.begin[n + 2 * k] + np.arange(3)
+            self._pose_at[i, 3:] = self._positions.begin[n + 2 * k + 1] + np.arange(4)
+        self._has_blocks = bool(blocks)
+        self._q, self._qd = np.zeros((2, n, joints), np.float32)
+        self._block_pose = np.zeros((n, 7), np.float32)
+        self._exact_pose = np.zeros((n, 7))
+        self.q, self.qd = torch.from_numpy(self._q), torch.from_numpy(self._qd)
+        self.block_pose = torch.from_numpy(self._block_pose)
+
+    @property
+    def velocities(self) -> Array:
+        """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
+        return self._velocities.flat
+
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Linear and angular velocities of the blocks in the world at the last ``read``, (n, 6)."""
+        if not self._has_blocks:
+            return torch.zeros(len(self._velocity_at), 6)
+        velocity = self._velocities.flat[self._velocity_at]
+        quaternion, angular = self._exact_pose[:, 3:], velocity[:, 3:]
+        # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
+        # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
+        w, axis = quaternion[:, :1], quaternion[:, 1:]
+        twice = 2 * np.cross(axis, angular)
+        angular[:] = angular + w * twice + np.cross(axis, twice)
+        return torch.from_numpy(velocity.astype(np.float32))
+
+    def joints(self) -> tuple[Array, Array]:
+        """Return joint positions and velocities at the last ``read``, shape (n, J) each."""
+        return self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
+
+    def read(self) -> None:
+        """Update the tensors from the data."""
+        self._positions.read()
+        self._velocities.read()
+        self._q[:], self._qd[:] = self.joints()
+        if self._has_blocks:
+            self._exact_pose = self._positions.flat[self._pose_at]
+            quaternion = self._exact_pose[:, 3:]
+            quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
+            self._block_pose[:] = self._exact_pose
+
+    def faults(self) -> dict[int, str]:
+        """Return the environments that diverged, each with the reason.
+
+        Their contacts do not fit into MuJoCo's memory, or they have a velocity that is not finite
+        or beyond ``MAX_SPEED``.
+        """
+        self._warnings.read()
+        if is_within(self._velocities.flat, MAX_SPEED) and is_within(self._warnings.flat, 0):
+            return {}
+        warnings = self._warnings.flat[:-1].reshape(len(self._q), -1)
+        speeds = np.abs(self._velocities.flat)
+        begin = self._velocities.begin
+        slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
+        full = np.asarray(warnings[:, _FULL].any(axis=1))
+        diverged = ~np.array(slow) | warnings.any(axis=1)
+        return {
+            env: _NO_MEMORY if full[env] else _TOO_FAST
+            for env in np.flatnonzero(full | diverged).tolist()
+        }
+
+    def release(self) -> None:
+        """Release the environments' data."""
+        self._positions = self._velocities = self._warnings = GatheredArrays(())
+
+
+BY_ERROR = CONTROL_STEP[1, 0] / CONTROL_PERIOD
+BY_VELOCITY = (CONTROL_STEP[1, 1] - 1) / CONTROL_PERIOD
+"""Mean acceleration in a control step per unit of initial error and initial velocity."""
+
+
+class PositionControl:
+    """Controls that make every joint follow the law of ``morphgen.model.dynamics``.
+
+    An actuator whose gains assume the joint's own inertia at home follows the law at home, as long
+    as nothing else moves. The missing force M(q) a - I a + c(q, v), with the law's acceleration a,
+    the joint-space inertia M, the inertia I that the gains assume and Coriolis forces c, is added
+    through the targets (inverse dynamics control; Siciliano et al. 2009, 8.5.2). It is computed
+    once per control step, with the mean of a over the step; the actuator does the rest in every
+    physics step. The actuator's effort limits the sum. With the gains alone, arms would leave the
+    path of the law by centimetres within a second.
+
+    A joint's speed limit v keeps its target within ``LAG`` v of its position. A target that moves
+    no faster is never farther away; one that is, because something holds the joint, does not pull
+    harder.
+
+    MuJoCo drops the implicit damping of an actuator at its effort limit. Light links at the end of
+    a long chain with a strong motor then diverge at a time step of 5 ms. So the fraction
+    ``PASSIVE`` of the damping belongs to the joints, which have no limit, and a torque compensates
+    it at the velocity with which the control step began.
+    """
+
+    def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData], joints: int) -> None:
+        """Prepare.
+
+        Args:
+            worlds: Model of each environment, n of them.
+            data: Data of each environment.
+            joints: Number of independent joints with padding, J.
+        """
+        self._shape = (len(worlds), joints)
+        bias = [env_data.qfrc_bias for env_data in data]
+        weight = [env_data.qfrc_gravcomp for env_data in data]
+        self._data_forces = GatheredArrays([*bias, np.zeros(1), *weight])  # one call reads both
+        self._bias, self._weight = np.split(self._data_forces.flat, 2)
+        self._applied, self._acceleration, self._force = np.zeros((3, len(self._bias)))
+        self._products: list[tuple[mujoco.MjModel, mujoco.MjData, Array, Array]] = []
+        self._compliance = np.zeros(self._shape)
+        self._farthest = np.zeros(self._shape)
+        self._damping = GatheredArrays([world.model.dof_damping for world in worlds])
+        self._damping.read()
+        slots, leaders, gains = [], [], []
+        for i, (world, env_data) in enumerate(zip(worlds, data, strict=True)):
+            begin, end = self._data_forces.begin[i : i + 2].tolist()
+            force, acceleration = self._force[begin:end], self._acceleration[begin:end]
+            self._products.append((world.model, env_data, force, acceleration))
+            self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
+            robot = world.robot
+            self._farthest[i, : robot.dof] = farthest_targets(robot, robot.independent_joints)
+            matrix, _ = world.robot.mimic_map
+            rows, columns = np.nonzero(matrix)
+            slots.append(begin + world.movable_qd_at[rows])
+            leaders.append(i * joints + columns)
+            gains.append(matrix[rows, columns])
+        self._slots, self._leaders = np.concatenate(slots), np.concatenate(leaders)
+        self._gains = np.concatenate(gains)
+
+    def applied_to(self, env: int) -> Array:
+        """Return the extra forces on an environment's degrees of freedom, shape (nv,); a view."""
+        begin, end = self._data_forces.begin[env : env + 2].tolist()
+        return self._applied[begin:end]
+
+    def controls(self, targets: Array, q: Array, qd: Array, velocities: Array, out: Array) -> None:
+        """Compute the controls of all actuators from the data as the last step left them.
+
+        Args:
+            targets: Targets of the independent joints, shape (n, J); padding is zero.
+            q: Positions of the independent joints, shape (n, J).
+            qd: Velocities of the independent joints, shape (n, J).
+            velocities: ``qvel`` of all environments, concatenated, and a zero.
+            out: Receives the controls, shape (n, J).
+        """
+        error = clamp(targets - q, self._farthest)
+        mean_acceleration = BY_ERROR * error + BY_VELOCITY * qd
+        self._acceleration[self._slots] = self._gains * mean_acceleration.ravel()[self._leaders]
+        for model, data, force, acceleration in self._products:
+            mujoco.mj_mulM(model, data, force, acceleration)
+        self._data_forces.read()
+        force = self._force + self._bias - self._weight
+        leader_forces = np.bincount(
+            self._leaders, self._gains * force[self._slots], minlength=mean_acceleration.size
+        )
+        np.multiply(leader_forces.reshape(self._shape), self._compliance, out=out)
+        out += q + error - PASSIVE * 2 / BANDWIDTH * qd - mean_acceleration / (GAIN * BANDWIDTH**2)
+        np.multiply(self._damping.flat, velocities, out=self._applied)
+
+    def release(self) -> None:
+        """Release the environments' data."""
+        self._products = []
+        self._data_forces = GatheredArrays(())
+
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 """Environment with its model and data; views of its actuator controls in the data and in the batch,

@@ -6,9 +6,8 @@ import warp as wp
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.motor_law import GAIN
-from morphgen.tasks.sim.mujoco_control import BY_ERROR, BY_VELOCITY
 from morphgen.tasks.sim.mujoco_model import PASSIVE
-from morphgen.tasks.sim.mujoco_state import MAX_SPEED
+from morphgen.tasks.sim.mujoco_sim import BY_ERROR, BY_VELOCITY, MAX_SPEED
 
 wp.set_module_options({"enable_backward": False})  # half of the code to compile
 

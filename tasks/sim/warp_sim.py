@@ -1,31 +1,444 @@
-"""MuJoCo Warp as a simulator: all environments of one structure step in the same kernels."""
+"""Scenes as models of MuJoCo Warp: scenes of one structure share a model with rows of numbers."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
+import mujoco
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, SimulationError
 
 try:
+    import mujoco_warp
     import warp as wp
-    from mujoco_warp import OverflowType
+    from mujoco_warp import Data, Model, OverflowType
 except ModuleNotFoundError as error:
     raise MissingDependencyError(
         f"simulator 'warp' needs MuJoCo Warp: {error}; install it with: pip install 'morphgen[gpu]'"
     ) from error
+
+from morphgen.tasks.sim import warp_kernels as kernels
 from morphgen.tasks.sim.base import (
+    SUBSTEPS,
     Contacts,
     Scene,
     Simulator,
     require_reset_shapes,
 )
+from morphgen.tasks.sim.motor_law import farthest_targets
 from morphgen.tasks.sim.mujoco_model import World, worlds
-from morphgen.tasks.sim.warp_group import Group
-from morphgen.tasks.sim.warp_model import structures
+
+UNUSED = frozenset({"dof_length", "key_time", "key_qpos", "key_qvel", "key_act", "key_ctrl"})
+"""Fields of a model that no step reads: sleeping is off, and keyframes are not used."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Environments whose models differ only in numbers that MuJoCo Warp has for every world."""
+
+    worlds: tuple[World, ...]
+    """Compiled scenes, R of them: the one of world w is ``worlds[w % R]``."""
+    envs: NDArray[np.int64]
+    """Environment of each world, shape (w,)."""
+    batched: dict[str, NDArray[Any]]
+    """Rows of the fields of the model that differ, R rows each."""
+
+
+@dataclass
+class _Group:
+    """A structure while its environments are collected."""
+
+    first: World
+    """Compiled scene with which the others are compared."""
+    size: int = 0
+    """Number of different compiled scenes."""
+    batched: dict[str, None] = field(default_factory=dict)
+    """Names of the fields in which they differ."""
+    envs: list[int] = field(default_factory=list)
+    """Environments."""
+
+
+def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
+    """Group environments by the structure of their models.
+
+    Two models have one structure if all fields that MuJoCo Warp holds once for all worlds are
+    equal: the tree, the types of joints, geoms and actuators, the pairs of geoms that are tested,
+    and meshes. Masses, poses, sizes, limits and gains may differ.
+
+    Args:
+        scenes: Scene of each environment.
+        compiled: Compiled scene of each environment; those that share one are the same object.
+
+    Raises:
+        SimulationError: If MuJoCo Warp does not support a model.
+    """
+    models: dict[int, Model] = {}
+    groups: list[_Group] = []
+    group_of_world: dict[int, _Group] = {}
+    for env, world in enumerate(compiled):
+        if id(world) not in group_of_world:
+            models[id(world)] = model = _warp_model(world, scenes[env])
+            for group in groups:
+                names = _differences(models[id(group.first)], model)
+                if all(map(_is_batched, names)) and _same_indices(group.first, world):
+                    group.batched.update(dict.fromkeys(names))
+                    break
+            else:
+                group = _Group(world)
+                groups.append(group)
+            group.size += 1
+            group_of_world[id(world)] = group
+        group_of_world[id(world)].envs.append(env)
+    found = []
+    for group in groups:
+        rows = _cyclic_rows([compiled[env] for env in group.envs], group.size)
+        batched = {
+            name: np.concatenate([getattr(models[id(world)], name).numpy() for world in rows])
+            for name in group.batched
+        }
+        found.append(Structure(rows, np.array(group.envs, dtype=np.int64), batched))
+    return found
+
+
+def put_model(structure: Structure, device: str) -> Model:
+    """Return the model of a structure on a device, with a row of numbers for each of its worlds.
+
+    Args:
+        structure: The structure.
+        device: Name of the device of Warp.
+    """
+    rows = len(structure.worlds)
+    with wp.ScopedDevice(device):
+        model = mujoco_warp.put_model(
+            _prepared(structure.worlds[0].model), dict.fromkeys(structure.batched, rows)
+        )
+        for name, values in structure.batched.items():
+            getattr(model, name).assign(values)
+    model.opt.warn_overflow = 0  # it prints; ``WarpSimulation`` counts
+    return model
+
+
+def _prepared(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Clear the flag that MuJoCo Warp refuses: it never resets on its own."""
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return model
+
+
+def _warp_model(world: World, scene: Scene) -> Model:
+    """Return a scene's model on the CPU.
+
+    Raises:
+        SimulationError: If MuJoCo Warp does not support it.
+    """
+    try:
+        with wp.ScopedDevice("cpu"):
+            return mujoco_warp.put_model(_prepared(world.model))
+    except (NotImplementedError, ValueError) as error:
+        raise SimulationError(
+            f"robot {scene.robot.name!r}: MuJoCo Warp refuses the scene: {error}"
+        ) from error
+
+
+def _is_batched(name: str) -> bool:
+    """Return whether a field of the model has numbers for every world."""
+    spec = _FIELDS[name]
+    return getattr(spec, "shape", ("",))[:1] == ("*",)
+
+
+_FIELDS: dict[str, Any] = {f.name: f.type for f in fields(Model)}
+
+
+def _differences(first: Model, other: Model) -> list[str]:
+    """Return the names of the fields in which two models differ."""
+    return [
+        name
+        for name in _FIELDS
+        if name not in UNUSED and not _equal(getattr(first, name), getattr(other, name))
+    ]
+
+
+def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
+    """Return whether two values of a model's field are equal."""
+    if isinstance(a, wp.array):
+        first, other = a.numpy(), b.numpy()
+        return bool(first.shape == other.shape and first.tobytes() == other.tobytes())
+    if isinstance(a, np.ndarray):
+        return bool(a.shape == b.shape and a.tobytes() == b.tobytes())
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b, strict=True))
+    if is_dataclass(a):
+        return all(_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    return bool(a == b)
+
+
+def _same_indices(first: World, other: World) -> bool:
+    """Return whether two worlds have joints, block and obstacles at the same indices."""
+    return (
+        np.array_equal(first.q_at, other.q_at)
+        and np.array_equal(first.qd_at, other.qd_at)
+        and np.array_equal(first.movable_q_at, other.movable_q_at)
+        and np.array_equal(first.movable_qd_at, other.movable_qd_at)
+        and first.block == other.block
+        and np.array_equal(first.obstacles, other.obstacles)
+        and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
+    )
+
+
+def dof_leaders(world: World) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+    """Return what each degree of freedom of a model follows.
+
+    Returns:
+        Independent joint that it follows, -1 for a block's; its gain; and its offset [rad or m],
+        shape (nv,) each.
+    """
+    matrix, offset = world.robot.mimic_map
+    leader = np.full(world.model.nv, -1, dtype=np.int32)
+    gain, shift = np.zeros((2, world.model.nv))
+    # A joint that mimics one that cannot move has no leader: it stays, with a gain of zero.
+    leader[world.movable_qd_at] = np.abs(matrix).argmax(axis=1)
+    gain[world.movable_qd_at] = matrix[np.arange(len(matrix)), leader[world.movable_qd_at]]
+    shift[world.movable_qd_at] = offset
+    return leader, gain, shift
+
+
+def _cyclic_rows(worlds: Sequence[World], distinct: int) -> tuple[World, ...]:
+    """Return rows such that world w has row w % R: few if the worlds repeat, else one each."""
+    rows = tuple(worlds[:distinct])
+    if all(world is rows[i % len(rows)] for i, world in enumerate(worlds)):
+        return rows
+    return tuple(worlds)
+
+
+CONTACTS_PER_WORLD, FEWEST_CONTACTS = 24, 1024
+"""Number of contacts that the memory of a group holds: for each world on average, and at least."""
+IGNORED_OVERFLOW = int(
+    OverflowType.EPA_HORIZON
+    | OverflowType.CONTACT_MATCH
+    | OverflowType.ITERATIONS
+    | OverflowType.LS_ITERATIONS
+)
+"""Overflows that lose no contact.
+
+Two are not about memory: the solver, or its line search, stopped at its number of iterations. It
+then goes on with the last forces, as MuJoCo does; in single precision many worlds that press links
+together never reach the tolerance.
+"""
+
+
+class Group:
+    """Environments of one structure: a model, and the data of its worlds."""
+
+    def __init__(
+        self, structure: Structure, number: int, device: str, buffers: dict[str, wp.array]
+    ) -> None:
+        """Put the structure's worlds on the device; ``WarpSimulation`` resets them.
+
+        Args:
+            structure: The environments and their models.
+            number: Number of the group.
+            device: Name of the device of Warp.
+            buffers: Arrays of all environments, see ``WarpSimulation``.
+        """
+        self._buffers, self._number = buffers, number
+        first = structure.worlds[0]
+        model = first.model
+        count = len(structure.envs)
+        contact_rows = 3 * max_contacts(model.ngeom)  # a normal and two tangents
+        rows = int(model.neq + np.count_nonzero(model.jnt_limited) + contact_rows)
+        with wp.ScopedDevice(device):
+            self.model = put_model(structure, device)
+            self.data = mujoco_warp.make_data(
+                model,
+                nworld=count,
+                naconmax=max(count * CONTACTS_PER_WORLD, FEWEST_CONTACTS),
+                njmax=rows,
+            )
+            _put_static_geoms(self.data, structure.worlds, count)
+            self._joints, self._things = _joints(structure), _things(first)
+            self._acceleration = wp.zeros((count, model.nv), dtype=float)
+            self._force = wp.zeros((count, model.nv), dtype=float)
+
+    def step(self) -> None:
+        """Launch the kernels of a control step.
+
+        The control law sees the joint-space inertia and the Coriolis forces of the state that it
+        acts on: MuJoCo computes them in the first half of a physics step.
+        """
+        mujoco_warp.step1(self.model, self.data)
+        self._launch_control()
+        mujoco_warp.step2(self.model, self.data)
+        for _ in range(SUBSTEPS - 1):
+            mujoco_warp.step(self.model, self.data)
+        self.read()
+        self._find_diverged()
+
+    def step_library(self) -> None:
+        """Launch the library's kernels of a control step alone, for ``benchmarks/gpu_speed.py``.
+
+        Targets are the controls of the actuators, without the forces of inverse dynamics.
+        """
+        wp.launch(
+            kernels.targets_as_controls,
+            self.data.ctrl.shape,
+            [self._joints, self._buffers["targets"]],
+            [self.data.ctrl],
+        )
+        for _ in range(SUBSTEPS):
+            mujoco_warp.step(self.model, self.data)
+
+    def _launch_control(self) -> None:
+        """Compute the controls of the actuators from the targets."""
+        data, targets = self.data, self._buffers["targets"]
+        dofs = self._acceleration.shape
+        wp.launch(
+            kernels.accelerations,
+            dofs,
+            [self._joints, targets, data.qpos, data.qvel, self.model.dof_damping],
+            [self._acceleration, data.qfrc_applied],
+        )
+        mujoco_warp.mul_m(self.model, data, self._force, self._acceleration)
+        wp.launch(
+            kernels.controls,
+            data.ctrl.shape,
+            [
+                self._joints,
+                targets,
+                data.qpos,
+                data.qvel,
+                self._force,
+                data.qfrc_bias,
+                data.qfrc_gravcomp,
+            ],
+            [data.ctrl],
+        )
+
+    def read(self) -> None:
+        """Write the state into the buffers."""
+        data, out = self.data, self._buffers
+        wp.launch(
+            kernels.read_state,
+            data.nworld,
+            [
+                self._joints,
+                self._things,
+                data.qpos,
+                data.qvel,
+                data.mocap_pos,
+                data.mocap_quat,
+            ],
+            [out["q"], out["qd"], out["block_pose"], out["block_velocity"]],
+        )
+
+    def _find_diverged(self) -> None:
+        """Mark the environments that diverged in the step, and count them."""
+        data, out = self.data, self._buffers
+        wp.launch(
+            kernels.find_diverged,
+            data.nworld,
+            [
+                self._joints,
+                IGNORED_OVERFLOW,
+                self._number,
+                out["targets"],
+                data.qpos,
+                data.qvel,
+                data.overflow,
+            ],
+            [out["overflow"], out["diverged"], out["counts"]],
+        )
+
+    def reset(self, obstacle_poses: wp.array) -> None:
+        """Reset the worlds that the buffers mark, to the state in the buffers."""
+        data, state = self.data, self._buffers
+        wp.launch(
+            kernels.reset_worlds,
+            data.nworld,
+            [
+                self._joints,
+                self._things,
+                state["mask"],
+                state["reset_q"],
+                state["reset_pose"],
+                obstacle_poses,
+            ],
+            [
+                data.qpos,
+                data.qvel,
+                data.qacc_warmstart,
+                data.mocap_pos,
+                data.mocap_quat,
+                data.overflow,
+            ],
+        )
+
+
+def max_contacts(num_shapes: int) -> int:
+    """Return how many contacts a world may have; with more it diverges.
+
+    Trained arms that push had up to 1.3 contacts for each shape in MuJoCo.
+
+    Args:
+        num_shapes: Number of shapes of the robot, its block, obstacles and ground together.
+    """
+    return max(48, 2 * num_shapes)
+
+
+def _put_static_geoms(data: Data, rows: Sequence[World], count: int) -> None:
+    """Write the poses of static geoms: MuJoCo Warp computes them once, from the first model."""
+    poses = []
+    for world in rows:
+        rest = mujoco.MjData(world.model)
+        mujoco.mj_kinematics(world.model, rest)
+        poses.append((rest.geom_xpos.copy(), rest.geom_xmat.reshape(-1, 3, 3).copy()))
+    row = np.arange(count) % len(rows)
+    data.geom_xpos.assign(np.stack([pose[0] for pose in poses])[row])
+    data.geom_xmat.assign(np.stack([pose[1] for pose in poses])[row])
+
+
+def _joints(structure: Structure) -> kernels.Joints:
+    """Return the joints of a structure, in memory of Warp's current device."""
+    rows = structure.worlds
+    first = rows[0]
+    leaders = [dof_leaders(world) for world in rows]
+    dof_q_at = np.zeros(first.model.nv, dtype=np.int32)
+    dof_q_at[first.movable_qd_at] = first.movable_q_at
+    joints = kernels.Joints()
+    joints.env = _array(structure.envs, int)
+    joints.q_at, joints.qd_at = _array(first.q_at, int), _array(first.qd_at, int)
+    joints.dof_leader = _array(leaders[0][0], int)
+    joints.dof_q_at = _array(dof_q_at, int)
+    joints.dof_gain = _array([gain for _, gain, _ in leaders], float)
+    joints.dof_offset = _array([offset for _, _, offset in leaders], float)
+    joints.compliance = _array([1 / world.model.actuator_gainprm[:, 0] for world in rows], float)
+    joints.farthest = _array(
+        [farthest_targets(world.robot, world.robot.independent_joints) for world in rows], float
+    )
+    return joints
+
+
+def _things(world: World) -> kernels.Things:
+    """Return the block and the obstacles of a structure."""
+    things = kernels.Things()
+    things.block_q_at, things.block_qd_at, things.block_mocap = -1, 0, -1
+    if world.block is not None and world.block_moves:
+        things.block_q_at, things.block_qd_at = world.block_q_at, world.block_qd_at
+    elif world.block is not None:
+        things.block_mocap = int(world.model.body_mocapid[world.block])
+    things.obstacles = _array(world.obstacles, int)
+    return things
+
+
+def _array(values: object, dtype: Callable[..., object]) -> wp.array:
+    """Return an array in memory of Warp's current device."""
+    return wp.array(np.asarray(values), dtype=dtype)
+
 
 _log = logging.getLogger(__name__)
 DIVERGED = "diverged: a target or the state is not finite, or a velocity is too large"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morphgen.benchmark.composition import HoldOutCandidate, hold_out, num_covering
+from morphgen.benchmark.generate import HoldOutCandidate, hold_out, num_covering
 from morphgen.errors import BenchmarkError
 
 

@@ -8,13 +8,15 @@ import pytest
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.difficulty import (
+    STRUCTURAL,
     BaselineResult,
     NearestTrain,
     RobotDifficulty,
+    difficulty_csv,
+    difficulty_table,
     split_difficulty,
     survey_difficulty,
 )
-from morphgen.benchmark.difficulty_table import STRUCTURAL, difficulty_csv, difficulty_table
 from morphgen.benchmark.similarity import MEASURES, features
 from morphgen.benchmark.split import SIDES, compose_member
 from morphgen.benchmark.survey import robot_stats, survey_split

@@ -11,9 +11,13 @@ from helpers.generated_splits import LIBRARY, derivations, names, order, require
 from helpers.grammars import grammar, shipped
 from morphgen.benchmark import generate, robot_factory
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.composition import composition
-from morphgen.benchmark.extrapolation import Bound, extrapolation, parse_bound
-from morphgen.benchmark.interpolation import interpolation
+from morphgen.benchmark.generate import (
+    Bound,
+    composition,
+    extrapolation,
+    interpolation,
+    parse_bound,
+)
 from morphgen.benchmark.regimes import parameters, regime_findings, structure
 from morphgen.benchmark.robot_factory import (
     ComposedRecipe,

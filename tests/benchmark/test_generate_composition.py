@@ -3,9 +3,8 @@
 import pytest
 
 from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
-from morphgen.benchmark.composition import composition
-from morphgen.benchmark.part_patterns import expand
-from morphgen.benchmark.regimes import parts, regime_findings, structure
+from morphgen.benchmark.generate import composition
+from morphgen.benchmark.regimes import expand, parts, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 

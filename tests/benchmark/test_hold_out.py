@@ -7,12 +7,10 @@ import pytest
 
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
-from morphgen.benchmark import hold_out_search
+from morphgen.benchmark import hold_out as hold_out_search
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest
-from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.hold_out_audit import hold_out_findings, related_parts
-from morphgen.benchmark.hold_out_rules import parse_rules
+from morphgen.benchmark.hold_out import hold_out, hold_out_findings, parse_rules, related_parts
 from morphgen.benchmark.regimes import parameters
 from morphgen.benchmark.split import Member, compose_member
 from morphgen.benchmark.split_file import parse_split, split_text

@@ -2,9 +2,8 @@
 
 import pytest
 
-from morphgen.benchmark.hold_out_rules import held_out_parts, parse_rules
-from morphgen.benchmark.member_names import parts_name, unique_names
-from morphgen.benchmark.part_patterns import pattern_robots
+from morphgen.benchmark.hold_out import held_out_parts, parse_rules, parts_name, unique_names
+from morphgen.benchmark.regimes import pattern_robots
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library

@@ -10,9 +10,7 @@ import pytest
 from helpers.grammars import shipped
 from helpers.splits import combined
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.extrapolation import extrapolation, parse_bound
-from morphgen.benchmark.generate import SplitRequest
-from morphgen.benchmark.interpolation import interpolation
+from morphgen.benchmark.generate import SplitRequest, extrapolation, interpolation, parse_bound
 from morphgen.benchmark.private_test import (
     PRIVATE_KEY,
     draw_private_test,

@@ -8,7 +8,7 @@ from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.scenarios import SCENARIOS, scenario_splits, write_scenarios
 from morphgen.benchmark.split import SIDES, compose_member
 from morphgen.benchmark.split_file import find_split, read_split, split_names, split_text
-from morphgen.benchmark.token_layout import MAX_LINKS
+from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 

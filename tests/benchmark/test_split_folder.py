@@ -16,10 +16,8 @@ from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import read_split, write_split
-from morphgen.benchmark.split_folder import load_split_folder
-from morphgen.benchmark.split_folder_files import BUNDLED, BuildSettings
-from morphgen.benchmark.token_layout import pad_tokens
-from morphgen.benchmark.tokens import tokens
+from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, load_split_folder
+from morphgen.benchmark.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_robot

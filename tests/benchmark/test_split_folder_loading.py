@@ -9,7 +9,7 @@ import pytest
 
 from morphgen.benchmark.split_folder import Robots, load_split_folder
 from morphgen.errors import BenchmarkError
-from morphgen.formats import npz_files
+from morphgen.formats import zip_files as npz_files
 
 
 def test_loading_returns_plain_records_with_tokens(whole, example_split):

@@ -9,7 +9,7 @@ from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.similarity import cosine, features
 from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.benchmark.statistics import PAPER, paper_row, robot_set, statistics
+from morphgen.benchmark.survey import PAPER, paper_row, robot_set, statistics
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import reach

@@ -11,12 +11,13 @@ import pytest
 
 from helpers.robots import arm
 from helpers.tokens import arm_tokens, field_of, shapes_of
-from morphgen.benchmark.token_layout import decode_position, encode_position
 from morphgen.benchmark.tokens import (
     LAYOUT,
     MAX_LINKS,
     TOKEN_SIZE,
+    decode_position,
     encode_joint_positions,
+    encode_position,
     normalize_positions,
     pad_tokens,
     robot_from_tokens,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.tree_distance import (
+from morphgen.benchmark.similarity import (
     FIXED,
     change_costs,
     edit_distance,

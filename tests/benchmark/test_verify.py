@@ -12,8 +12,8 @@ from helpers.splits import LIBRARY, TRAIN, combined, member, split
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_names, split_text
-from morphgen.benchmark.split_folder_files import BuildSettings
-from morphgen.benchmark.token_layout import GEOMETRY, ORIGIN, PARENT
+from morphgen.benchmark.split_folder import BuildSettings
+from morphgen.benchmark.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
 

@@ -10,9 +10,14 @@ import morphgen
 from helpers.robots import arm
 from morphgen.benchmark.workspace import density_overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
-from morphgen.model.frame_positions import FramePosition, frame_positions
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, random_configurations, reach
+from morphgen.model.kinematics import (
+    FramePosition,
+    frame_pose,
+    frame_positions,
+    random_configurations,
+    reach,
+)
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.tree import scale_links
 

@@ -8,12 +8,10 @@ import pytest
 
 from helpers.composed import composed
 from helpers.robots import arm
-from morphgen.checks.collision_matrix import collision_matrix
-from morphgen.checks.robot_srdf import robot_srdf, robot_srdf_text
+from morphgen.checks.robot_srdf import collision_matrix, robot_srdf, robot_srdf_text
 from morphgen.checks.self_collision import ALWAYS_SHARE, PENETRATION
 from morphgen.errors import FormatError
-from morphgen.formats.srdf import EndEffector, Group, GroupState, with_disabled_pairs
-from morphgen.formats.srdf_reader import parse_srdf
+from morphgen.formats.srdf import EndEffector, Group, GroupState, parse_srdf, with_disabled_pairs
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot

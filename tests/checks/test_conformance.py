@@ -12,9 +12,9 @@ from morphgen.checks import conformance as module
 from morphgen.checks.conformance import compare, compare_file, conformance
 from morphgen.checks.readers import LOADERS as LOADER_TABLE
 from morphgen.errors import FormatError
-from morphgen.formats import urdf
 from morphgen.formats.bundle import write_bundle
 from morphgen.formats.resolve import default_finder
+from morphgen.formats.urdf import read as urdf
 from morphgen.model.geometry import Capsule, Pose, Shape
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 

@@ -16,7 +16,8 @@ from helpers.faulty_robots import (
     with_joint,
 )
 from helpers.robots import arm
-from morphgen.checks import check, shapes
+from morphgen.checks import check
+from morphgen.checks import loaders as shapes
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Inertial, Link, Mimic, Robot
 from morphgen.model.tree import rename

@@ -15,9 +15,10 @@ from helpers.faulty_robots import (
     with_link,
 )
 from helpers.robots import arm
-from morphgen.checks import check, fix, shapes
+from morphgen.checks import check, fix
+from morphgen.checks import loaders as shapes
 from morphgen.checks.inertia import DEFAULT_DENSITY
-from morphgen.checks.names import safe_names
+from morphgen.checks.loaders import safe_names
 from morphgen.model.inertia import inertial_from_density
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Robot
 from morphgen.model.tree import rename

@@ -9,7 +9,7 @@ import trimesh
 from helpers.commands import tree
 from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import LIBRARY_VARIABLE
 
 

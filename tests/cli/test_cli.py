@@ -14,7 +14,7 @@ from helpers.parts import PINCER, write_part
 from helpers.robots import arm
 from morphgen.cli import main
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar import catalogue
 from morphgen.grammar.library import LIBRARY_VARIABLE
 

@@ -8,17 +8,16 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.checks.collision_matrix import MATRIX_SAMPLES
-from morphgen.checks.robot_srdf import robot_srdf_text
-from morphgen.cli.export_formats import SAMPLES
-from morphgen.fitting import sphere_robot
+from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
+from morphgen.cli.export import SAMPLES
+from morphgen.fitting import collision_geometry as sphere_robot
 from morphgen.formats.bundle import file_findings, write_bundle
-from morphgen.formats.export_folder import MANIFEST
+from morphgen.formats.files import MANIFEST
 from morphgen.formats.fits import FITS
-from morphgen.formats.srdf_reader import read_srdf
-from morphgen.formats.urdf import read_urdf
+from morphgen.formats.srdf import read_srdf
+from morphgen.formats.urdf.read import read_urdf
 from morphgen.model.kinematics import forward_kinematics
-from morphgen.tasks.env_specs import load_robot
+from morphgen.tasks.scenes.env_specs import load_robot
 
 
 def test_bundles_get_their_web_page_and_stay_valid(run, tmp_path):

@@ -10,8 +10,9 @@ from helpers.commands import start
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_text
-from morphgen.benchmark.split_folder_files import BuildSettings
-from morphgen.tasks import free_space, goal_sets
+from morphgen.benchmark.split_folder import BuildSettings
+from morphgen.tasks import free_space
+from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.registry import TASKS
 
 

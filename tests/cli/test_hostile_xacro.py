@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import pytest
 import yaml
 
-from morphgen.formats import xacro_process
+from morphgen.formats.xacro import expand as xacro_process
 
 HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
 SECRET = "root:hunter2"
@@ -314,7 +314,7 @@ def test_limits_apply_to_user_library_parts(refused, tmp_path, monkeypatch):
 
 
 def test_child_process_writes_no_files(tmp_path):
-    code = "from morphgen.formats.xacro_process import limit_process; limit_process(9, 2**30); "
+    code = "from morphgen.formats.xacro.expand import limit_process; limit_process(9, 2**30); "
     write = "file = open('written', 'w'); file.write('a'); file.close()"
     done = subprocess.run(
         [sys.executable, "-c", code + write], capture_output=True, text=True, check=False
@@ -325,7 +325,7 @@ def test_child_process_writes_no_files(tmp_path):
 
 def test_child_process_imports_no_heavy_packages():
     code = (
-        "import morphgen.formats.xacro, morphgen.formats.xacro_compile, sys, json;"
+        "import morphgen.formats.xacro.expand, morphgen.formats.xacro.compile, sys, json;"
         "print(json.dumps(list(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

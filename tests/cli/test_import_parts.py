@@ -8,7 +8,7 @@ import pytest
 import morphgen
 from helpers.commands import tree
 from helpers.mjcf import TWO_JOINTS, write
-from morphgen.formats.named_descriptions import find_description
+from morphgen.formats.description import find_description
 
 SITE = '<site name="tool" pos="0 0 0.2" euler="0 90 0"/>'
 ARM = f"""<worldbody>

@@ -10,7 +10,7 @@ import pytest
 from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import TrainingProgress
-from morphgen.rl.metrics import UpdateMetrics
+from morphgen.rl.distributed import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
 REPORT = UpdateMetrics(

@@ -15,7 +15,7 @@ from helpers.parts import write_part
 from helpers.robots import arm
 from morphgen import cli
 from morphgen.cli.command import whole_number
-from morphgen.cli.export_formats import FORMATS, FileFormat
+from morphgen.cli.export import FORMATS, FileFormat
 from morphgen.errors import MorphgenError
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle

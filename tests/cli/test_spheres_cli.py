@@ -9,8 +9,8 @@ import yaml
 
 from helpers.robots import arm
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.srdf_reader import read_srdf
-from morphgen.formats.urdf import read_urdf
+from morphgen.formats.srdf import read_srdf
+from morphgen.formats.urdf.read import read_urdf
 from morphgen.model.geometry import Pose, Shape, Sphere
 
 pytestmark = pytest.mark.usefixtures("own_cache", "nothing_is_stored")

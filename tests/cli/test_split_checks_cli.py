@@ -11,9 +11,10 @@ from helpers.splits import TEST, TRAIN, combined, member, split
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.split_folder import load_split_folder
-from morphgen.benchmark.statistics import PAPER
-from morphgen.tasks import free_space, goal_sets
-from morphgen.tasks.split_goals import read_goals
+from morphgen.benchmark.survey import PAPER
+from morphgen.tasks import free_space
+from morphgen.tasks.goals import goal_sets
+from morphgen.tasks.goals.split_goals import read_goals
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import sided_members
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.grammar.library import default_library
-from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
+from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 STUDY = Path(__file__).parents[2] / "results" / "reach-30m"
 ARM3 = "interpolation/arm3/reach"

@@ -12,7 +12,7 @@ from helpers.splits import TEST, TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.grammar.library import default_library
-from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
+from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 STICKS = ("split", "new", "interpolation", "--grammar", "stick", "--train", "4", "--name")
 RELEASE = ("split", "release", "--light", "--no-goals")
@@ -143,7 +143,7 @@ def test_an_interrupt_keeps_the_secret_of_a_release_that_was_written(run, monkey
             (out / "my-sticks-1.0.0.zip").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morphgen.tasks.split_release.release_split", interrupted)
+    monkeypatch.setattr("morphgen.tasks.goals.split_release.release_split", interrupted)
     run(*STICKS, "my/sticks")
     words = ("my/sticks.yaml", "--private-test", "2", "--secret-file", "new.txt")
     assert run(*RELEASE, *words)[0] != 0

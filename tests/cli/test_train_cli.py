@@ -10,11 +10,11 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.runs import ROLLOUT, RUN, SMALL, equal, weights
-from morphgen.rl.recorders import METRICS, read_metrics
-from morphgen.rl.robot_source import specs_of
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
-from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.split_goals import read_goals
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
+from morphgen.rl.runs.recorders import METRICS, read_metrics
+from morphgen.rl.runs.robot_source import specs_of
+from morphgen.tasks.goals.split_goals import read_goals
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

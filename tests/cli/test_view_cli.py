@@ -78,7 +78,7 @@ def test_work_that_hangs_does_not_keep_the_viewer_running(tmp_path, monkeypatch,
 import os, time
 from concurrent.futures import ThreadPoolExecutor
 from morphgen.cli import main
-from morphgen.viewer import app
+from morphgen.viewer.app import app
 PIPE = {str(tmp_path / "pipe")!r}
 if __name__ == "__main__":
     serve = app.serve

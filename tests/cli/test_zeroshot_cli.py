@@ -5,7 +5,7 @@ import json
 import pytest
 
 from morphgen.cli import main
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.shipped_policies import POLICIES, ZERO_SHOT, ShippedPolicy, policies_for
 
 

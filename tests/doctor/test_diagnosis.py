@@ -17,7 +17,7 @@ from morphgen.doctor.entry import Entry, attempt
 from morphgen.errors import MissingDependencyError, PartError
 from morphgen.grammar import catalogue
 from morphgen.grammar.library import LIBRARY_VARIABLE, default_library
-from morphgen.tasks import packaged_sets
+from morphgen.tasks.goals import goal_sets as packaged_sets
 from morphgen.tasks.registry import SIMULATORS
 
 

@@ -6,8 +6,10 @@ from pathlib import Path
 from morphgen.benchmark import release_file, split, split_folder
 from morphgen.formats import card
 from morphgen.grammar.robot_set import SetConfig
-from morphgen.rl import drawn_robots, runs, submission
-from morphgen.tasks import split_goals
+from morphgen.rl.runs import checkpoint as runs
+from morphgen.rl.runs import drawn_robots
+from morphgen.rl.scores import submission
+from morphgen.tasks.goals import split_goals
 from morphgen.viewer import episode
 
 PAGE = (Path(__file__).parents[2] / "docs" / "versions.md").read_text(encoding="utf-8")

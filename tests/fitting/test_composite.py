@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from morphgen.fitting.composite import fit_composite
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import solid_of
+from morphgen.fitting.token_shapes import fit_composite
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2, 3, 4, 5))]

@@ -11,13 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.initial_guess import MIN_POINTS, around, by_growth, by_pieces
 from morphgen.fitting.quality import quality
 from morphgen.fitting.search import (
     DIGITS,
+    MIN_POINTS,
     SearchResult,
+    around,
     best_several,
     best_single,
+    by_growth,
+    by_pieces,
     sample_solid,
 )
 from morphgen.fitting.soft_iou import SEARCH_KINDS, Candidates, covered, overlaps

@@ -7,7 +7,7 @@ import yaml
 
 from helpers.robots import arm
 from morphgen.errors import FormatError
-from morphgen.fitting.sphere_robot import link_spheres
+from morphgen.fitting.collision_geometry import link_spheres
 from morphgen.formats.curobo import curobo_text
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.robot import Frame

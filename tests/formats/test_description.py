@@ -9,7 +9,7 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle, read_robot, write_bundle
 from morphgen.formats.description import is_mjcf, read_description
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import find_robot, import_robot, read_source
 

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.commands import tree
 from morphgen.errors import FormatError
-from morphgen.formats.export_folder import MANIFEST, writing_export
+from morphgen.formats.files import MANIFEST, writing_export
 
 
 def export(folder, text="a"):

@@ -20,8 +20,8 @@ from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
+from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
-from morphgen.viewer.uploads import store_upload
 
 URDF_TEXT = """<robot name="r"><link name="a"><visual><geometry><sphere radius="0.1"/></geometry>
 </visual>{}</link>{}</robot>"""
@@ -340,7 +340,7 @@ LIMITED = """
 import resource, sys
 from pathlib import Path
 from morphgen.errors import MorphgenError
-from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.formats.mjcf.read import read_mjcf
 resource.setrlimit(resource.RLIMIT_CPU, (120, 120))
 for file in sys.argv[1:]:
     before = resource.getrusage(resource.RUSAGE_SELF)

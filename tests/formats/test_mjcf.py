@@ -11,8 +11,7 @@ import trimesh
 
 from helpers.robots import arm, rod
 from morphgen.errors import FormatError
-from morphgen.formats.mjcf import mjcf_text, to_spec
-from morphgen.formats.mjcf_elements import FLAT_THICKNESS
+from morphgen.formats.mjcf.write import FLAT_THICKNESS, mjcf_text, to_spec
 from morphgen.model.dynamics import MIN_ROTATIONAL_INERTIA, actuation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import (

@@ -10,8 +10,8 @@ import pytest
 from helpers.mjcf import read, write
 from morphgen.errors import MeshError
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.mjcf_read import read_mjcf
-from morphgen.model import msh_files
+from morphgen.formats.mjcf.read import read_mjcf
+from morphgen.model import mesh_files as msh_files
 from morphgen.model.geometry import Mesh, Sphere
 from morphgen.model.mesh import convex_hull, load_mesh
 

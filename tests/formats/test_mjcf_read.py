@@ -9,8 +9,8 @@ from helpers.composed import composed
 from helpers.mjcf import TWO_JOINTS, read, refusal, write
 from helpers.robots import arm
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.mjcf import mjcf_text
-from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.formats.mjcf.read import read_mjcf
+from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Sphere
 from morphgen.model.kinematics import (
     forward_kinematics,

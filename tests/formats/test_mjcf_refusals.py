@@ -6,9 +6,9 @@ import pytest
 
 from helpers.mjcf import TWO_JOINTS, read, refusal, write
 from morphgen.errors import FormatError
-from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import UnsoundError
+from morphgen.formats.urdf.read import UnsoundError
 
 BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
 

@@ -7,7 +7,7 @@ import pytest
 
 CODE = """
 import logging, sys
-import morphgen.formats.mjcf
+import morphgen.formats.mjcf.write
 import mujoco
 
 logging.basicConfig(stream=sys.stdout, format="%(name)s %(levelname)s %(message)s")

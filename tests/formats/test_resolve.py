@@ -15,7 +15,7 @@ from morphgen.formats.resolve import (
     require_allowed_text,
     resolve_uri,
 )
-from morphgen.formats.xacro_functions import RefusedError
+from morphgen.formats.xacro.evaluator import RefusedError
 from morphgen.grammar.library import default_library
 
 NOWHERE = PackageFinder()

@@ -13,7 +13,7 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.ros_package import ros_package_name, write_ros_package
-from morphgen.formats.urdf import read_urdf
+from morphgen.formats.urdf.read import read_urdf
 
 
 def written(robot, tmp_path):

@@ -21,10 +21,11 @@ from morphgen.formats.srdf import (
     UncheckedLink,
     VirtualJoint,
     disabled_link_pairs,
+    parse_srdf,
+    read_srdf,
     srdf_text,
     with_disabled_pairs,
 )
-from morphgen.formats.srdf_reader import parse_srdf, read_srdf
 
 FULL = Srdf(
     'arm & "hand"',

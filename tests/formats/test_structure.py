@@ -8,8 +8,8 @@ from lxml import etree
 
 from morphgen.checks import fix
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.structure import structure_findings
-from morphgen.formats.urdf import robot_from_xml
+from morphgen.formats.urdf.read import robot_from_xml
+from morphgen.formats.urdf.schema import structure_findings
 from morphgen.formats.xml import parse_xml
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule

@@ -10,8 +10,8 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_robot
 from morphgen.formats.rounding import format_number
-from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.read import UnsoundError, read_urdf, with_frames
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.kinematics import frame_pose, random_configurations
 from morphgen.model.robot import Joint, Link, Robot

@@ -10,8 +10,8 @@ import pytest
 from morphgen import read
 from morphgen.cli import main
 from morphgen.errors import FormatError
-from morphgen.formats.structure import structure_findings
-from morphgen.formats.urdf import read_urdf
+from morphgen.formats.urdf.read import read_urdf
+from morphgen.formats.urdf.schema import structure_findings
 from morphgen.formats.xml import parse_xml
 from morphgen.model.geometry import Capsule
 from morphgen.model.robot import Robot

@@ -11,9 +11,10 @@ from xml.dom import minidom
 import pytest
 
 from morphgen.errors import FormatError
-from morphgen.formats import resolve, xacro_process
+from morphgen.formats import resolve
 from morphgen.formats.resolve import PackageFinder, default_finder, distribution_file
-from morphgen.formats.xacro import Expansion, evaluate, expand
+from morphgen.formats.xacro import expand as xacro_process
+from morphgen.formats.xacro.expand import Expansion, evaluate, expand
 from morphgen.formats.xml import parse_xml
 
 NOWHERE = PackageFinder()
@@ -324,6 +325,6 @@ def test_warnings_of_the_subprocess_are_logged(
     origin: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     origin.write_text(robot("<link name=\"l${xacro.warning('odd')}\"/>"))
-    with caplog.at_level("INFO", "morphgen.formats.xacro"):
+    with caplog.at_level("INFO", "morphgen.formats.xacro.expand"):
         assert b'name="l"' in expand(origin, {}, NOWHERE)
     assert caplog.messages == ["odd"]

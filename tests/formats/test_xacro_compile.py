@@ -8,8 +8,8 @@ import pytest
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.rounding import format_number
-from morphgen.formats.xacro import expand
-from morphgen.formats.xacro_compile import compile_xacro, trace
+from morphgen.formats.xacro.compile import compile_xacro, trace
+from morphgen.formats.xacro.expand import expand
 from morphgen.grammar.library import default_library
 
 TEMPLATES = [manifest for manifest in default_library().manifests() if manifest.is_template]

@@ -11,12 +11,19 @@ from pathlib import Path
 import pytest
 
 import morphgen.formats
-from morphgen.formats import xacro_files, xacro_process
-from morphgen.formats.xacro import MAX_INCLUDE_DEPTH
-from morphgen.formats.xacro_engine import MAX_ELEMENTS, MAX_TEXT
-from morphgen.formats.xacro_expressions import MAX_LENGTH, Expression
-from morphgen.formats.xacro_functions import BUILTINS, MATH, MAX_BITS, MAX_SIZE, RefusedError
-from morphgen.formats.xacro_nodes import MAX_WORK
+from morphgen.formats.xacro import expand as xacro_files
+from morphgen.formats.xacro import expand as xacro_process
+from morphgen.formats.xacro.evaluator import (
+    BUILTINS,
+    MATH,
+    MAX_BITS,
+    MAX_LENGTH,
+    MAX_SIZE,
+    MAX_WORK,
+    Expression,
+    RefusedError,
+)
+from morphgen.formats.xacro.expand import MAX_ELEMENTS, MAX_INCLUDE_DEPTH, MAX_TEXT
 
 NAMES = {
     **MATH,
@@ -200,7 +207,7 @@ def test_the_page_documents_every_function_and_bound():
 
 def test_suspicious_expressions_print_no_python_warning():
     code = (
-        "from morphgen.formats.xacro import evaluate; "
+        "from morphgen.formats.xacro.expand import evaluate; "
         r"print(evaluate('${2if 1 else 3}', {}), evaluate('${len(\'\\d\')}', {}))"
     )
     result = subprocess.run(

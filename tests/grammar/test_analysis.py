@@ -8,10 +8,13 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import check_grammar, variables
-from morphgen.grammar.choosers import RandomChooser
-from morphgen.grammar.derive import derive
-from morphgen.grammar.structures import count_structures, enumerate_structures
+from morphgen.grammar.analysis import (
+    check_grammar,
+    count_structures,
+    enumerate_structures,
+    variables,
+)
+from morphgen.grammar.derive import RandomChooser, derive
 
 
 def structures(robot_grammar, limit=None):

@@ -9,15 +9,15 @@ from helpers.grammars import LIBRARY
 from helpers.robots import arm
 from morphgen.errors import GrammarError
 from morphgen.grammar.compose import join
-from morphgen.grammar.conditions import (
+from morphgen.grammar.request import parse_request
+from morphgen.grammar.syntax import parse_condition
+from morphgen.grammar.values import (
     PROPERTIES,
     RobotProperties,
     clauses,
     holds,
     require_condition,
 )
-from morphgen.grammar.request import parse_request
-from morphgen.grammar.syntax import parse_condition
 
 
 def true_of(text, robot):

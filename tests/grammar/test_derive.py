@@ -7,9 +7,14 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import FirstChooser, RandomChooser, RecordedChooser
-from morphgen.grammar.derive import TooManyPartsError, derive
-from morphgen.grammar.limits import MAX_PARTS
+from morphgen.grammar.derive import (
+    FirstChooser,
+    RandomChooser,
+    RecordedChooser,
+    TooManyPartsError,
+    derive,
+)
+from morphgen.grammar.syntax import MAX_PARTS
 
 
 def first(*lines):

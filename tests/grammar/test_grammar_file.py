@@ -4,8 +4,7 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import FirstChooser
-from morphgen.grammar.derive import derive
+from morphgen.grammar.derive import FirstChooser, derive
 from morphgen.grammar.grammar_file import (
     find_grammar,
     grammar_from_text,

@@ -8,16 +8,14 @@ import pytest
 from helpers.grammars import LIBRARY, shipped, unphysical
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import check_grammar
-from morphgen.grammar.choosers import RandomChooser
-from morphgen.grammar.conditions import PROPERTIES
-from morphgen.grammar.derive import derive
+from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
-from morphgen.grammar.parameters import UNITS
-from morphgen.grammar.pinning import pin
+from morphgen.grammar.manifest import UNITS
+from morphgen.grammar.request import pin
 from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.syntax import parse_condition
-from morphgen.grammar.values import DISTRIBUTIONS
+from morphgen.grammar.values import DISTRIBUTIONS, PROPERTIES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "grammar.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```grammar\n(.*?)```", PAGE, re.DOTALL)

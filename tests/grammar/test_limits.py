@@ -8,14 +8,16 @@ import pytest
 
 from helpers.grammars import LIBRARY, grammar
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import check_grammar
-from morphgen.grammar.choosers import FirstChooser, RandomChooser
+from morphgen.grammar.analysis import (
+    SearchError,
+    check_grammar,
+    count_structures,
+    enumerate_structures,
+)
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.derive import derive
+from morphgen.grammar.derive import FirstChooser, RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_text, load_grammar
-from morphgen.grammar.limits import MAX_COUNT, MAX_NESTING, MAX_PARTS
-from morphgen.grammar.structures import SearchError, count_structures, enumerate_structures
-from morphgen.grammar.syntax import parse_condition
+from morphgen.grammar.syntax import MAX_COUNT, MAX_NESTING, MAX_PARTS, parse_condition
 
 SOON = 10.0
 """CPU seconds."""

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from morphgen.errors import PartError
-from morphgen.grammar.parameters import (
+from morphgen.grammar.manifest import (
     MOUNT_YAW_PARAMETER,
     Parameter,
     parse_value,

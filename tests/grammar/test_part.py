@@ -8,7 +8,7 @@ import pytest
 from helpers.parts import PINCER, write_part
 from morphgen.errors import PartError
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.xacro import Expansion
+from morphgen.formats.xacro.expand import Expansion
 from morphgen.grammar import part as module
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest

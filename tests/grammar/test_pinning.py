@@ -4,10 +4,8 @@ import pytest
 
 from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import MorphgenError
-from morphgen.grammar.choosers import FirstChooser
-from morphgen.grammar.derive import derive
-from morphgen.grammar.pinning import pin
-from morphgen.grammar.request import parse_words
+from morphgen.grammar.derive import FirstChooser, derive
+from morphgen.grammar.request import parse_words, pin
 from morphgen.grammar.sampling import sample_robots
 
 

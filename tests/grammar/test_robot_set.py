@@ -21,12 +21,12 @@ from morphgen.grammar.robot_set import (
     JOURNAL,
     SETTINGS,
     SetConfig,
+    make_in_processes,
     make_serially,
     make_set,
     read_index,
 )
 from morphgen.grammar.sampling import SamplingError
-from morphgen.grammar.workers import make_in_processes
 
 
 def plan(folder, category="cubes", **changes):

@@ -11,7 +11,7 @@ from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import import_robot, resolve_robot
 from morphgen.model.geometry import IDENTITY, Box

@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 from helpers.grammars import LIBRARY, grammar, shipped, unphysical
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar import sampling
-from morphgen.grammar.analysis import check_grammar
-from morphgen.grammar.choosers import RandomChooser
-from morphgen.grammar.derive import derive
+from morphgen.grammar.analysis import check_grammar, count_structures
+from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
 from morphgen.grammar.sampling import SamplingError, robot_name, sample_robot, sample_robots
-from morphgen.grammar.structures import count_structures
 from morphgen.grammar.syntax import parse_condition
 
 

@@ -8,9 +8,8 @@ from helpers.commands import tree
 from helpers.grammars import shipped
 from morphgen.errors import MorphgenError
 from morphgen.grammar.grammar_file import grammar_text
-from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
+from morphgen.grammar.robot_set import SetConfig, make_on_ray, make_serially, make_set
 from morphgen.grammar.sampling import SamplingError
-from morphgen.grammar.workers import make_on_ray
 
 pytestmark = pytest.mark.slow
 

@@ -1,9 +1,9 @@
 """Goal sets and environment specifications of a robot, by the constants of a task."""
 
-from morphgen.tasks.env_specs import GoalConfig, env_spec
-from morphgen.tasks.goal_sets import goal_set
+from morphgen.tasks.goals.goal_sets import goal_set
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec
 
 CONFIG = ReachConfig(num_goals=12, train_layouts=3, eval_layouts=2)
 """Constants of a small goal set."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from morphgen.model.kinematics import joint_limits
-from morphgen.tasks.robot_tables import STEP_SLIDE, STEP_TURN
+from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 SECOND = round(1 / CONTROL_PERIOD)

@@ -6,8 +6,7 @@ import torch
 
 from morphgen.model import inverse_kinematics, inverse_kinematics_torch, kinematics
 from morphgen.model import kinematics_torch as batched
-from morphgen.model.frame_positions import frame_positions
-from morphgen.model.kinematics import joint_limits
+from morphgen.model.kinematics import frame_positions, joint_limits
 
 BACKENDS = ("numpy", "float64", "float32")
 

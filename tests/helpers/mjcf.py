@@ -3,7 +3,7 @@
 import pytest
 
 from morphgen.errors import FormatError
-from morphgen.formats.mjcf_read import read_mjcf
+from morphgen.formats.mjcf.read import read_mjcf
 
 TWO_JOINTS = """
 <worldbody>

@@ -6,9 +6,9 @@ from helpers.splits import member, split
 from morphgen.rl.agents import AGENTS, mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.evaluation import EvalConfig
-from morphgen.rl.robot_source import robot_source, split_source
-from morphgen.rl.runs import RunConfig, read_checkpoint
-from morphgen.rl.training import ExecutionConfig
+from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
+from morphgen.rl.runs.robot_source import robot_source, split_source
+from morphgen.rl.runs.training import ExecutionConfig
 
 QUIET = ExecutionConfig(tensorboard=False)
 EVAL = EvalConfig(episodes=2, sim="mujoco")

@@ -5,8 +5,8 @@ import msgspec
 from helpers.runs import small_split
 from morphgen.benchmark.split import split_id
 from morphgen.grammar.library import default_library
-from morphgen.rl.submission import FORMAT, KIND
-from morphgen.tasks.eval_protocol import EvalProtocol, expected_robots
+from morphgen.rl.scores.submission import FORMAT, KIND
+from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 SPLIT = small_split()
 PROTOCOL = EvalProtocol(episodes=4)

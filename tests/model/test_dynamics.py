@@ -6,7 +6,7 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.api.robots import compose
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.dynamics import (
     BANDWIDTH,
     MIN_RELATIVE_INERTIA,

@@ -20,14 +20,14 @@ from morphgen.model.kinematics import (
     joint_limits,
     random_configurations,
 )
-from morphgen.model.kinematics_torch import frame_jacobian as frame_jacobians
-from morphgen.model.kinematics_torch import frame_pose as frame_poses
-from morphgen.model.rotation_torch import (
+from morphgen.model.kinematics_torch import (
     angle_between,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotvec_from_matrix,
 )
+from morphgen.model.kinematics_torch import frame_jacobian as frame_jacobians
+from morphgen.model.kinematics_torch import frame_pose as frame_poses
 
 UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
     robot(words)

@@ -11,11 +11,16 @@ import morphgen
 from helpers.kinematic_backends import BACKENDS, TorchBackend, backend
 from helpers.robots import arm
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model import kinematics_torch
-from morphgen.model.frame_positions import FramePosition, frame_positions
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
+from morphgen.model.kinematics import (
+    FramePosition,
+    frame_pose,
+    frame_positions,
+    movable_positions,
+    random_configurations,
+)
 from morphgen.model.kinematics_torch import (
     compile_chain,
     compile_tree,

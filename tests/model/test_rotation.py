@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from morphgen.model import rotation
-from morphgen.model.rotation_torch import rotation_from_z
+from morphgen.model.kinematics_torch import rotation_from_z
 
 ANGLES = st.floats(-math.pi, math.pi, allow_nan=False)
 RPY = st.tuples(ANGLES, st.floats(-math.pi / 2, math.pi / 2), ANGLES)

@@ -9,13 +9,13 @@ import torch
 
 from helpers.runs import QUIET, small_config
 from morphgen.errors import TaskError
-from morphgen.rl.agent_spec import parse_agent, parse_agents, parse_constants
 from morphgen.rl.agents import AGENTS, Agent, NetworkConfig, encoder
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.inference import load_policy
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs.agent_spec import parse_agent, parse_agents, parse_constants
+from morphgen.rl.runs.checkpoint import read_checkpoint
+from morphgen.rl.runs.training import train
 from morphgen.rl.shipped_policies import POLICIES
-from morphgen.rl.training import train
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def test_sizes_of_another_agent_are_refused(linear):
 def test_a_policy_acts_on_an_observation_alone(tmp_path):
     from contextlib import closing
 
-    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.scenes.make import make_batch
 
     train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
     policy = load_policy(tmp_path)
@@ -92,7 +92,7 @@ def test_a_policy_acts_on_an_observation_alone(tmp_path):
 def test_a_shipped_policy_is_loaded_by_its_name(name):
     from contextlib import closing
 
-    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.scenes.make import make_batch
 
     policy = load_policy(name)
     (task,) = POLICIES[name].tasks

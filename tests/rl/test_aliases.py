@@ -8,12 +8,12 @@ import torch
 
 from helpers.runs import EVAL, QUIET, equal, small_config, weights
 from morphgen.errors import TaskError
-from morphgen.rl.agent_spec import parse_constants
 from morphgen.rl.aliases import ALIASES, current_policy
 from morphgen.rl.config import PPOConfig, policy_from
-from morphgen.rl.runs import CHECKPOINT, CONFIG, read_checkpoint, read_config
-from morphgen.rl.study import SCORES, agent_cell, read_scores
-from morphgen.rl.training import train
+from morphgen.rl.runs.agent_spec import parse_constants
+from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, read_checkpoint, read_config
+from morphgen.rl.runs.training import train
+from morphgen.rl.scores.study import SCORES, agent_cell, read_scores
 
 OTHER_SIZES = {
     "se": ("features", "layers", "heads", "feedforward", "decoder", "logit_scale"),

@@ -9,12 +9,11 @@ from helpers.submissions import EXPECTED, SPLIT, data
 from morphgen.benchmark.difficulty import BaselineResult
 from morphgen.benchmark.split_file import split_text
 from morphgen.errors import BenchmarkError
-from morphgen.rl.baseline_results import study_results, submitted_results
 from morphgen.rl.evaluation import EvalConfig
-from morphgen.rl.reference_scores import References
-from morphgen.rl.robot_source import split_source
-from morphgen.rl.scores import Score, scores_to_json
-from morphgen.rl.submission import submission_from
+from morphgen.rl.runs.robot_source import split_source
+from morphgen.rl.scores.reference_scores import References, study_results, submitted_results
+from morphgen.rl.scores.scores import Score, scores_to_json
+from morphgen.rl.scores.submission import submission_from
 
 EVAL = EvalConfig(episodes=4, sim="mujoco").as_data()
 NAMES = [(each.side, each.member.name) for each in EXPECTED]

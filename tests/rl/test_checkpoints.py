@@ -8,8 +8,8 @@ import torch
 from helpers.learners import equal, learner, stored, untimed, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
-from morphgen.rl.checkpoint_file import packed
-from morphgen.rl.learner_state import load_networks, resume, state_of
+from morphgen.rl.runs.checkpoint import packed
+from morphgen.rl.runs.training import load_networks, resume, state_of
 
 
 @pytest.mark.slow

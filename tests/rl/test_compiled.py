@@ -9,9 +9,8 @@ from torch._dynamo.exc import TorchDynamoException
 from helpers.learners import learner
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
-from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.ppo import Learner
+from morphgen.rl.ppo import Learner, prepared
 
 CPU = torch.device("cpu")
 

@@ -11,7 +11,7 @@ import torch
 from morphgen.cli import main
 from morphgen.errors import TaskError
 from morphgen.rl.distributed import ALONE, ProcessGroup, merged_metrics, process_group
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs.checkpoint import read_checkpoint
 
 TRAIN = ("train", "interpolation/arm3/reach", "--sim", "kinematic", "--envs", "40", "--steps")
 UPDATE = 32 * 40

@@ -13,8 +13,8 @@ from morphgen.benchmark.split_file import read_split, split_names, write_split
 from morphgen.errors import GrammarError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robots
-from morphgen.rl import drawn_robots
-from morphgen.rl.drawn_robots import (
+from morphgen.rl.runs import drawn_robots
+from morphgen.rl.runs.drawn_robots import (
     FILE,
     draw,
     drawn_source,
@@ -23,15 +23,15 @@ from morphgen.rl.drawn_robots import (
     trained_on,
     write_drawn,
 )
-from morphgen.rl.robot_source import (
+from morphgen.rl.runs.robot_source import (
     other_side,
     robot_source,
     specs_of,
     split_source,
     tasks_of,
 )
-from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 LIBRARY = default_library()
 FEW = GoalConfig(tasks=(ReachConfig(num_goals=3),))

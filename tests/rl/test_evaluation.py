@@ -11,7 +11,6 @@ from helpers.runs import EVAL, QUIET, small_config, small_source
 from helpers.splits import member, split
 from morphgen.errors import TaskError
 from morphgen.rl import evaluation
-from morphgen.rl.eval_report import score_table, summary, write_scores
 from morphgen.rl.evaluation import (
     EvalConfig,
     episodes_for,
@@ -20,13 +19,13 @@ from morphgen.rl.evaluation import (
     evaluate_checkpoints,
     evaluate_run,
 )
-from morphgen.rl.robot_source import other_side, robot_source, split_source
-from morphgen.rl.runs import read_checkpoint, write_checkpoint
-from morphgen.rl.scores import scores_to_json
-from morphgen.rl.training import checkpoint_files, subruns_of, train
-from morphgen.tasks.make import batch_from_specs
+from morphgen.rl.runs.checkpoint import read_checkpoint, write_checkpoint
+from morphgen.rl.runs.robot_source import other_side, robot_source, split_source
+from morphgen.rl.runs.training import checkpoint_files, subruns_of, train
+from morphgen.rl.scores.scores import score_table, scores_to_json, summary, write_scores
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
+from morphgen.tasks.scenes.make import batch_from_specs
 
 pytestmark = pytest.mark.slow
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from morphgen.rl.advantages import gae
+from morphgen.rl.ppo import gae
 
 GAMMA, LAM = 0.9, 0.5
 

@@ -8,12 +8,11 @@ import pytest
 
 from helpers.runs import EVAL, small_config, small_source
 from morphgen.errors import TaskError
-from morphgen.rl.eval_report import score_table
 from morphgen.rl.evaluation import eval_config_of, evaluate_baseline
-from morphgen.rl.robot_source import other_side
-from morphgen.rl.runs import config_from
-from morphgen.rl.scores import score_from_json, scores_to_json
-from morphgen.rl.study import SCORES, baseline_cells, read_scores
+from morphgen.rl.runs.checkpoint import config_from
+from morphgen.rl.runs.robot_source import other_side
+from morphgen.rl.scores.scores import score_from_json, score_table, scores_to_json
+from morphgen.rl.scores.study import SCORES, baseline_cells, read_scores
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 

@@ -7,10 +7,10 @@ import morphgen
 from morphgen.rl.agents import graph
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import Policy
-from morphgen.rl.learner_state import state_of
 from morphgen.rl.ppo import Learner
-from morphgen.tasks.make import make_batch
+from morphgen.rl.runs.training import state_of
 from morphgen.tasks.observation import observation_config
+from morphgen.tasks.scenes.make import make_batch
 
 POLICY = PolicyConfig(
     "me-graph", discrete=False, observe=("lag", "joint", "jacobian"), normalize=True

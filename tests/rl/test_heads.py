@@ -7,7 +7,7 @@ import torch
 from torch.distributions import Categorical, Independent, Normal
 from torch.nn import functional
 
-from morphgen.rl.heads import (
+from morphgen.rl.observation_layout import (
     INITIAL_LOG_STD,
     MAX_LOG_STD,
     MIN_LOG_STD,

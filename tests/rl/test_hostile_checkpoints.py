@@ -13,9 +13,9 @@ import torch
 from helpers.runs import QUIET, equal, small_config, weights
 from morphgen.cli import main
 from morphgen.errors import TaskError
-from morphgen.rl import checkpoint_file
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint, write_checkpoint
-from morphgen.rl.training import train
+from morphgen.rl.runs import checkpoint as checkpoint_file
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from morphgen.rl.runs.training import train
 
 ENTER = "network.enter.weight"
 

@@ -12,9 +12,9 @@ from morphgen.rl.baselines.ik import STARTS, InverseKinematics, random_starts
 from morphgen.rl.baselines.path_planner import PathFollower
 from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 REACH, PUSH = ReachConfig(num_goals=10), PushConfig(num_goals=4)

@@ -11,8 +11,8 @@ from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.jacobian import GAIN, JacobianColumns, column_steps
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.actions import BINS
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import make_batch
 
 REACH = ReachConfig(num_goals=10)
 

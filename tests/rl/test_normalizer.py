@@ -5,10 +5,10 @@ import torch
 from helpers.learners import SMALL, stored
 from helpers.line_batch import OnALine
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.learner_state import resume, state_of
-from morphgen.rl.normalizer import MAX_NORMALIZED, RunningNormalizer
 from morphgen.rl.observation_layout import Layout
+from morphgen.rl.policies import MAX_NORMALIZED, RunningNormalizer
 from morphgen.rl.ppo import Learner
+from morphgen.rl.runs.training import resume, state_of
 
 LAYOUT = Layout(5, 48, 0, 0, (), vectors=(("lag", 1), ("dls", 3)))
 

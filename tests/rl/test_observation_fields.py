@@ -6,12 +6,12 @@ import torch
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.checkpoint_content import require_learner
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import Policy
-from morphgen.rl.learner_state import state_of
 from morphgen.rl.observation_layout import Layout, layout_of
 from morphgen.rl.ppo import Learner
+from morphgen.rl.runs.checkpoint import require_learner
+from morphgen.rl.runs.training import state_of
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS

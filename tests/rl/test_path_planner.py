@@ -19,7 +19,7 @@ from morphgen.rl.baselines.path_planner import (
 )
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.free_space import RESOLUTION, FreeSpace
-from morphgen.tasks.make import make_batch
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import Block, Scene
 
 STEP = np.array([0.02, 0.02])

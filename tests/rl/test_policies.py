@@ -17,7 +17,7 @@ from helpers.observations import (
     observed,
     outputs,
 )
-from morphgen.benchmark.token_layout import POSITION
+from morphgen.benchmark.tokens import POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS, transformer
 from morphgen.rl.agents.encoder import Entities

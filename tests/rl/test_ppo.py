@@ -12,15 +12,16 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import merged_metrics
-from morphgen.rl.learning_rate import KL_FACTOR, MIN_ACTOR_LR_SCALE, next_actor_lr_scale
-from morphgen.rl.metrics import explained_variance
+from morphgen.rl.distributed import explained_variance, merged_metrics
 from morphgen.rl.ppo import (
+    KL_FACTOR,
+    MIN_ACTOR_LR_SCALE,
     Learner,
     ema_update,
+    next_actor_lr_scale,
     policy_loss,
+    symlog,
 )
-from morphgen.rl.symlog import symlog
 
 
 def test_policy_loss_by_hand():

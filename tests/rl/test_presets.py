@@ -5,11 +5,11 @@ from dataclasses import asdict
 import pytest
 
 from morphgen.errors import TaskError
-from morphgen.rl.advantages import normalized_advantages
-from morphgen.rl.agent_spec import SWITCHES, configs_of, parse_agent
 from morphgen.rl.agents import AGENTS, network_fields
 from morphgen.rl.config import NUMBERS, PPOConfig
-from morphgen.rl.presets import FAST, PAPER, PRESETS, preset_of
+from morphgen.rl.ppo import normalized_advantages
+from morphgen.rl.runs.agent_spec import SWITCHES, configs_of, parse_agent
+from morphgen.rl.runs.presets import FAST, PAPER, PRESETS, preset_of
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

@@ -13,11 +13,11 @@ from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import push_planner
 from morphgen.rl.baselines.push_contacts import find_contacts
 from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics
-from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.robot_tables import build_robot_tables
+from morphgen.tasks.scenes.env_specs import member_spec
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)

@@ -8,10 +8,9 @@ from helpers.submissions import PROTOCOL, SPLIT, VERSION, data
 from morphgen.errors import BenchmarkError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl import reference_scores
-from morphgen.rl.reference_scores import collect_references, reference_files
-from morphgen.rl.submission import Submission
-from morphgen.rl.submission_checks import require_same_random
+from morphgen.rl.scores import reference_scores
+from morphgen.rl.scores.reference_scores import collect_references, reference_files
+from morphgen.rl.scores.submission import Submission, require_same_random
 
 TEST = -1
 """Index of the test robot."""

@@ -7,11 +7,11 @@ from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
 from helpers.learners import learner
 from helpers.scenes import robot
-from morphgen.rl.final_observations import FinalObservations
+from morphgen.rl.ppo import FinalObservations
 from morphgen.tasks import host
-from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import batch_from_specs
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=5)
 

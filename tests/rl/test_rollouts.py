@@ -8,7 +8,7 @@ import torch
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.play import make_env_and_controller, play, read_controller
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.make import make_batch
+from morphgen.tasks.scenes.make import make_batch
 
 
 @pytest.fixture

@@ -15,18 +15,8 @@ from helpers.commands import tree
 from helpers.learners import learner
 from helpers.runs import small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
-from morphgen.rl.learner_state import state_of
-from morphgen.rl.metrics import UpdateMetrics
-from morphgen.rl.recorders import (
-    METRICS,
-    Metrics,
-    TensorBoard,
-    read_metrics,
-    recording,
-    require_wandb,
-)
-from morphgen.rl.robot_source import robot_source, specs_of
-from morphgen.rl.runs import (
+from morphgen.rl.distributed import UpdateMetrics
+from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
     CONFIG,
     config_from,
@@ -35,8 +25,17 @@ from morphgen.rl.runs import (
     read_config,
     write_checkpoint,
 )
-from morphgen.rl.training import ROBOTS
-from morphgen.tasks.env_specs import GoalConfig
+from morphgen.rl.runs.recorders import (
+    METRICS,
+    Metrics,
+    TensorBoard,
+    read_metrics,
+    recording,
+    require_wandb,
+)
+from morphgen.rl.runs.robot_source import robot_source, specs_of
+from morphgen.rl.runs.training import ROBOTS, state_of
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
 def report(update, success=0.5):

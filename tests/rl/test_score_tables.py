@@ -11,13 +11,13 @@ from helpers.submissions import SPLIT, data
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split
 from morphgen.errors import BenchmarkError
-from morphgen.rl.score_tables import (
+from morphgen.rl.scores.score_tables import (
     cells_without_episodes,
     read_submissions,
     result_rows,
     result_tables,
 )
-from morphgen.rl.submission import submission_from
+from morphgen.rl.scores.submission import submission_from
 
 BASELINE = {"mode": "", "training_seed": None}
 TRAINING = {"simulator": "warp", "transitions": 30_000_000}

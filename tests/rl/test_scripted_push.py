@@ -10,9 +10,9 @@ from helpers.simulators import PYBULLET
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines.push_planner import PushPlanner
 from morphgen.rl.baselines.scripted_push import MAX_PLANS, RISE, ScriptedPush
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import make_batch
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)

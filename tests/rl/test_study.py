@@ -18,25 +18,35 @@ from helpers.commands import tree
 from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
-from morphgen.rl import study, study_work
-from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.evaluation import Score
 from morphgen.rl.inference import MODES
-from morphgen.rl.recorders import METRICS
-from morphgen.rl.robot_source import members, other_side
-from morphgen.rl.runs import CHECKPOINT
-from morphgen.rl.study import (
+from morphgen.rl.runs.checkpoint import CHECKPOINT
+from morphgen.rl.runs.recorders import METRICS
+from morphgen.rl.runs.robot_source import members, other_side
+from morphgen.rl.runs.training import subruns_of
+from morphgen.rl.scores import study
+from morphgen.rl.scores import study as study_work
+from morphgen.rl.scores.score_tables import (
+    CURVES,
+    DATA,
+    ROBOTS,
+    TABLE,
+    rows,
+    table_text,
+    write_tables,
+)
+from morphgen.rl.scores.scores import UNSTABLE
+from morphgen.rl.scores.study import (
     SCORES,
     agent_cell,
     baseline_cells,
     matched_budget,
     read_scores,
     require_cells,
+    run_cells,
+    run_cells_on_ray,
 )
-from morphgen.rl.study_report import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
-from morphgen.rl.study_work import run_cells, run_cells_on_ray
-from morphgen.rl.submission import read_submission
-from morphgen.rl.training import subruns_of
+from morphgen.rl.scores.submission import read_submission
 
 pytestmark = pytest.mark.slow
 

@@ -1,6 +1,6 @@
 """Tables of a study."""
 
-from morphgen.rl.study_report import Row, table_text
+from morphgen.rl.scores.score_tables import Row, table_text
 
 
 def test_a_table_of_several_splits_has_a_section_for_each():

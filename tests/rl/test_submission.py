@@ -13,9 +13,8 @@ from morphgen.benchmark.split import split_id
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl import reference_scores
-from morphgen.rl.intervals import stratified_mean_interval
-from morphgen.rl.leaderboard import (
+from morphgen.rl.scores import reference_scores
+from morphgen.rl.scores.leaderboard import (
     Row,
     SideScore,
     random_scores,
@@ -23,10 +22,15 @@ from morphgen.rl.leaderboard import (
     ranking_table,
     score_submission,
 )
-from morphgen.rl.reference_scores import collect_references, read_references, reference_files
-from morphgen.rl.submission import Submission, read_submission, submission_text
-from morphgen.rl.submission_checks import check_submission
-from morphgen.tasks.eval_protocol import EvalProtocol, protocol_from
+from morphgen.rl.scores.reference_scores import collect_references, read_references, reference_files
+from morphgen.rl.scores.scores import stratified_mean_interval
+from morphgen.rl.scores.submission import (
+    Submission,
+    check_submission,
+    read_submission,
+    submission_text,
+)
+from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
 
 LIBRARY = default_library()
 TEST = -1
@@ -291,7 +295,7 @@ def write_cell(folder, *, tuned=False, **changes):
     from dataclasses import asdict
 
     from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.scores import Score
+    from morphgen.rl.scores.scores import Score
 
     scores = [
         vars(Score(each.member.name, each.side, "reach", 4, 1200, 2.0, 1.0, 3.0, 1, -1, 1, 0, 0, 0))
@@ -374,8 +378,8 @@ def test_the_rules_of_an_evaluation_are_read_as_they_were_written():
 
 
 def test_expected_goal_sets_are_those_of_episodes():
-    from morphgen.rl.robot_source import specs_of
-    from morphgen.tasks.env_specs import GoalConfig
+    from morphgen.rl.runs.robot_source import specs_of
+    from morphgen.tasks.scenes.env_specs import GoalConfig
 
     specs = specs_of(small_source(), GoalConfig())
     assert [spec.goals.key for spec in specs] == [each.goal_set for each in EXPECTED[:2]]

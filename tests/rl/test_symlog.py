@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from morphgen.rl.symlog import half_square, matching_loss, symexp, symlog
+from morphgen.rl.ppo import half_square, matching_loss, symexp, symlog
 
 
 def test_symexp_is_the_inverse_of_symlog():

@@ -17,13 +17,13 @@ from helpers.runs import POLICY, PPO, QUIET, equal, small_config, small_source, 
 from helpers.splits import member, split
 from morphgen.errors import BenchmarkError, FormatError, TaskError
 from morphgen.formats.files import locked_folder
-from morphgen.rl import training
 from morphgen.rl.agents import mlp
 from morphgen.rl.ppo import Learner
-from morphgen.rl.recorders import METRICS, read_metrics
-from morphgen.rl.robot_source import robot_source, split_source
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
-from morphgen.rl.training import (
+from morphgen.rl.runs import training
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
+from morphgen.rl.runs.recorders import METRICS, read_metrics
+from morphgen.rl.runs.robot_source import robot_source, split_source
+from morphgen.rl.runs.training import (
     ExecutionConfig,
     checkpoint_files,
     require_runnable,
@@ -365,7 +365,7 @@ def test_training_and_evaluation_do_not_need_pybullet(tmp_path):
         "import sys; sys.modules['pybullet'] = None\n"
         "from pathlib import Path\n"
         "from morphgen.rl.evaluation import evaluate_run\n"
-        "from morphgen.rl.training import train\n"
+        "from morphgen.rl.runs.training import train\n"
         "from helpers.runs import EVAL, QUIET, small_config\n"
         "folder = Path(sys.argv[1])\n"
         "train(folder, small_config(total_timesteps=32), execution=QUIET)\n"

@@ -14,24 +14,24 @@ from helpers.splits import member, split
 from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.drawn_robots import FILE, draw, drawn_source
-from morphgen.rl.learner_state import use_batch
-from morphgen.rl.recorders import read_metrics
-from morphgen.rl.robot_source import specs_of, split_source
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.training import train
-from morphgen.rl.training_batches import (
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
+from morphgen.rl.runs.drawn_robots import FILE, draw, drawn_source
+from morphgen.rl.runs.recorders import read_metrics
+from morphgen.rl.runs.robot_source import specs_of, split_source
+from morphgen.rl.runs.training import (
     TrainingBatches,
     default_slice_updates,
     num_actuated,
     num_slices,
     slice_of,
+    train,
+    use_batch,
 )
-from morphgen.tasks.env_specs import GoalConfig, load_robot
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.robot_tables import build_robot_tables
+from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 CONFIGS = (ReachConfig(num_goals=3), PushConfig())
 

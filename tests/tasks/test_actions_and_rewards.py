@@ -12,8 +12,8 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import curriculum_line, push_terms
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import anybody_score, reach_terms
-from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.rows import limit_violation
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 CPU = torch.device("cpu")
 

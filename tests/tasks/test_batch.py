@@ -16,10 +16,10 @@ from morphgen.model.robot import TOOL
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.tasks.actions import BINS, encode_actions
-from morphgen.tasks.make import batch_from_specs, make_batch
+from morphgen.tasks.batch_observation import NOISE
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.point_clouds import NOISE
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 
 CONFIG = replace(ReachConfig(), num_goals=20)
 WORDS = ("arm3", "arm=ur5 ee=plane", "prims")

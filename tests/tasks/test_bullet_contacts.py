@@ -16,7 +16,7 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from helpers.pybullet_states import client_of, reset, touching
-from morphgen.tasks.sim.bullet_scene import FRICTION
+from morphgen.tasks.sim.bullet_batch import FRICTION
 
 
 def block_scene(friction=1.0, height=0.5, mass=0.1):

@@ -23,7 +23,7 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from helpers.pybullet_states import client_of, reset
-from morphgen.tasks.sim.bullet_scene import OVERSPEED
+from morphgen.tasks.sim.bullet_batch import OVERSPEED
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])

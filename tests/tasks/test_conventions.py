@@ -28,13 +28,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 import morphgen
 from helpers.simulators import needs_pybullet
 from morphgen.errors import MorphgenError, TaskError
-from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.gym.env import TaskEnv
+from morphgen.tasks.gym.sb3 import SB3Vector
+from morphgen.tasks.gym.vector import TaskVector, task_vector
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.sb3 import SB3Vector
 from morphgen.tasks.sim.base import Contacts
-from morphgen.tasks.vector import TaskVector, task_vector
 
 REACH, PUSH = "morphgen/Reach-v0", "morphgen/Push-v0"
 STEPS = 8
@@ -658,7 +658,7 @@ def test_hindsight_replay_learns():
 def test_vectors_of_stable_baselines3(kind):
     options = {"robot": "arm3-stick", "config": CONFIGS[REACH], "sim": "kinematic"}
     vec = make_vec_env(
-        f"morphgen.tasks.gym_env:{REACH}", n_envs=2, seed=1, env_kwargs=options, vec_env_cls=kind
+        f"morphgen.tasks.gym.env:{REACH}", n_envs=2, seed=1, env_kwargs=options, vec_env_cls=kind
     )
     vec.reset()
     for _ in range(STEPS):

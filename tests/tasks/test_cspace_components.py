@@ -13,8 +13,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Link
-from morphgen.tasks.cspace_components import cspace_components, in_other_component
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene

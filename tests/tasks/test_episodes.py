@@ -14,11 +14,11 @@ from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.rollouts import STEPS_UNREAD, run_episodes
 from morphgen.tasks import host
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.robot_tables import build_robot_tables
+from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=9, train_layouts=3, eval_layouts=1)
 PUSH = PushConfig(num_goals=6, max_episode_steps=11, train_layouts=3, eval_layouts=1)

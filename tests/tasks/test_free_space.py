@@ -9,7 +9,7 @@ import pytest
 from helpers.scenes import push_scene, reach_scene, real_arm_scene
 from morphgen.checks.self_collision import PENETRATION
 from morphgen.errors import BenchmarkError
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot

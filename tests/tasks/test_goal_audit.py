@@ -9,11 +9,11 @@ import pytest
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.split_file import read_split
-from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.goal_audit import CODES, NEAR, audit_goals, with_goal_findings
+from morphgen.tasks.goals.goal_audit import CODES, NEAR, audit_goals, with_goal_findings
+from morphgen.tasks.goals.split_goals import SplitGoals, sample_split_goals
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.split_goals import SplitGoals, sample_split_goals
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 REACH = "train", "gantry-plane"

@@ -7,9 +7,9 @@ import pytest
 
 from helpers.goal_sets import CONFIG, LIFTED, sample_goals
 from morphgen.errors import BenchmarkError, TaskError
-from morphgen.tasks import obstacles
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.obstacles import (
+from morphgen.tasks.scenes import obstacles
+from morphgen.tasks.scenes.obstacles import (
     draw_boxes,
     draw_layouts,
     layouts_of,

@@ -17,16 +17,17 @@ from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
-from morphgen.tasks import free_space, goal_sets
+from morphgen.tasks import free_space
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.obstacles import (
+from morphgen.tasks.goals import goal_sets
+from morphgen.tasks.reach import goals as module
+from morphgen.tasks.reach.goals import certify_goals
+from morphgen.tasks.scenes.obstacles import (
     KEPT,
     draw_boxes,
     fewest_goals,
     place_boxes,
 )
-from morphgen.tasks.reach import goals as module
-from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 
 WORDS = (

@@ -17,7 +17,7 @@ from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
-from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -99,7 +99,7 @@ def test_both_checkers_pass(make, name, options):
         "import gymnasium, morphgen",
         "import gymnasium, morphgen.tasks",
         "import morphgen, gymnasium, morphgen.tasks",
-        "import morphgen.tasks, gymnasium, morphgen.tasks.gym_env",
+        "import morphgen.tasks, gymnasium, morphgen.tasks.gym.env",
     ],
 )
 def test_ids_are_registered_after_importing_gymnasium_and_tasks(imports):
@@ -116,7 +116,7 @@ def test_ids_are_registered_after_importing_gymnasium_and_tasks(imports):
 def test_ids_with_a_module_prefix_work_in_any_import_order():
     code = (
         "import morphgen.tasks, gymnasium\n"
-        "env_id = 'morphgen.tasks.gym_env:morphgen/Reach-v0'\n"
+        "env_id = 'morphgen.tasks.gym.env:morphgen/Reach-v0'\n"
         "try: gymnasium.make(env_id, robot='no such robot')\n"
         "except morphgen.MorphgenError as error: assert 'no such robot' in str(error)\n"
     )

@@ -13,12 +13,11 @@ from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.ik_channel import SOLVED
-from morphgen.tasks.kinematic_channels import IK_SHARE
-from morphgen.tasks.make import batch_from_specs
+from morphgen.tasks.kinematic_channels import IK_SHARE, SOLVED
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import batch_from_specs
 
 CHANGE = 3
 """Column of the channel with the displacement of the joint in rad or m."""

@@ -13,11 +13,11 @@ from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.device import batch_device
-from morphgen.tasks.gym_env import TaskEnv
-from morphgen.tasks.make import batch_from_specs, make_batch
+from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS, evaluation_simulator, installed_simulators
+from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 
 REVOLUTE, PRISMATIC = "arm=ur5 ee=plane", "prims"
 CONFIG = replace(ReachConfig(), num_goals=20)

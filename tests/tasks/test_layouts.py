@@ -13,14 +13,14 @@ from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.scripted_push import ScriptedPush
+from morphgen.tasks.batch_observation import NOISE
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.gym_env import TaskEnv
-from morphgen.tasks.make import batch_from_specs
+from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.point_clouds import NOISE
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.renderer import render_state
+from morphgen.tasks.render.renderer import render_state
+from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 

@@ -8,9 +8,9 @@ import morphgen
 from helpers.robots import arm
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import CompositionError, FormatError, PartError
-from morphgen.formats.urdf_text import urdf_text
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.model.geometry import Mesh
-from morphgen.tasks.env_specs import load_robot
+from morphgen.tasks.scenes.env_specs import load_robot
 
 
 @pytest.mark.parametrize(

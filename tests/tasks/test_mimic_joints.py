@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from morphgen.api.robots import compose
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts, Scene

@@ -8,9 +8,9 @@ import pytest
 import morphgen
 from helpers.splits import member, split
 from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.tasks.env_specs import load_robot
-from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.env_specs import load_robot
+from morphgen.tasks.scenes.make import make_batch, make_split_batch
 
 WORDS = "arm=ur5 ee=stick"
 CONFIG = ReachConfig(num_goals=4)

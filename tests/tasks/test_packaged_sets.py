@@ -9,13 +9,25 @@ import pytest
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.errors import TaskError
 from morphgen.grammar.library import default_library
-from morphgen.tasks import package_sets, packaged_sets
-from morphgen.tasks.env_specs import GoalConfig, env_spec, ground_under, member_with_primitives
-from morphgen.tasks.goal_sets import goal_set_key, set_npz
-from morphgen.tasks.package_sets import identity, shipped_members, sizes_text, write_sets
-from morphgen.tasks.packaged_sets import FOLDER, INDEX, packaged_index, packaged_set
+from morphgen.tasks.goals import goal_sets as packaged_sets
+from morphgen.tasks.goals import package_sets
+from morphgen.tasks.goals.goal_sets import (
+    FOLDER,
+    INDEX,
+    goal_set_key,
+    packaged_index,
+    packaged_set,
+    set_npz,
+)
+from morphgen.tasks.goals.package_sets import identity, shipped_members, sizes_text, write_sets
+from morphgen.tasks.goals.split_goals import certify_goal_set
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.split_goals import certify_goal_set
+from morphgen.tasks.scenes.env_specs import (
+    GoalConfig,
+    env_spec,
+    ground_under,
+    member_with_primitives,
+)
 
 MEMBERS = shipped_members()
 PUSH, REACH = (

@@ -11,14 +11,18 @@ from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits
-from morphgen.tasks import obstacles
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.obstacles import place_boxes
 from morphgen.tasks.push import starts as module
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.feasibility import CLOSE, path_is_clear
-from morphgen.tasks.push.region import effective_reach, push_region
-from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.push.starts import (
+    CLOSE,
+    PushStartSet,
+    effective_reach,
+    path_is_clear,
+    push_region,
+)
+from morphgen.tasks.scenes import obstacles
+from morphgen.tasks.scenes.obstacles import place_boxes
 from morphgen.tasks.sim.base import Block, Scene
 
 CONFIG = PushConfig(num_goals=5, train_layouts=3, eval_layouts=2)

@@ -10,13 +10,13 @@ import torch
 from helpers.resets import reset_envs
 from helpers.scenes import robot
 from morphgen.errors import TaskError
-from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
-from morphgen.tasks.gym_env import TaskEnv
-from morphgen.tasks.make import make_batch
+from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
+from morphgen.tasks.gym.env import TaskEnv
+from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import anybody_score, is_near, reach_terms
-from morphgen.tasks.vector import task_vector
+from morphgen.tasks.scenes.make import make_batch
 
 POSITION = ReachConfig(num_goals=5, max_episode_steps=6)
 POSE = replace(POSITION, goal="pose")

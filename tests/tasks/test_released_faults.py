@@ -17,9 +17,9 @@ from helpers.simulators import PYBULLET
 from morphgen.model.dynamics import actuation
 from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.sim.base import Contacts
 
 SIMS = (PYBULLET, "mujoco")

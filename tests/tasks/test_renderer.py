@@ -11,18 +11,18 @@ from helpers.goal_sets import draw_spec
 from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
-from morphgen.tasks import renderer
-from morphgen.tasks.env_specs import load_robot
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.renderer import (
+from morphgen.tasks.render import renderer
+from morphgen.tasks.render.renderer import (
     Renderer,
     RenderState,
     render_state,
     require_video_path,
     write_video,
 )
+from morphgen.tasks.scenes.env_specs import load_robot
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import Block, Scene
 
 SIZE = (160, 120)

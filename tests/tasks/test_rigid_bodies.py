@@ -12,9 +12,9 @@ from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.dynamics import mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Inertial, Joint, Link
-from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import SIMULATORS
+from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 

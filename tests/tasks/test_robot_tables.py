@@ -13,7 +13,7 @@ from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.observation import LinkTokens
-from morphgen.tasks.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
+from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 FOLDERS = default_library(()).folders

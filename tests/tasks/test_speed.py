@@ -9,9 +9,9 @@ import pytest
 
 import morphgen
 from helpers.simulators import PYBULLET
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.speed import measure_speed
 
 CONFIG = replace(ReachConfig(), num_goals=4, max_episode_steps=10)

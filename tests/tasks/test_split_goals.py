@@ -15,26 +15,26 @@ from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.split_build import build_split
-from morphgen.benchmark.split_folder import load_split_folder
-from morphgen.benchmark.split_folder_files import BuildSettings
+from morphgen.benchmark.split_folder import BuildSettings, load_split_folder
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
-from morphgen.tasks import free_space, split_goals
-from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.goal_sets import arrays_of, goals_from_npz, set_npz
-from morphgen.tasks.make import make_split_batch
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach import goals as reach_goals
-from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.registry import TASKS
-from morphgen.tasks.split_goals import (
+from morphgen.tasks import free_space
+from morphgen.tasks.goals import split_goals
+from morphgen.tasks.goals.goal_sets import arrays_of, goals_from_npz, set_npz
+from morphgen.tasks.goals.split_goals import (
     SplitGoals,
     read_goals,
     read_split_goals,
     sample_robot_goals,
     write_goals,
 )
-from morphgen.tasks.split_goals import sample_split_goals as make
+from morphgen.tasks.goals.split_goals import sample_split_goals as make
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach import goals as reach_goals
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.scenes.make import make_split_batch
 
 RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 

@@ -11,10 +11,9 @@ import yaml
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
-from morphgen.benchmark import release_checks, release_file, release_texts
-from morphgen.benchmark.croissant import CONFORMS_TO
-from morphgen.benchmark.difficulty import BaselineResult, split_difficulty
-from morphgen.benchmark.difficulty_table import difficulty_csv
+from morphgen.benchmark import release_file, release_texts
+from morphgen.benchmark import verify as release_checks
+from morphgen.benchmark.difficulty import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.benchmark.release_file import (
     CROISSANT_FILE,
     DIFFICULTY_FILE,
@@ -23,16 +22,16 @@ from morphgen.benchmark.release_file import (
     opened_folder,
     read_release,
 )
+from morphgen.benchmark.release_texts import CONFORMS_TO
 from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_folder import SUMS_FILE, read_sums
-from morphgen.benchmark.split_folder_files import BuildSettings, sums_text
+from morphgen.benchmark.split_folder import SUMS_FILE, BuildSettings, read_sums, sums_text
 from morphgen.benchmark.split_source import read_split_or_folder
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
 from morphgen.grammar.library import default_library
-from morphgen.tasks.eval_protocol import EvalProtocol
-from morphgen.tasks.split_release import ReleaseRequest, release_split
+from morphgen.tasks.goals.eval_protocol import EvalProtocol
+from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
 
 LIBRARY = default_library()
 LIGHT = ReleaseRequest(

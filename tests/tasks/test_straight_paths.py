@@ -7,8 +7,8 @@ import torch
 
 from helpers.scenes import ball
 from morphgen.model.geometry import Pose
+from morphgen.tasks.batch_observation import SAME, StraightPaths
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.straight_paths import SAME, StraightPaths
 
 START, BEHIND, BESIDE = np.array([-0.5, 0.0]), np.array([0.5, 0.0]), np.array([-0.5, 0.5])
 

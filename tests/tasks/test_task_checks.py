@@ -7,12 +7,12 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PPOConfig
-from morphgen.rl.runs import config_from
-from morphgen.tasks.make import make_batch
+from morphgen.rl.runs.checkpoint import config_from
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.task import GOAL, ObservationField, Task
 
 EXTRA = ObservationField("extra", 1, GOAL.mask)

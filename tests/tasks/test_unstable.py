@@ -9,11 +9,11 @@ import torch
 from helpers.goal_sets import draw_spec
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.env_specs import load_robot
-from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.env_specs import load_robot
+from morphgen.tasks.scenes.make import batch_from_specs
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet

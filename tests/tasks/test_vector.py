@@ -17,11 +17,11 @@ from stable_baselines3.common.vec_env import VecMonitor
 from morphgen.errors import MissingDependencyError, TaskError
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.gym.sb3 import sb3_vector
+from morphgen.tasks.gym.vector import TaskVector, observation_space
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.sb3 import sb3_vector
 from morphgen.tasks.task import BOUND, ObservationField
-from morphgen.tasks.vector import TaskVector, observation_space
 
 ROBOTS, TASKS = ["arm3-stick", "prims"], ["reach", "push"]
 REACH, PUSH = (
@@ -209,7 +209,7 @@ def test_stable_baselines3_can_read_attributes(batch_from_specs):
 
 
 def test_missing_stable_baselines3_error_says_what_to_install(batch_from_specs, monkeypatch):
-    monkeypatch.delitem(sys.modules, "morphgen.tasks.sb3", raising=False)
+    monkeypatch.delitem(sys.modules, "morphgen.tasks.gym.sb3", raising=False)
     for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
         monkeypatch.delitem(sys.modules, name)
 
@@ -220,7 +220,7 @@ def test_missing_stable_baselines3_error_says_what_to_install(batch_from_specs, 
 
     monkeypatch.setattr(sys, "meta_path", [Missing(), *sys.meta_path])
     with pytest.raises(MissingDependencyError, match="pip install stable-baselines3"):
-        import_module("morphgen.tasks.sb3")
+        import_module("morphgen.tasks.gym.sb3")
 
 
 def test_gymnasium_makes_vector_envs_of_several_robots(cache):

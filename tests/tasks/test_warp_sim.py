@@ -12,8 +12,8 @@ from morphgen.errors import SimulationError, TaskError
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import sorted_pair
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.make import make_batch
 from morphgen.tasks.registry import evaluation_simulator
+from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
@@ -21,9 +21,9 @@ from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
 import warp as wp
 
-from morphgen.tasks.sim import warp_group, warp_sim
-from morphgen.tasks.sim.warp_model import structures
-from morphgen.tasks.sim.warp_sim import WarpSimulation
+from morphgen.tasks.sim import warp_sim
+from morphgen.tasks.sim import warp_sim as warp_group
+from morphgen.tasks.sim.warp_sim import WarpSimulation, structures
 from morphgen.tasks.step_graph import StepGraph
 
 if not torch.cuda.is_available():  # kernels of a GPU are tested as users run them

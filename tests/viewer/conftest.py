@@ -13,7 +13,7 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
-from morphgen.viewer.app import serve
+from morphgen.viewer.app.app import serve
 from morphgen.viewer.robot_uri import FileAccess
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

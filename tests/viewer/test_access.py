@@ -9,8 +9,7 @@ from websockets.exceptions import InvalidStatus
 
 from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
-from morphgen.viewer.access import AccessPolicy, access_policy, refusal_reason
-from morphgen.viewer.server import start_server
+from morphgen.viewer.app.server import AccessPolicy, access_policy, refusal_reason, start_server
 
 HUB = "https://hub.example.com"
 

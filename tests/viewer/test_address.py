@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morphgen.viewer.address import Address, AddressError, parse_address
-from morphgen.viewer.pages import PAGES, load_page
+from morphgen.viewer.app.address import PAGES, Address, AddressError, load_page, parse_address
 
 KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)

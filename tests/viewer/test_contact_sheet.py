@@ -12,8 +12,7 @@ from PIL import Image
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
-from morphgen.viewer.contact_sheet import Cell, contact_sheet
-from morphgen.viewer.gallery_cards import card
+from morphgen.viewer.gallery import Cell, card, contact_sheet
 from morphgen.viewer.robot_rows import Row
 
 

@@ -8,8 +8,7 @@ from morphgen.grammar.grammar_file import find_grammar, grammar_from_text, load_
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request
 from morphgen.grammar.sampling import sample_robot
-from morphgen.viewer.derivation_grammar import grammar_around
-from morphgen.viewer.evolution import make_individual, offspring
+from morphgen.viewer.pages.compose_grammar import grammar_around, make_individual, offspring
 
 LIBRARY = default_library()
 

@@ -8,9 +8,9 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robot
-from morphgen.viewer.address import AddressError, pack_text
-from morphgen.viewer.compose_view import Facts, change_text
-from morphgen.viewer.evolution import (
+from morphgen.viewer.app.address import AddressError, pack_text
+from morphgen.viewer.pages.compose_evolve import Facts, change_text
+from morphgen.viewer.pages.compose_grammar import (
     NUM_OFFSPRING,
     History,
     change_lines,
@@ -19,7 +19,7 @@ from morphgen.viewer.evolution import (
     pack_choices,
     unpack_choices,
 )
-from morphgen.viewer.scene_offspring import hit_robot
+from morphgen.viewer.scene.robot import hit_robot
 
 LIBRARY = default_library()
 

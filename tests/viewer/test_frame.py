@@ -8,14 +8,14 @@ from urllib.parse import quote
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.viewer.address import (
+from morphgen.viewer.app.address import (
     MAX_CHOSEN,
     Address,
     AddressError,
     parse_address,
     require_few_chosen,
 )
-from morphgen.viewer.frame import page_links, shown_address, tray_html
+from morphgen.viewer.app.frame import page_links, shown_address, tray_html
 
 A, B = "words:arm=ur5 ee=plane", "robots/prims/prims-000001"
 

@@ -3,8 +3,8 @@
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.viewer.address import AddressError
-from morphgen.viewer.gallery_filter import parse_range
+from morphgen.viewer.app.address import AddressError
+from morphgen.viewer.gallery import parse_range
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from helpers.viser_client import CAMERA, PlainClient
-from morphgen.viewer.messages import message_fault
+from morphgen.viewer.app.server import message_fault
 
 
 @pytest.mark.parametrize(

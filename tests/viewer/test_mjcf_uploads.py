@@ -4,8 +4,8 @@ import pytest
 import trimesh
 
 from helpers.uploads import URDF, archive
+from morphgen.viewer.app.uploads import UploadError, store_upload
 from morphgen.viewer.robot_uri import UriError, read_robot_uri
-from morphgen.viewer.uploads import UploadError, store_upload
 
 BODY = b'<worldbody><body name="%s"><geom type="box" size="1 1 1"/></body></worldbody>'
 MJCF = b'<mujoco model="m">%s</mujoco>'

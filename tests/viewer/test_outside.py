@@ -9,7 +9,7 @@ import pytest
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
-from morphgen.rl.robot_source import RobotSource
+from morphgen.rl.runs.robot_source import RobotSource
 from morphgen.viewer import rollout
 
 WORD = "tellnobody"

@@ -10,8 +10,8 @@ from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
 from morphgen.model.geometry import Box
-from morphgen.viewer import workspace
-from morphgen.viewer.scene_shapes import grown_triangles
+from morphgen.viewer.scene import overlays as workspace
+from morphgen.viewer.scene.stage import grown_triangles
 
 ARM = "?robot=robots/some-arm"
 

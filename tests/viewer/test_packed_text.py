@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morphgen.viewer.address import (
+from morphgen.viewer.app.address import (
     MAX_PACKED,
     MAX_UNPACKED,
     Address,

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from morphgen.viewer.address import AddressError
+from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.parallel_coordinates import Axis, parallel_svg, parse_brush
 from morphgen.viewer.robot_rows import Row
 

@@ -7,8 +7,8 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.page_compose_parameters import with_parameter
-from morphgen.viewer.part_choice import (
+from morphgen.viewer.pages.compose_parts import with_parameter
+from morphgen.viewer.pages.part_choice import (
     NO_PART,
     choice_of,
     controls_of,

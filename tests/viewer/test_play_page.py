@@ -8,7 +8,7 @@ import pytest
 import zstandard
 
 from helpers.runs import QUIET, small_config, small_source
-from morphgen.rl.training import train
+from morphgen.rl.runs.training import train
 from morphgen.viewer.episode import read_episode, score_until
 
 pytestmark = pytest.mark.slow

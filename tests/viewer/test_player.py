@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from morphgen.errors import TaskError
-from morphgen.viewer.address import AddressError
-from morphgen.viewer.page_play import parse_time
-from morphgen.viewer.player import Player
+from morphgen.viewer.app.address import AddressError
+from morphgen.viewer.pages.play import parse_time
+from morphgen.viewer.rollout import Player
 
 WAIT = 30
 

@@ -10,7 +10,7 @@ from helpers.viser_client import PlainClient
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer.episode import Episode, Track, score_until
 from morphgen.viewer.figures import histogram_svg
-from morphgen.viewer.page_play_plots import curves
+from morphgen.viewer.pages.play import curves
 
 
 def track(num_steps):

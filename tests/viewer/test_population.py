@@ -15,30 +15,33 @@ from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Link, Robot
 from morphgen.viewer import population_layout as layout
-from morphgen.viewer import scene_population
 from morphgen.viewer.comparison import parse_moves, with_roles
-from morphgen.viewer.population import make_population, move_roles, robot_bounds, shape_poses
-from morphgen.viewer.population_hover import SCALE, pack_capsules
-from morphgen.viewer.population_pick import View, project, project_points, robot_at, robots_in
-from morphgen.viewer.population_source import (
+from morphgen.viewer.pages.population import (
+    SCALE,
+    card,
+    format_selection,
+    pack_capsules,
+    parse_selection,
+)
+from morphgen.viewer.population import (
     NUM_POSES,
     find_source,
     free_configurations,
+    make_population,
+    move_roles,
     read_robots,
+    robot_bounds,
     sample_robots,
+    shape_poses,
     token_rows,
 )
-from morphgen.viewer.population_state import (
-    card,
-    format_selection,
-    parse_selection,
-)
+from morphgen.viewer.population_pick import View, project, project_points, robot_at, robots_in
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, owned_set, read_robot_uri
-from morphgen.viewer.scene_population import quaternions, world_poses
-from morphgen.viewer.scene_robot import robot_bounds as one_robot_bounds
-from morphgen.viewer.scene_shapes import batch_colours
-from morphgen.viewer.scene_stage import fit_camera
+from morphgen.viewer.scene import population as scene_population
+from morphgen.viewer.scene.population import quaternions, world_poses
+from morphgen.viewer.scene.robot import robot_bounds as one_robot_bounds
+from morphgen.viewer.scene.stage import batch_colours, fit_camera
 
 
 @pytest.fixture

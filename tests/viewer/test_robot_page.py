@@ -18,9 +18,9 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.model.kinematics import frame_pose
-from morphgen.viewer.page_robot_show import format_joints
+from morphgen.viewer.pages.robot_show import format_joints
 from morphgen.viewer.robot_uri import read_robot_uri
-from morphgen.viewer.scene_robot import RED
+from morphgen.viewer.scene.robot import RED
 
 ARM = "?robot=robots/some-arm"
 

@@ -7,8 +7,7 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.model.robot import Inertial
-from morphgen.viewer.page_robot_move import free_configuration
-from morphgen.viewer.page_robot_show import format_joints, parse_joints
+from morphgen.viewer.pages.robot_show import format_joints, free_configuration, parse_joints
 from morphgen.viewer.robot_tables import (
     collision_text,
     joint_groups,
@@ -18,8 +17,8 @@ from morphgen.viewer.robot_tables import (
     slider_step,
     summary,
 )
-from morphgen.viewer.scene_robot import robot_bounds
-from morphgen.viewer.scene_shapes import inertia_box
+from morphgen.viewer.scene.robot import robot_bounds
+from morphgen.viewer.scene.stage import inertia_box
 
 
 def test_joints_are_grouped_by_their_part():

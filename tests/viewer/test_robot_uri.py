@@ -10,7 +10,7 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
-from morphgen.viewer.app import start_address
+from morphgen.viewer.app.app import start_address
 from morphgen.viewer.robot_rows import (
     folder_rows,
     neighbour_uris,

@@ -14,17 +14,23 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
-from morphgen.rl import runs
 from morphgen.rl.play import make_env_and_controller, play, read_controller
-from morphgen.rl.training import train
-from morphgen.viewer.address import Address
-from morphgen.viewer.app import start_address
+from morphgen.rl.runs import checkpoint as runs
+from morphgen.rl.runs.training import train
+from morphgen.viewer.app.address import Address
+from morphgen.viewer.app.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.episode_export import episode_page, make_renderer, record_scene
-from morphgen.viewer.page_play_controls import parse_rollout, rollout_address
+from morphgen.viewer.pages.play import parse_rollout, rollout_address
 from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess
 from morphgen.viewer.rollout import RecordedEpisode, Rollout, RolloutConfig, simulators
-from morphgen.viewer.scene_rollout import GAP, grid_positions, track_area
+from morphgen.viewer.scene.rollout import (
+    GAP,
+    episode_page,
+    grid_positions,
+    make_renderer,
+    record_scene,
+    track_area,
+)
 
 CUBE = "words:base=planar ee=cube"
 

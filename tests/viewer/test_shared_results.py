@@ -1,6 +1,6 @@
 """Results that the pages of all browsers share."""
 
-from morphgen.viewer.shared_results import SharedResults
+from morphgen.viewer.app.workers import SharedResults
 
 
 def test_a_result_is_made_once_and_the_least_recently_used_is_dropped():

@@ -7,8 +7,8 @@ import pytest
 from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
-from morphgen.viewer.address import parse_address
-from morphgen.viewer.page_gallery import choose_sides
+from morphgen.viewer.app.address import parse_address
+from morphgen.viewer.pages.gallery import choose_sides
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.splits import make_member, save_split

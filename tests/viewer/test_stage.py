@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from morphgen.viewer.scene_stage import add_scale_bar, look_at
+from morphgen.viewer.scene.stage import add_scale_bar, look_at
 
 POINT = np.zeros(3)
 LOW, HIGH = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.5])

@@ -19,10 +19,10 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.model.mesh import mesh_parts
-from morphgen.viewer import uploads
+from morphgen.viewer.app import uploads
+from morphgen.viewer.app.uploads import UploadError, store_upload
 from morphgen.viewer.robot_files import bundle_files, thumbnail_of_picture, zip_files
 from morphgen.viewer.robot_uri import UriError, read_robot_uri
-from morphgen.viewer.uploads import UploadError, store_upload
 
 MESHED = (
     b'<robot name="r"><link name="a"><visual><geometry><mesh filename="%s"/>'

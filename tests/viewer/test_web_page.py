@@ -19,11 +19,11 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
-from morphgen.tasks.renderer import Renderer, RenderState
+from morphgen.tasks.render.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
-from morphgen.viewer import turntable as turntable_module
-from morphgen.viewer.turntable import turntable
-from morphgen.viewer.web_page import joint_sweep, joint_titles, robot_page
+from morphgen.viewer.app.web_page import joint_sweep, joint_titles, robot_page
+from morphgen.viewer.scene import robot as turntable_module
+from morphgen.viewer.scene.robot import turntable
 
 ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
 

@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from helpers.worker_functions import die_later, power, sleep_from
-from morphgen.viewer.workers import WorkerDied, Workers
+from morphgen.viewer.app.workers import WorkerDied, Workers
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""MJCF: documents of strangers, reading and writing."""

@@ -1,0 +1,393 @@
+"""Read MJCF documents from untrusted sources: one text without files, and the meshes it names."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from lxml import etree
+
+from morphgen.errors import FormatError
+from morphgen.formats.data_files import read_bytes
+from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolve_uri
+from morphgen.formats.urdf.read import UnsoundError
+from morphgen.formats.urdf.schema import MAX_LINKS
+from morphgen.formats.xacro.evaluator import RefusedError
+from morphgen.formats.xml import parse_description
+from morphgen.model.findings import Finding
+
+MAX_MJCF_BYTES = 8 * 2**20
+"""Largest MJCF that is read, with all its includes [bytes]."""
+MAX_INCLUDES = 100
+"""Largest number of files that an MJCF includes."""
+MAX_DEPTH = 40
+"""Deepest nesting of includes."""
+MAX_COPIES = 10_000
+"""Largest number of elements that the ``<replicate>`` elements of an MJCF make."""
+MAX_ELEMENTS = {"*": 20_000, "body": MAX_LINKS, "default": 1000, "mesh": 2000, "replicate": 100}
+"""Largest number of elements of an MJCF with its includes, of all tags and of some. MuJoCo's time
+grows with the square of it."""
+GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
+"""Types of geoms that a robot can have, for errors."""
+
+_IGNORED = ("size", "visual", "statistic", "custom", "sensor", "deformable")
+"""Sections without a counterpart in ``Robot``. Some allocate memory as the file demands."""
+_ASSETS = ("mesh", "material", "hfield")
+"""Assets that are kept; textures, skins and models would be read from files."""
+_ELEMENTS = frozenset(
+    [
+        *("mujoco", "mujocoinclude", "include", "compiler", "option", "flag", "default", *_ASSETS),
+        *("asset", "worldbody", "body", "frame", "replicate", "inertial", "joint", "freejoint"),
+        *("geom", "site", "camera", "light", "contact", "pair", "exclude", "tendon", "spatial"),
+        *("fixed", "pulley", "equality", "connect", "weld", "keyframe", "key", "actuator"),
+        *("general", "motor", "position", "velocity", "intvelocity", "orientation", "pid"),
+        *("damper", "cylinder", "muscle", "adhesion", "dcmotor"),
+    ]
+)
+"""Elements that MuJoCo gets. All others are refused or left out."""
+_LEFT_OUT = frozenset([*_IGNORED, "texture", "skin", "model", "layer", "lengthrange"])
+"""Elements that are left out with everything in them, wherever they are."""
+_REFUSED = {
+    "plugin": "plugins are code",
+    "extension": "plugins are code",
+    "attach": "a robot is read from one model; put its bodies into this file",
+    "composite": "a robot has rigid links",
+    "flexcomp": "a robot has rigid links",
+    "flex": "a robot has rigid links",
+    "flexstrain": "a robot has rigid links",
+}
+"""Elements that are refused, and why."""
+_UNHELD = {
+    "geom": "friction condim priority solmix solref solimp margin gap fluidshape fluidcoef hfield",
+    "joint": (
+        "stiffness springref springdamper armature margin solreffriction solimpfriction "
+        "solreflimit solimplimit actuatorgravcomp"
+    ),
+    "freejoint": "group align",
+    "body": "gravcomp sleep",
+    "site": "type size fromto group material rgba",
+    "material": (
+        "texture texrepeat texuniform emission specular shininess reflectance metallic roughness"
+    ),
+    "mesh": "smoothnormal maxhullvert texcoord",
+    "connect": "solref solimp",
+    "weld": "solref solimp torquescale",
+    "spatial": "stiffness damping frictionloss springlength width material rgba",
+    "fixed": "stiffness damping frictionloss springlength",
+    **dict.fromkeys(
+        ("general", "motor", "position", "velocity", "intvelocity", "damper", "muscle"),
+        "kp kv dampratio timeconst inheritrange gainprm biasprm dynprm gaintype biastype dyntype",
+    ),
+}
+"""Attributes of elements that MuJoCo gets for which a ``Robot`` has no place."""
+_UNHELD_ELEMENTS = ("option", "flag", "light", "camera", "pair")
+"""Elements that MuJoCo gets for which a ``Robot`` has no place, besides ``_LEFT_OUT``."""
+_FILES = re.compile(r"file|file(back|down|front|left|right|up)|(asset|mesh|texture)dir")
+"""Attributes that name files or folders."""
+_ALLOCATING = ("user", "act", "actdim", "nsample", "delay", "interp")
+"""Attributes by which MuJoCo allocates memory, for values that a robot does not have."""
+_LINE = re.compile(r",? line \d+(, column \d+)?")
+
+
+@dataclass(frozen=True)
+class MjcfDocument:
+    """An MJCF document that names no file."""
+
+    path: Path
+    """The file that it was read from."""
+    name: str
+    """Name of the model; that of the file if the document has none."""
+    text: str
+    """The document with includes inserted, without the sections that a robot does not need."""
+    meshes: Mapping[str, Path]
+    """File of every mesh asset by name; assets with vertices in the document have none until
+    ``inline_meshes`` adds it."""
+    includes: tuple[Path, ...] = ()
+    """Files whose content is inserted."""
+    findings: tuple[Finding, ...] = ()
+    """Repairs without which the document could not be parsed, and what is left out."""
+
+    def error(self, why: str) -> FormatError:
+        """Return an error about the document, without the lines of the text with includes."""
+        return FormatError(f"{self.path}: {' '.join(_LINE.sub('', why).split())}")
+
+
+def read_document(path: Path, finder: PackageFinder, *, with_options: bool = False) -> MjcfDocument:
+    """Read an MJCF with its includes, and resolve the files of its meshes.
+
+    Included files come from the folders that ``require_allowed_text`` allows, meshes from those of
+    ``resolve_uri``. Their names are relative to the folder of ``path``; those of a nested include
+    also to the folder of the file that includes it. Textures, height fields and skins are not read.
+
+    MuJoCo gets the elements of an allow-list. It ignores namespaces, which would hide an element
+    from that list, so names with a namespace are refused.
+
+    Args:
+        path: The file.
+        finder: Finds ROS packages, and the folder that files may come from.
+        with_options: Whether to keep the options of a simulation.
+
+    Raises:
+        UnsoundError: If a mesh is not found; it lists all of them.
+        FormatError: If a file is missing, too large, not XML or elsewhere, or the document has an
+            element that cannot be read.
+    """
+    includes = _Includes(path, finder)
+    root, findings = includes.read(path, 0)
+    etree.cleanup_namespaces(root)
+    _require_few_elements(root, path)
+    if not with_options:
+        for element in [*root.iterchildren("option")]:
+            root.remove(element)
+    for field in root.iterfind("asset/hfield"):
+        field.set("name", field.get("name") or PurePosixPath(field.get("file", "")).stem)
+        _drop(field, "file", "content_type", "elevation")
+        field.set("nrow", "2")
+        field.set("ncol", "2")
+    for element in root.iter("material", "light"):
+        _drop(element, "texture")
+    meshes = _take_mesh_files(root, path, finder)
+    for element in root.iter():
+        _drop(element, *_ALLOCATING)
+        if named := [key for key in element.attrib if _FILES.fullmatch(str(key))]:
+            raise FormatError(
+                f"{path}: <{element.tag}> has the attribute {named[0]!r}; only assets, includes "
+                "and the compiler name files"
+            )
+    where = str(path)
+    return MjcfDocument(
+        path,
+        root.get("model") or path.stem,
+        etree.tostring(root, encoding="unicode"),
+        meshes,
+        includes.files,
+        tuple(replace(f, where=f"{path.name}{f.where.removeprefix(where)}") for f in findings),
+    )
+
+
+class _Includes:
+    """Reads a document and inserts the files that it includes, each at most once."""
+
+    def __init__(self, main: Path, finder: PackageFinder) -> None:
+        self._main = main
+        self._finder = finder
+        self._seen: set[Path] = set()
+        self._bytes_left = MAX_MJCF_BYTES
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files read so far, links resolved, besides the main one."""
+        return tuple(sorted(self._seen - {self._main.resolve()}))
+
+    def read(self, path: Path, depth: int) -> tuple[etree._Element, tuple[Finding, ...]]:
+        """Return the root of a file with its includes inserted, and what was repaired."""
+        self._require_bounded(path, depth)
+        if self._bytes_left <= 0:
+            raise FormatError(
+                f"{path}: holds more than {MAX_MJCF_BYTES} bytes with its includes, the most that "
+                "is read"
+            )
+        data = read_bytes(path, self._bytes_left)
+        self._bytes_left -= len(data)
+        root, findings = parse_description(data, str(path))
+        findings = (*findings, *_left_out_findings(root, path))
+        _keep_known(root, path)
+        for element in [*root.iter("include")]:
+            included = self._file(element, path)
+            child, more = self.read(included, depth + 1)
+            findings = (*findings, *more)
+            parent = element.getparent()
+            if parent is None:
+                raise FormatError(f"{path}: the root element is <include>, not <mujoco>")
+            at = parent.index(element)
+            parent[at : at + 1] = [*child]
+        return root, findings
+
+    def _require_bounded(self, path: Path, depth: int) -> None:
+        real = path.resolve()
+        if real in self._seen:
+            raise FormatError(f"{path}: is included twice; MJCF includes a file once")
+        if depth > MAX_DEPTH:
+            raise FormatError(f"{path}: includes are nested deeper than {MAX_DEPTH} levels")
+        if len(self._seen) > MAX_INCLUDES:
+            raise FormatError(f"{self._main}: includes more than {MAX_INCLUDES} files")
+        self._seen.add(real)
+
+    def _file(self, element: etree._Element, includer: Path) -> Path:
+        where = f"{includer}:{element.sourceline}"
+        name = element.get("file", "")
+        if not name.strip():
+            raise FormatError(f"{where}: <include> names no file")
+        # MuJoCo searches the folder of the main file, then that of the file with the <include>.
+        bases = [self._main]
+        if not (self._main.parent / name).is_file() and (includer.parent / name).is_file():
+            bases = [includer]
+        file = resolve_uri(name, bases[0], self._finder)
+        try:
+            require_allowed_text(file, self._finder, self._main, includer)
+        except RefusedError as error:
+            raise FormatError(f"{where}: {error}") from error
+        return file
+
+
+def _keep_known(root: etree._Element, path: Path) -> None:
+    """Remove what a robot does not need from a file, and refuse what MuJoCo must not get."""
+    if root.tag not in ("mujoco", "mujocoinclude"):
+        raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
+    _require_plain(root, path)
+    for element in [*root.iter()]:
+        tag = str(element.tag)
+        if tag in _REFUSED:
+            name = element.get("name") or element.get("plugin") or element.get("model")
+            label = f"<{tag}>" if name is None else f"<{tag}> {name!r}"
+            raise FormatError(f"{path}: {label} is refused: {_REFUSED[tag]}")
+        if tag == "mesh" and "builtin" in element.attrib:
+            raise FormatError(
+                f"{path}: mesh {element.get('name')!r} is built in MuJoCo; give it a file, or use "
+                "a primitive geom"
+            )
+    for element in [*root.iter(*_LEFT_OUT)]:
+        remove_element(element)
+    for element in root.iter():
+        if element.tag not in _ELEMENTS:
+            raise FormatError(
+                f"{path}:{element.sourceline}: <{element.tag}> is no element of MJCF that is read"
+            )
+
+
+def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
+    """Count what is left out of a file: elements by their parent, attributes by their element."""
+    elements: dict[tuple[str, str], list[etree._Element]] = {}
+    attributes: dict[str, list[tuple[etree._Element, str]]] = {}
+    skipped = frozenset([*_LEFT_OUT, *_UNHELD_ELEMENTS])
+    todo = [root]
+    while todo:
+        element = todo.pop()
+        tag, names = str(element.tag), [str(name) for name in element.attrib]
+        unheld = (*_UNHELD.get(tag, "").split(), *_ALLOCATING)
+        if found := [(element, name) for name in names if name in unheld]:
+            attributes.setdefault(tag, []).extend(found)
+        for child in element:
+            if child.tag in skipped:
+                elements.setdefault((tag, str(child.tag)), []).append(child)
+        todo += reversed([child for child in element if child.tag not in skipped])
+    for (tag, name), children in elements.items():
+        inside = sum(sum(1 for _ in child.iterdescendants()) for child in children)
+        what = f"{len(children)} <{name}> of <{tag}>" + (
+            f" with {inside} elements inside" if inside else ""
+        )
+        yield _left_out("element-unread", f"{path}:{children[0].sourceline}", what)
+    for tag, places in attributes.items():
+        counts = Counter(name for _, name in places)
+        what = ", ".join(f"{n} {name}=..." for name, n in sorted(counts.items()))
+        yield _left_out(
+            "attribute-unread", f"{path}:{places[0][0].sourceline}", f"{what} of <{tag}>"
+        )
+
+
+def _left_out(code: str, where: str, what: str) -> Finding:
+    return Finding(
+        code,
+        "info",
+        where,
+        f"a robot has no place for {what}",
+        "none is needed",
+        f"left out: {what}",
+    )
+
+
+def _require_plain(root: etree._Element, path: Path) -> None:
+    """Require names without a namespace."""
+    for element in root.iter():
+        for name in map(etree.QName, (str(element.tag), *map(str, element.attrib))):
+            if name.namespace is not None:
+                raise FormatError(
+                    f"{path}:{element.sourceline}: {name.localname!r} has the namespace "
+                    f"{name.namespace!r}; names in an MJCF have none, remove it"
+                )
+
+
+def _require_few_elements(root: etree._Element, path: Path) -> None:
+    if root.tag != "mujoco":
+        raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
+    for tag, bound in MAX_ELEMENTS.items():
+        count = sum(1 for _ in root.iter(tag))
+        if count > bound:
+            what = "elements" if tag == "*" else f"<{tag}> elements"
+            raise FormatError(f"{path}: has {count} {what}; at most {bound} are read")
+    copies = sum(_copies(element, path) for element in root.iter("replicate"))
+    if copies > MAX_COPIES:
+        raise FormatError(
+            f"{path}: <replicate> makes {copies} elements; at most {MAX_COPIES} are read"
+        )
+
+
+def _copies(replicate: etree._Element, path: Path) -> int:
+    """Return how many elements a ``<replicate>`` makes, with those around it."""
+    copies = sum(1 for _ in replicate.iterdescendants())
+    for element in (replicate, *replicate.iterancestors("replicate")):
+        text = element.get("count", "")
+        if not text.strip().isdecimal():
+            raise FormatError(
+                f"{path}: <replicate> has count {text!r}; expected a whole number of at least 1"
+            )
+        copies *= int(text[:12])
+    return copies
+
+
+def _take_mesh_files(root: etree._Element, path: Path, finder: PackageFinder) -> dict[str, Path]:
+    """Remove the files of the mesh assets from the document, and return them by name."""
+    folder = ""
+    strip = False
+    for compiler in root.iterfind("compiler"):
+        folder = compiler.get("meshdir", compiler.get("assetdir", folder))
+        strip = compiler.get("strippath", str(strip).lower()) == "true"
+        _drop(compiler, "meshdir", "assetdir", "texturedir", "strippath")
+    meshes: dict[str, Path] = {}
+    missing: list[Finding] = []
+    for element in root.iterfind("asset/mesh[@file]"):
+        uri = element.get("file", "")
+        _drop(element, "file", "content_type")
+        parts = PurePosixPath(uri.replace("\\", "/"))
+        name = element.get("name") or parts.stem
+        element.set("name", name)
+        try:
+            inside = parts.name if strip else uri
+            meshes[name] = resolve_uri(_joined(folder, inside), path, finder)
+        except FormatError as error:
+            where = f"{path}: mesh {name!r}"
+            missing.append(
+                Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
+            )
+    if missing:
+        raise UnsoundError(str(path), missing)
+    return meshes
+
+
+def _joined(folder: str, name: str) -> str:
+    """Return a file's name below a folder, both as an MJCF writes them."""
+    return (PurePosixPath(folder.replace("\\", "/")) / name.replace("\\", "/")).as_posix()
+
+
+def _drop(element: etree._Element, *keys: str) -> None:
+    """Remove attributes, if the element has them."""
+    for key in keys:
+        if key in element.attrib:
+            del element.attrib[key]
+
+
+def remove_element(element: etree._Element) -> None:
+    """Remove an element from its parent, if it has one."""
+    parent = element.getparent()
+    if parent is not None:
+        parent.remove(element)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return quoted names, at most five, for an error."""
+    names = [*names]
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(repr(name) for name in names[:5]) + more

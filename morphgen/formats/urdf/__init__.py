@@ -1,0 +1,1 @@
+"""URDF: what it may contain, reading and writing."""

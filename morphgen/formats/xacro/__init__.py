@@ -1,0 +1,1 @@
+"""xacro: expanding files of strangers, evaluating their expressions."""

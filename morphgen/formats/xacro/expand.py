@@ -1,0 +1,779 @@
+"""Expand xacro files, those of strangers in a process with limits."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import logging
+import math
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from glob import glob
+from importlib import import_module
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType, ModuleType, SimpleNamespace
+from typing import Any, TypeAlias
+from xml.dom import expatbuilder, minidom
+from xml.parsers.expat import ExpatError
+from xml.sax.saxutils import escape, quoteattr
+
+import yaml
+
+from morphgen.errors import FormatError, nearest
+from morphgen.formats.data_files import read_bytes, yaml_problem
+from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
+from morphgen.formats.xacro.evaluator import (
+    BUILTINS,
+    MATH,
+    MAX_SIZE,
+    Function,
+    RefusedError,
+    expression,
+    size_of,
+)
+from morphgen.formats.xml import parse_xml
+
+MAX_FILE = 16 * 2**20
+"""Largest file that an expansion reads [bytes]."""
+MAX_OUTPUT = 20_000_000
+"""Largest expanded document [characters]."""
+MAX_CLONES = 200_000
+"""Largest number of elements that an expansion may copy, as macros do; the PR2 has 6,978 nodes."""
+
+Untyped: TypeAlias = Any
+"""Objects of minidom and xacro, which have no type hints."""
+
+_LOCATION = "morphgen-location"
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a regular file; a device or a pipe might never end.
+
+    Raises:
+        OSError: If it cannot be read.
+        RefusedError: If it is not a regular file, or too large.
+    """
+    try:
+        return read_bytes(path, MAX_FILE)
+    except FormatError as error:
+        raise RefusedError(str(error)) from error
+
+
+def location_of(node: Untyped) -> str:
+    """Return ``file:line`` of an element that ``ElementLocations`` parsed, or of a clone of it."""
+    return str(node.getUserData(_LOCATION))
+
+
+class ElementLocations:
+    """Source locations of the elements of an expansion; a DOM ``UserDataHandler``.
+
+    minidom calls it for every clone of an element, which gets the location of the original. The
+    clones are counted, because macros can multiply them.
+    """
+
+    def __init__(self) -> None:
+        self.clones = 0
+
+    def parse(self, data: bytes, origin: str) -> minidom.Document:
+        """Parse XML and store the location of every element."""
+        document = _Builder(origin, self).parseString(data)
+        assert isinstance(document, minidom.Document)
+        return document
+
+    def handle(
+        self, operation: int, key: str, location: object, source: object, clone: Untyped
+    ) -> None:
+        """Store the location of a clone; minidom calls this.
+
+        Raises:
+            RefusedError: If there are more than ``MAX_CLONES``.
+        """
+        del operation, source
+        clone.setUserData(key, location, self)
+        self.clones += 1
+        if self.clones > MAX_CLONES:
+            raise RefusedError(f"the expansion copies more than {MAX_CLONES} elements")
+
+
+class _Builder(expatbuilder.ExpatBuilderNS):
+    def __init__(self, origin: str, locations: ElementLocations) -> None:
+        super().__init__()
+        self.origin = origin
+        self.locations = locations
+
+    def start_element_handler(self, name: Untyped, attributes: Untyped) -> None:
+        super().start_element_handler(name, attributes)
+        location = f"{self.origin}:{self.getParser().CurrentLineNumber}"
+        self.curNode.setUserData(_LOCATION, location, self.locations)
+
+
+def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
+    """Parse a YAML file of texts, numbers, lists and dictionaries.
+
+    Args:
+        data: The file's content.
+        path: The file, for messages.
+        units: xacro's unit tags.
+
+    Raises:
+        FormatError: If it is invalid YAML.
+        RefusedError: If it is too large with all aliases expanded.
+    """
+
+    class Loader(yaml.SafeLoader):
+        """Safe YAML with xacro's unit tags, which must not be added to the shared loader."""
+
+        def flatten_mapping(self, node: yaml.MappingNode) -> None:
+            super().flatten_mapping(node)
+            if len(node.value) > MAX_SIZE:
+                raise RefusedError(f"{path}: a mapping has more than {MAX_SIZE} entries")
+
+    for unit in units:
+        Loader.add_constructor(unit.value.tag, unit.constructor)
+    for tag in ("set", "binary"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", _refuse_tag)
+    try:
+        content = yaml.load(data, Loader)
+    except yaml.YAMLError as error:
+        raise FormatError(f"{path}{yaml_problem(error)}") from error
+    size_of(content)
+    return content
+
+
+def _refuse_tag(loader: yaml.SafeLoader, node: yaml.Node) -> object:
+    del loader
+    raise yaml.constructor.ConstructorError(
+        None, None, f"{node.tag} is neither text, number, list nor mapping", node.start_mark
+    )
+
+
+def document_text(document: minidom.Document) -> str:
+    """Return a document as text.
+
+    Raises:
+        RefusedError: If it is too long.
+    """
+    pieces = []
+    length = 0
+    for piece in _serialised(document.documentElement):
+        pieces.append(piece)
+        length += len(piece)
+        if length > MAX_OUTPUT:
+            raise RefusedError(f"the expanded document has more than {MAX_OUTPUT} characters")
+    return "".join(pieces)
+
+
+def _serialised(node: minidom.Node | None) -> Iterator[str]:
+    """Serialise a DOM; another user of xacro may have replaced ``minidom``'s own writer."""
+    if isinstance(node, minidom.Text):
+        yield escape(node.data)
+    elif isinstance(node, minidom.Element):
+        attributes = (f" {name}={quoteattr(value)}" for name, value in node.attributes.items())
+        yield f"<{node.tagName}{''.join(attributes)}>"
+        for child in node.childNodes:
+            yield from _serialised(child)
+        yield f"</{node.tagName}>"
+
+
+Engine: TypeAlias = Any
+"""A ``xacro`` module, which has no type hints."""
+
+MAX_ELEMENTS = 50_000
+"""Largest number of elements that an expansion may process; the PR2 has 2,734."""
+MAX_TEXT = 20_000_000
+"""Largest text that the substitutions of an expansion may create [characters]."""
+
+_NAME = "morphgen.formats._xacro"
+_READERS = ("parse", "load_yaml", "list_files", "eval_extension")
+"""Functions of the module through which a document accesses files; the caller sets them."""
+_log = logging.getLogger("morphgen.formats.xacro.expand")
+_per_thread = threading.local()
+
+
+def thread_engine() -> Engine:
+    """Return this thread's copy of the ``xacro`` module, reset to its initial state.
+
+    Differences from the package: an allow-list evaluates expressions, the number of elements and
+    the size of text are bounded, ``node`` is the element being processed, and warnings go to the
+    logger ``morphgen.formats.xacro.expand`` (level INFO) instead of the terminal.
+    """
+    if not hasattr(_per_thread, "engine"):
+        _per_thread.engine = _fresh_module()
+    engine = _per_thread.engine
+    engine.init_stacks(None)
+    engine.all_includes = []
+    engine.substitution_args_context = {}
+    engine.verbosity = 0
+    engine.node = None
+    for name in _READERS:  # the readers of the last expansion must not remain
+        setattr(engine, name, _refuse_access)
+    engine.elements = engine.text = 0
+    engine._global_symbols = _symbols(engine)
+    return engine
+
+
+def _fresh_module() -> Engine:
+    module: Engine = ModuleType(_NAME)
+    module.__package__ = _NAME
+    module.__path__ = sys.modules[_NAME].__path__
+    module.print = _record
+    exec(_BODY, module.__dict__)
+    module.eval_text = _shortcut(module)
+    module.safe_eval = _safe_eval
+    module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
+    module.eval_all = _counting(module)
+    for name in ("handle_macro_call", "process_include", "check_attrs", "reqd_attrs"):
+        setattr(module, name, _returning(module, getattr(module, name)))
+    return module
+
+
+def _safe_eval(
+    text: str, symbols: Mapping[str, object], local: Mapping[str, object] | None = None
+) -> object:
+    return expression(text.strip()).evaluate(symbols, local)
+
+
+def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
+    """Return ``eval_text`` with a limit on the size of its results.
+
+    It skips the lexer, a quarter of an expansion's time, for texts without expressions.
+    """
+    eval_text = engine.eval_text
+
+    def evaluated(text: str, symbols: Untyped) -> object:
+        if "$" not in text:
+            return text
+        result = eval_text(text, symbols)
+        if isinstance(result, str):
+            engine.text += len(result)
+            if engine.text > MAX_TEXT:
+                raise RefusedError(f"the expansion creates more than {MAX_TEXT} characters")
+        return result
+
+    return evaluated
+
+
+def _counting(engine: Engine) -> Callable[[Any, Any, Any], None]:
+    """Return ``eval_all`` with a limit on the number of elements; it stores the element."""
+    eval_all = engine.eval_all
+
+    def counted(node: Untyped, macros: Untyped, symbols: Untyped) -> None:
+        engine.elements += 1
+        if engine.elements > MAX_ELEMENTS:
+            raise RefusedError(f"the expansion processes more than {MAX_ELEMENTS} elements")
+        engine.node = node
+        eval_all(node, macros, symbols)
+
+    return counted
+
+
+def _returning(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
+    """Wrap a function so that ``node`` is its element again after it processed other elements."""
+
+    def call_and_restore(node: Untyped, *rest: Untyped) -> object:
+        engine.node = node
+        result = function(node, *rest)
+        engine.node = node
+        return result
+
+    return call_and_restore
+
+
+def _symbols(engine: Engine) -> dict[str, object]:
+    """Return the names that every document may use, with and without a namespace."""
+
+    def space(members: Mapping[str, object]) -> object:
+        names = engine.NameSpace()
+        dict.update(names, members)
+        return names
+
+    def fatal(*words: object) -> None:
+        raise engine.XacroException(" ".join(map(str, words)))
+
+    def tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:
+        for character in sep[1:]:
+            text = text.replace(character, sep[0])
+        return [word for word in text.split(sep[0]) if word or not skip_empty]
+
+    files = {
+        "load_yaml": lambda name: engine.load_yaml(name),
+        "abs_filename": engine.abs_filename_spec,
+        "dotify": _same,
+    }
+    calls = {
+        **files,
+        "arg": lambda name: engine.substitution_args_context["arg"][name],
+        "fatal": fatal,
+        "tokenize": tokenize,
+        **dict.fromkeys(("message", "warning", "error", "print_location"), _record),
+    }
+    functions = {name: Function(name, call) for name, call in calls.items()}
+    return {
+        **MATH,
+        **BUILTINS,
+        **{name: functions[name] for name in files},
+        "math": space(MATH),
+        "python": space(BUILTINS),
+        "xacro": space(functions),
+    }
+
+
+def _same(dictionary: dict[str, object]) -> dict[str, object]:
+    """Return a dictionary unchanged: ``xacro.dotify``, but dots work on every dictionary here."""
+    if not isinstance(dictionary, dict):
+        raise TypeError("dotify() takes a dictionary")
+    return dictionary
+
+
+def _refuse_access(*_: object) -> object:
+    raise RefusedError("files and substitutions are not available here")
+
+
+def _record(*words: object, **_: object) -> str:
+    _log.info(" ".join(map(str, words)))
+    return ""
+
+
+def _load_package() -> CodeType:
+    """Import the package's modules under the private name and return its compiled body."""
+    spec = importlib.util.find_spec("xacro")
+    if spec is None or not isinstance(spec.loader, SourceFileLoader):
+        raise ModuleNotFoundError("morphgen needs the package xacro: pip install xacro")
+    private = importlib.util.spec_from_file_location(
+        _NAME, spec.origin, submodule_search_locations=list(spec.submodule_search_locations or ())
+    )
+    assert private is not None
+    assert private.loader is not None
+    module = importlib.util.module_from_spec(private)
+    sys.modules[_NAME] = module
+    writer = minidom.Element.writexml
+    private.loader.exec_module(module)
+    minidom.Element.writexml = writer  # type: ignore[method-assign]
+    sys.modules[f"{_NAME}.color"].print = _record  # type: ignore[attr-defined]
+    body = spec.loader.get_code("xacro")
+    assert body is not None
+    return body
+
+
+_BODY = _load_package()
+
+
+CPU_LIMIT = 8
+"""Longest computation of an expansion [s of CPU time]."""
+WALL_LIMIT = 30
+"""Longest wait for an expansion [s]. On Windows, which has no other limit, the only one."""
+MEMORY_LIMIT = 2**30
+"""Largest address space of an expansion [bytes]; Linux enforces it, macOS only in part."""
+MAX_RECORDS = 1000
+"""Most warnings of a document that are passed on to the log, and longest of them [characters]."""
+
+_RECURSION_LIMIT = 4000
+"""Python frames for nested macros; one level takes about ten."""
+_CHILD_CODE = (
+    "import json, sys; request = json.load(sys.stdin); sys.path[:] = request['sys_path']; "
+    "from morphgen.formats.xacro.expand import serve; serve(request)"
+)
+
+
+def run_in_child(
+    task: Callable[..., object], path: Path, finder: PackageFinder, **values: Mapping[str, str]
+) -> Any:  # noqa: ANN401
+    """Run a function in a child process with limits.
+
+    Args:
+        task: A function of a module of morphgen; it takes ``path``, ``finder`` and ``values`` and
+            returns JSON data.
+        path: The xacro file, absolute.
+        finder: Finds its packages.
+        **values: Arguments of the task.
+
+    Returns:
+        The result of the task.
+
+    Raises:
+        FormatError: If the task raises it, or exceeds a limit.
+    """
+    source = str(Path(__file__).parents[3])
+    request = {
+        "task": [task.__module__, task.__name__],
+        "path": str(path),
+        "roots": [str(root) for root in finder.roots],
+        "packages": [[name, str(folder)] for name, folder in finder.packages],
+        "root": None if finder.root is None else str(finder.root),
+        "values": {name: dict(given) for name, given in values.items()},
+        "limits": {"cpu": CPU_LIMIT, "memory": MEMORY_LIMIT},
+        "sys_path": [entry for entry in sys.path if Path(entry).is_absolute()] + [source],
+    }
+    try:
+        # -I: neither the environment nor the current folder decides what the child imports.
+        child = subprocess.run(
+            [sys.executable, "-I", "-c", _CHILD_CODE],
+            input=json.dumps(request).encode(),
+            capture_output=True,
+            timeout=WALL_LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise FormatError(f"{path}: its expansion takes more than {WALL_LIMIT} s") from error
+    except OSError as error:
+        raise FormatError(f"{path}: no process for its expansion: {error.strerror}") from error
+    if child.returncode:
+        raise FormatError(f"{path}: {_failure(child.returncode, child.stderr)}")
+    answer: dict[str, Any] = json.loads(child.stdout)
+    for record in answer["records"]:
+        _log.info(record)
+    if "error" in answer:
+        raise FormatError(answer["error"])
+    return answer["result"]
+
+
+def _failure(code: int, stderr: bytes) -> str:
+    """Return why a child ended without an answer."""
+    if code < 0:  # minus the signal that ended it; Windows has no signals
+        if -code == signal.SIGXCPU:
+            return f"its expansion takes more than {CPU_LIMIT} s of CPU time"
+        return f"its expansion was ended by signal {-code}, perhaps for lack of memory"
+    last = stderr.decode(errors="replace").strip().splitlines()[-1:]
+    if any("MemoryError" in line for line in last):
+        return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
+    return f"its expansion ended with code {code}: {' '.join(last)[:200]}"
+
+
+def serve(request: Mapping[str, Any]) -> None:
+    """Run the parent's task in this process, the child, and print its result as JSON."""
+    records: list[str] = []
+    _log.addHandler(_Recorder(records))
+    _log.setLevel(logging.INFO)
+    _log.propagate = False
+    finder = PackageFinder(
+        tuple(map(Path, request["roots"])),
+        tuple((name, Path(folder)) for name, folder in request["packages"]),
+        None if request["root"] is None else Path(request["root"]),
+    )
+    module, name = request["task"]
+    task = getattr(import_module(module), name)
+    limit_process(**request["limits"])
+    answer: dict[str, Any]
+    try:
+        answer = {"result": task(Path(request["path"]), finder, **request["values"])}
+    except FormatError as error:
+        answer = {"error": str(error)}
+    sys.stdout.write(json.dumps(answer | {"records": records}))
+
+
+class _Recorder(logging.Handler):
+    """Keeps the first messages."""
+
+    def __init__(self, records: list[str]) -> None:
+        super().__init__()
+        self.records = records
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if len(self.records) < MAX_RECORDS:
+            self.records.append(record.getMessage()[:MAX_RECORDS])
+
+
+def limit_process(cpu: int, memory: int) -> None:
+    """Limit CPU time [s] and address space [bytes] of this process, and forbid writing files."""
+    global MEMORY_LIMIT
+    MEMORY_LIMIT = memory  # errors of the expansion name it
+    sys.setrecursionlimit(_RECURSION_LIMIT)
+    try:
+        import resource
+    except ImportError:  # Windows: the parent's WALL_LIMIT remains
+        return
+    limits = (
+        (resource.RLIMIT_CPU, cpu, cpu + 1),
+        (resource.RLIMIT_AS, memory, memory),
+        (resource.RLIMIT_FSIZE, 0, 0),
+        (resource.RLIMIT_CORE, 0, 0),
+    )
+    for kind, soft, hard in limits:
+        # macOS refuses some; the others, the bounds of the expansion and WALL_LIMIT remain.
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(kind, (soft, hard))
+
+
+MAX_INCLUDE_DEPTH = 40
+"""Deepest nesting of includes; deeper ones are taken for a loop."""
+MAX_REASON = 400
+"""Longest reason in an error [characters]; expressions can be long."""
+
+_COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
+_FAULTS = (
+    ArithmeticError,
+    AttributeError,
+    ExpatError,
+    LookupError,
+    MemoryError,
+    NameError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+)
+"""Exceptions that an invalid document can raise in the evaluator, besides XacroException."""
+
+
+def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
+    """Expand a xacro file.
+
+    The result depends on the files and the arguments only: the working directory plays no part,
+    ``$(optenv NAME default)`` is always its default, and ``$(env NAME)`` and ``$(cwd)`` are errors.
+
+    Threat model: the file and everything it includes may come from a stranger, and the values of
+    arguments as well. Expressions are interpreted by an allow-list and never given to Python.
+    Files are read only where ``require_allowed_text`` permits. Time, memory and size are bounded.
+
+    A file that was installed with morphgen or a data package was chosen by whoever installed it, so
+    it is expanded in this process as long as it reads installed files only. Every other file,
+    including one of the user's own library, is expanded in a child process with resource limits.
+
+    Args:
+        path: The file.
+        args: Values of the document's ``xacro:arg``; the others keep their defaults.
+        finder: Where ``$(find package)`` looks, besides around the file.
+
+    Returns:
+        The expanded document: UTF-8, no XML declaration, no comments.
+
+    Raises:
+        FormatError: The file or one that it includes is missing, broken or cannot be expanded, asks
+            for what is not allowed or too much, or neither declares an argument of ``args``.
+    """
+    path = path.absolute()
+    if is_installed(path):
+        expansion = Expansion(args, path, finder, installed_only=True)
+        try:
+            return expansion.run_file()
+        except FormatError:
+            if not expansion.met_foreign:
+                raise
+    document: str = run_in_child(expand_here, path, finder, args=args)
+    return document.encode()
+
+
+def expand_here(path: Path, finder: PackageFinder, args: Mapping[str, str]) -> str:
+    """Expand a xacro file in this process; ``expand`` decides which process that is."""
+    return Expansion(args, path, finder).run_file().decode()
+
+
+def evaluate(expression: str, values: Mapping[str, float]) -> float:
+    """Evaluate a text with ``${...}`` to a number.
+
+    Args:
+        expression: Such as ``"0.5"`` or ``"${length / 2}"``, with xacro's functions (``pi``,
+            ``sin``, ``max``, ``radians``, ...).
+        values: Numbers by name; they hide xacro's own names.
+
+    Raises:
+        FormatError: It cannot be evaluated, or is not a finite number.
+    """
+    engine = thread_engine()
+    engine.eval_extension = _no_substitution
+    symbols = engine.Table(engine._global_symbols)
+    dict.update(symbols, values)
+    try:
+        result = symbols._eval_literal(engine.eval_text(expression, symbols))
+    except (engine.XacroException, *_FAULTS) as error:
+        hint = _unknown_name_hint(error, values)
+        raise FormatError(f"{expression!r}: {_reason(error)}{hint}") from error
+    if isinstance(result, bool) or not isinstance(result, int | float) or not math.isfinite(result):
+        raise FormatError(f"{expression!r} is {result!r}, not a finite number")
+    return float(result)
+
+
+class Expansion:
+    """State of one expansion: its arguments, and the arguments that the files read declare."""
+
+    def __init__(
+        self,
+        args: Mapping[str, str],
+        origin: Path,
+        finder: PackageFinder,
+        objects: Mapping[str, object] | None = None,
+        *,
+        installed_only: bool = False,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            args: Values of the document's ``xacro:arg``.
+            origin: The file, absolute.
+            finder: Where ``$(find package)`` looks.
+            objects: Further arguments, whose values reach expressions without conversion to text.
+            installed_only: Whether to refuse files that are not ``is_installed``; ``met_foreign``
+                is then true if the document asked for one.
+        """
+        self.engine = thread_engine()
+        self.engine.parse = self._parse_include
+        self.engine.load_yaml = self._load_yaml
+        self.engine.list_files = self._list_files
+        self.engine.eval_extension = self._substitute
+        self.objects = dict(objects or {})
+        self.given = {name: str(value) for name, value in args.items()}
+        self.arguments = _Arguments(self.engine.XacroException, self.given)
+        self.declared: set[str] = set()
+        self.locations = ElementLocations()
+        self.origin = origin
+        self.finder = finder
+        self.installed_only = installed_only
+        self.met_foreign = False
+
+    def run_file(self) -> bytes:
+        """Expand the file.
+
+        Raises:
+            FormatError: As ``expand``.
+        """
+        try:
+            data = read_file(self.origin)
+        except OSError as error:
+            raise FormatError(f"{self.origin}: cannot be read: {error.strerror}") from error
+        except RefusedError as error:
+            raise FormatError(str(error)) from error
+        return self.run(data)
+
+    def run(self, data: bytes) -> bytes:
+        """Expand a document in place of the file's content.
+
+        Raises:
+            FormatError: As ``expand``.
+        """
+        self.engine.init_stacks(str(self.origin))
+        with self._located():
+            document = self._parse(data, str(self.origin))
+            self.engine.process_doc(document, mappings=self.arguments)
+            known = self.declared | self.arguments.used
+            for name in (*self.given, *self.objects):
+                if name not in known:
+                    raise FormatError(f"{self.origin}: no argument {name!r}{nearest(name, known)}")
+            return document_text(document).encode()
+
+    @contextmanager
+    def _located(self) -> Iterator[None]:
+        """Turn exceptions into one-line errors with the file and line being processed."""
+        try:
+            yield
+        except (self.engine.XacroException, *_FAULTS) as error:
+            macros, node = self.engine.macrostack, self.engine.node
+            location = location_of(node) if node is not None else str(self.origin)
+            macro = f" in macro {macros[-1].body.getAttribute('name')!r}" if macros else ""
+            is_included = not location.startswith(str(self.origin))
+            including = "" if not is_included else f" (included from {self.origin})"
+            raise FormatError(f"{location}: {_reason(error)}{macro}{including}") from error
+
+    def _parse(self, data: bytes, origin: str) -> minidom.Document:
+        for element in parse_xml(data, origin).iter("{*}arg"):
+            self.declared.add(element.get("name", ""))
+        return self.locations.parse(data, origin)
+
+    def _parse_include(self, _: object, filename: str) -> minidom.Document:
+        files = self.engine.filestack
+        if len(files) > MAX_INCLUDE_DEPTH:
+            raise FormatError(
+                f"{files[-2]}: includes {filename} in an endless loop (from {self.origin})"
+            )
+        including = files[-2]
+        try:
+            data = self._read(filename, including)
+        except OSError as error:
+            files.pop()
+            missing = OSError(f"cannot include {filename}: {error.strerror}")
+            raise self.engine.XacroException(exc=missing) from error
+        return self._parse(data, filename)
+
+    def _load_yaml(self, filename: str) -> object:
+        name = self.engine.abs_filename_spec(filename)
+        data = self._read(name, self.engine.filestack[-1])
+        return parse_yaml(data, Path(name), self.engine.ConstructUnits)
+
+    def _read(self, filename: str, including: str) -> bytes:
+        require_allowed_text(Path(filename), self.finder, self.origin, Path(including))
+        if self.installed_only and not is_installed(Path(filename)):
+            self.met_foreign = True
+            raise RefusedError(f"{filename} was not installed")
+        return read_file(Path(filename))
+
+    def _list_files(self, pattern: str) -> list[str]:
+        """Return the files that match a pattern; its fixed first folders must be allowed."""
+        folder = Path(re.split(r"[*?[]", pattern)[0] + "x").parent
+        require_allowed_text(folder, self.finder, self.origin, Path(self.engine.filestack[-1]))
+        return glob(pattern)  # noqa: PTH207 - an absolute pattern, as xacro takes it
+
+    def _substitute(self, text: str) -> object:
+        """Evaluate one substitution ``$(command words)``."""
+        match text[2:-1].split():
+            case ["arg", name] if name in self.objects:
+                return self.objects[name]
+            case ["arg", name]:
+                return self.arguments[name]
+            case ["find", package]:
+                return str(self.finder.find(package, Path(self.engine.filestack[-1]), self.origin))
+            case ["dirname"]:
+                return str(Path(self.engine.filestack[-1]).parent)
+            case ["optenv", _, *default]:
+                return " ".join(default)
+            case ["eval", *words]:
+                literal = self.engine.Table._eval_literal
+                names = {name: literal(value) for name, value in self.arguments.items()}
+                return str(
+                    self.engine.safe_eval(" ".join(words), self.engine._global_symbols, names)
+                )
+            case ["env" | "cwd" as command, *_]:
+                raise self.engine.XacroException(
+                    f"{text} would make the robot depend on where it is built:"
+                    f" $({command}) is not supported, use a xacro:arg"
+                )
+        raise self.engine.XacroException(
+            f"unknown substitution {text}; valid: {', '.join(_COMMANDS)}"
+        )
+
+
+class _Arguments(dict[str, str]):
+    """Arguments by name, with a record of the names that were used."""
+
+    def __init__(self, fault: type[Exception], given: Mapping[str, str]) -> None:
+        super().__init__(given)
+        self.fault = fault
+        self.used: set[str] = set()
+
+    def __getitem__(self, name: str) -> str:
+        self.used.add(name)
+        if name not in self:
+            raise self.fault(f"argument {name!r} has neither a value nor a default")
+        return super().__getitem__(name)
+
+
+def _no_substitution(text: str) -> str:
+    raise ValueError(f"{text} is not valid here")
+
+
+def _reason(error: BaseException) -> str:
+    """Return the innermost error in one line; xacro wraps it once for each expression."""
+    suffix = ""
+    while isinstance(inner := getattr(error, "exc", None), BaseException):
+        suffix = getattr(error, "suffix", None) or suffix
+        error = inner
+    if isinstance(error, RecursionError):
+        return "macros or properties refer to each other endlessly or too deeply"
+    if isinstance(error, MemoryError):
+        return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
+    reason = " ".join(f"{error or type(error).__name__} {suffix}".split())
+    return reason if len(reason) <= MAX_REASON else f"{reason[:MAX_REASON]}..."
+
+
+def _unknown_name_hint(error: BaseException | None, values: Mapping[str, float]) -> str:
+    while error is not None:
+        if isinstance(error, NameError) and error.name:
+            return nearest(error.name, values)
+        error = error.__context__
+    return ""

@@ -1,0 +1,1 @@
+"""Runs of training: their agents, robots, checkpoints and records."""

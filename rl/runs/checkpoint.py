@@ -1,0 +1,653 @@
+"""Check the content of a checkpoint before anything is built from it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import math
+import pickle
+import pickletools
+import struct
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from morphgen.benchmark.tokens import MAX_LINKS
+from morphgen.errors import FormatError, TaskError, nearest
+from morphgen.formats.data_files import read_json
+from morphgen.formats.files import LOCK, partial_path, write_atomic
+from morphgen.rl.agents import AGENTS
+from morphgen.rl.aliases import current_learner, current_run
+from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
+from morphgen.rl.observation_layout import Layout
+from morphgen.rl.policies import make_networks
+from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.observation import ObservationConfig, observation_config
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.scenes.collision_geometry import require_geometry
+from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs, task_configs
+from morphgen.tasks.sim.base import CollisionGeometry
+from morphgen.tasks.task import TaskConfig
+
+MAX_ROWS = 100_000
+"""Largest number of links, obstacles or points of an observation, and of numbers of a token."""
+_KINDS: Mapping[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("actor", "critic", "optimiser", "generators", "batch"), dict),
+    **dict.fromkeys(("layout", "policy", "config"), dict),
+    **dict.fromkeys(("update", "updates"), int),
+    "actor_lr_scale": (int, float),
+    "device": str,
+}
+"""Entries of every learner, and their types."""
+
+
+def require_learner(learner: object, where: str) -> None:
+    """Require that the state of a learner is complete, and its weights have the right shapes.
+
+    Args:
+        learner: The state, as a checkpoint has it.
+        where: The checkpoint, for messages.
+
+    Raises:
+        TaskError: If an entry is missing, or of another type, shape or number format.
+    """
+    if not isinstance(learner, dict):
+        raise TaskError(f"{where}: {shown(learner)}: expected a learner")
+    for name, kind in _KINDS.items():
+        if name not in learner:
+            raise TaskError(f"{where}: its learner has no {name}")
+        if not isinstance(learner[name], kind) or isinstance(learner[name], bool):
+            raise TaskError(f"{where}: {name} of its learner is {shown(learner[name])}")
+    layout = _layout(learner["layout"], f"{where}: layout")
+    try:
+        PPOConfig(**read_fields(learner["config"], PPOConfig, "config"))
+        policy = policy_from(learner["policy"])
+        with torch.device("meta"):  # shapes alone: nothing is allocated
+            actor, critic = make_networks(policy, layout, 0)
+    except TaskError as error:
+        raise TaskError(f"{where}: {error}") from error
+    wanted = {"actor": actor.state_dict(), "critic": critic.state_dict()}
+    for name in ("actor", "critic", "target_critic"):
+        if name in learner:
+            _require_network(
+                learner[name], wanted["actor" if name == "actor" else "critic"], f"{where}: {name}"
+            )
+    parameters = [*actor.parameters(), *critic.parameters()]
+    _require_optimiser(learner["optimiser"], parameters, f"{where}: optimiser")
+
+
+def _layout(stored: Mapping[str, Any], where: str) -> Layout:
+    """Return the stored layout, if it is valid."""
+    layout = Layout(**read_fields(stored, Layout, where))
+    sizes = {name: getattr(layout, name) for name in ("links", "token", "obstacles", "points")}
+    named = [*sizes.items(), *(field[:2] for field in layout.fields), *layout.vectors]
+    for name, size in named:
+        if not 0 <= size <= MAX_ROWS:
+            raise TaskError(f"{where}: {name} {size}: expected 0 to {MAX_ROWS:,}")
+    return layout
+
+
+def _require_network(stored: object, wanted: Mapping[str, torch.Tensor], where: str) -> None:
+    if not isinstance(stored, dict):
+        raise TaskError(f"{where} is {shown(stored)}; expected weights")
+    for name in wanted:
+        if name not in stored:
+            raise TaskError(f"{where} has no {name}")
+    for name, tensor in stored.items():
+        if name not in wanted:
+            raise TaskError(f"{where} has {shown(name)}, which its sizes do not ask for")
+        if not isinstance(tensor, torch.Tensor):
+            raise TaskError(f"{where}: {name} is {shown(tensor)}; expected a tensor")
+        actual = (tuple(tensor.shape), tensor.dtype)
+        expected = (tuple(wanted[name].shape), wanted[name].dtype)
+        if actual != expected:
+            raise TaskError(
+                f"{where}: {name} has shape {actual[0]} of {actual[1]}; expected {expected[0]} of "
+                f"{expected[1]}"
+            )
+
+
+def _require_optimiser(
+    stored: dict[str, Any], parameters: list[torch.nn.Parameter], where: str
+) -> None:
+    state, groups = stored.get("state"), stored.get("param_groups")
+    if not isinstance(state, dict) or not isinstance(groups, list):
+        raise TaskError(f"{where} has no state or no param_groups")
+    for number, moments in state.items():
+        if not isinstance(number, int) or not 0 <= number < len(parameters):
+            raise TaskError(f"{where}: state of an unknown parameter {shown(number)}")
+        if not isinstance(moments, dict):
+            raise TaskError(f"{where}: state {number} is {shown(moments)}")
+        for name in ("exp_avg", "exp_avg_sq"):
+            moment = moments.get(name)
+            shape = tuple(parameters[number].shape)
+            if not isinstance(moment, torch.Tensor) or tuple(moment.shape) != shape:
+                raise TaskError(f"{where}: {name} of parameter {number} is not of shape {shape}")
+
+
+_log = logging.getLogger(__name__)
+
+HASH = "sha256"
+"""Key of the hash of all other content; checkpoints of older versions have none."""
+MAX_BYTES = 512 * 2**20
+"""Largest size of a checkpoint's file, and of its tensors together [bytes]."""
+MAX_INDEX_BYTES = 32 * 2**20
+"""Largest size of a checkpoint without the numbers of its tensors [bytes]."""
+MAX_INSTRUCTIONS = 2_000_000
+"""Most pickle instructions of that part; a run of 1,000 environments has about 60,000."""
+MAX_VALUES = 1_000_000
+"""Most numbers, texts, tensors and containers in a checkpoint."""
+MAX_LEVELS = 20
+"""Most levels of nested containers."""
+MAX_INTEGER_BITS = 256
+"""Most bits of an integer; the states of random generators have 128."""
+_GLOBALS = frozenset(
+    {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"}
+    | {f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16")}
+    | {f"torch {kind}Storage" for kind in ("Long", "Int", "Short", "Char", "Byte", "Bool")}
+)
+"""All Python objects that a checkpoint of morphgen names. torch itself would also allow some that
+allocate as much as a file asks for, such as ``bytearray``."""
+
+
+def packed(content: Mapping[str, Any], where: str) -> bytes:
+    """Return the bytes of a checkpoint's file, with its hash.
+
+    Raises:
+        TaskError: If a number of the content is not finite, or it is beyond a limit.
+    """
+    _require_plain(content, where)
+    file = io.BytesIO()
+    torch.save({**content, HASH: _digest(content)}, file)
+    return file.getvalue()
+
+
+def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
+    """Return the content of a checkpoint's file without its hash, and whether it has one.
+
+    Raises:
+        TaskError: If the file is not a checkpoint, is damaged or beyond a limit, or a number in it
+            is not finite.
+    """
+    try:
+        _require_container(file)
+        # Mapped, a storage that claims more than its record has cannot reach beyond the file.
+        data = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+    except (
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+        NotImplementedError,
+        OverflowError,
+        RecursionError,
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+    ) as error:
+        raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
+    if not isinstance(data, dict):
+        raise TaskError(f"{file} is not a checkpoint of morphgen train")
+    digest = data.pop(HASH, None)
+    _require_plain(data, str(file))
+    if digest is not None and digest != _digest(data):
+        raise TaskError(
+            f"{file} is damaged: its content does not have the hash that was stored with it; use "
+            "another copy"
+        )
+    return {key: in_main_memory(value) for key, value in data.items()}, digest is not None
+
+
+@lru_cache(maxsize=1024)
+def warn_of_no_hash(file: Path) -> None:
+    """Warn once per file."""
+    _log.warning(
+        "morphgen: %s has no hash, as those of older versions: damage to it would not be noticed",
+        file,
+    )
+
+
+def _require_container(file: Path) -> None:
+    size = file.stat().st_size
+    if size > MAX_BYTES:
+        raise TaskError(f"{file}: {size:,} bytes; a checkpoint has at most {MAX_BYTES:,}")
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        if sum(entry.file_size for entry in entries) > size or any(
+            entry.compress_type != zipfile.ZIP_STORED for entry in entries
+        ):
+            raise TaskError(f"{file}: compressed or overlapping entries; a checkpoint has none")
+        index = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+        if len(index) != 1:
+            raise TaskError(f"{file} is not a checkpoint of morphgen train")
+        if index[0].file_size > MAX_INDEX_BYTES:
+            raise TaskError(
+                f"{file}: {index[0].file_size:,} bytes beside its tensors; expected at most "
+                f"{MAX_INDEX_BYTES:,}"
+            )
+        instructions = archive.read(index[0])
+    for count, (operation, argument, _) in enumerate(pickletools.genops(instructions)):
+        if count > MAX_INSTRUCTIONS:
+            raise TaskError(
+                f"{file}: more than {MAX_INSTRUCTIONS:,} instructions to build its content"
+            )
+        if "GLOBAL" in operation.name and argument not in _GLOBALS:
+            raise TaskError(
+                f"{file} is not a checkpoint of morphgen train: it names {str(argument)[:100]!r}, "
+                "which no checkpoint does"
+            )
+
+
+def _require_plain(content: object, where: str) -> None:
+    """Require that the content has plain containers, finite numbers and dense tensors only.
+
+    Raises:
+        TaskError: If it has others, or is beyond a limit.
+    """
+    total = 0
+    for count, (path, value) in enumerate(_walked(content, where)):
+        if count > MAX_VALUES:
+            raise TaskError(f"{where}: more than {MAX_VALUES:,} values")
+        if isinstance(value, torch.Tensor):
+            total += _require_tensor(value, where, path)
+            if total > MAX_BYTES:
+                raise TaskError(f"{where}: tensors of more than {MAX_BYTES:,} bytes")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise TaskError(f"{where}: {path} is {value}: not finite")
+        elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
+            raise TaskError(f"{where}: {path} is a number of {value.bit_length():,} bits")
+        elif not isinstance(value, str | int | float | dict | list | tuple | None):
+            raise TaskError(f"{where}: {path} is of an unexpected type: {type(value).__name__}")
+
+
+def _walked(content: object, where: str) -> Iterator[tuple[str, object]]:
+    """Yield every value of nested containers, with its path."""
+    left: list[tuple[str, object, int]] = [("", content, 0)]
+    while left:
+        path, value, level = left.pop()
+        yield path, value
+        entries: Iterator[tuple[object, object]] | None = None
+        if isinstance(value, dict):
+            entries = iter(value.items())
+        elif isinstance(value, list | tuple):
+            entries = iter(enumerate(value))
+        if entries is None:
+            continue
+        if level == MAX_LEVELS:
+            raise TaskError(f"{where}: more than {MAX_LEVELS} levels of containers")
+        for key, below in entries:
+            if not isinstance(key, str | int):
+                raise TaskError(f"{where}: a key of an unexpected type: {type(key).__name__}")
+            left.append((f"{path}.{str(key)[:100]}".lstrip("."), below, level + 1))
+
+
+def _require_tensor(tensor: torch.Tensor, where: str, path: str) -> int:
+    """Require a dense tensor of finite numbers in main memory; return its size [bytes]."""
+    plain = type(tensor) is torch.Tensor and tensor.device.type == "cpu"
+    if not plain or tensor.layout != torch.strided or tensor.is_quantized:
+        raise TaskError(f"{where}: {path} is not a dense tensor in main memory")
+    size = tensor.numel() * tensor.element_size()
+    if size > tensor.untyped_storage().nbytes():
+        raise TaskError(f"{where}: {path} has {size:,} bytes, more than the file holds of it")
+    if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+        lost = int((~torch.isfinite(tensor)).sum())
+        raise TaskError(f"{where}: {path}: {lost} of {tensor.numel()} numbers are not finite")
+    return size
+
+
+def _digest(content: object) -> str:
+    """Return the hexadecimal SHA-256 of a content; the order of keys does not matter."""
+    digest = hashlib.sha256()
+    _add(digest, content)
+    return digest.hexdigest()
+
+
+def _add(digest: hashlib._Hash, value: object) -> None:
+    if isinstance(value, torch.Tensor):
+        digest.update(f"t{value.dtype}{tuple(value.shape)}".encode())
+        flat = value.detach().cpu().contiguous().reshape(-1)
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
+    elif isinstance(value, dict):
+        digest.update(f"d{len(value)};".encode())
+        for key in sorted(value, key=lambda key: (isinstance(key, str), key)):
+            _add(digest, key)
+            _add(digest, value[key])
+    elif isinstance(value, list | tuple):
+        digest.update(f"l{len(value)};".encode())
+        for item in value:
+            _add(digest, item)
+    elif isinstance(value, str):
+        text = value.encode("utf-8", "surrogatepass")
+        digest.update(f"s{len(text)};".encode() + text)
+    elif isinstance(value, float):
+        digest.update(b"f" + struct.pack(">d", value))
+    else:
+        digest.update(f"{type(value).__name__}{value};".encode())
+
+
+def in_main_memory(value: object) -> object:
+    """Return a copy of a content whose tensors are in main memory and need no file or GPU."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, dict):
+        return {key: in_main_memory(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(in_main_memory(each) for each in value)
+    return value
+
+
+CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
+FORMAT = 3
+"""Version of the files' format. Format 2 has other names of keys; see ``aliases``."""
+READABLE = (2, FORMAT)
+"""Versions that can be read. Format 1 had other defaults of the networks' logit scale."""
+
+
+@dataclass(frozen=True)
+class Interface:
+    """Actions and observations that a policy needs from its environments."""
+
+    kind: ActionKind = "continuous"
+    """Kind of the actions."""
+    max_links: int | None = None
+    """Links that observations and actions are padded to; None: the number of the benchmark, or the
+    links of the largest robot if it has more."""
+    channels: ObservationConfig = field(default_factory=ObservationConfig)
+    """Channels of the observations."""
+
+
+def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) -> Interface:
+    """Return the interface of a policy.
+
+    Args:
+        policy: Agent and networks.
+        max_links: Links that its observations are padded to, if it needs a fixed number.
+        obstacles: Minimum number of obstacle rows.
+    """
+    channels = observation_config(policy.channels, obstacles=obstacles)
+    channels = replace(channels, tool=channels.tool or policy.tool_position)
+    any_size = AGENTS[policy.agent].any_size
+    return Interface(policy.kind, None if any_size else max_links, channels)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Configuration of a run; together with the machine it determines the weights."""
+
+    source: RobotSource
+    """Robots and their tasks."""
+    policy: PolicyConfig
+    """Agent and networks."""
+    ppo: PPOConfig
+    """Hyperparameters of PPO."""
+    seed: int = 0
+    """Seed of weights, actions, minibatches and episodes."""
+    sim: str = DEFAULT_SIMULATOR
+    """Name of the simulator."""
+    geometry: CollisionGeometry = "primitive"
+    """Collision shapes of the robots in training; evaluations have all of them."""
+    num_envs: int = 128
+    """Number of parallel environments of all robots together."""
+    device: str = "cpu"
+    """Device of networks and rollouts."""
+    initial_checkpoint: str = ""
+    """Path of a checkpoint with the initial networks, relative to the folder of the run; empty for
+    random initial weights."""
+    full_budget: bool = False
+    """For an agent of single robots on a split: train each robot with all environments and
+    timesteps (as in the paper), instead of an equal share of them."""
+    max_links: int = MAX_LINKS
+    """Number of links that observations and actions are padded to; no robot may have more."""
+    slice_updates: int = 0
+    """Updates after which the next of the drawn robots take the places of the last ones, if there
+    are more robots than environments; 0 if all robots have environments at all times."""
+    tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
+    """Configs of the tasks; a file has an entry for each, under the name of the task."""
+
+    @property
+    def evaluation_tasks(self) -> tuple[TaskConfig, ...]:
+        """Configs of the tasks in evaluations: with the default number of goals per robot."""
+        return tuple(replace(task, num_goals=type(task)().num_goals) for task in self.tasks)
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            TaskError: If a number is out of its range, or the simulator is unknown.
+        """
+        if self.seed < 0:
+            raise TaskError(f"--seed {self.seed}: expected 0 or more")
+        if self.num_envs < 1:
+            raise TaskError(f"--envs {self.num_envs}: expected 1 or more")
+        if self.sim not in SIMULATORS:
+            raise TaskError(f"unknown simulator {self.sim!r}{nearest(self.sim, SIMULATORS)}")
+        require_geometry(self.geometry)
+        if self.max_links < 2:
+            raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
+        if self.slice_updates < 0:
+            raise TaskError(f"--slice-updates {self.slice_updates}: expected 0 or more")
+
+    @property
+    def num_updates(self) -> int:
+        """Number of updates until the end of the run."""
+        return self.ppo.num_updates(self.num_envs)
+
+    @property
+    def interface(self) -> Interface:
+        """Actions and observations of the policy."""
+        obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
+        return policy_interface(self.policy, max_links=self.max_links, obstacles=obstacles)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the config as JSON values, which ``config_from`` reads."""
+        data = asdict(self)
+        del data["tasks"]
+        return data | GoalConfig(tasks=self.tasks).as_data()
+
+
+def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
+    """Create the folder of a run, or check that an existing one has the same run.
+
+    A run without a checkpoint is overwritten: it has nothing to continue from.
+
+    Raises:
+        TaskError: If the folder has another run, or a run that is not to be resumed.
+        FormatError: If the config cannot be written.
+    """
+    require_open(folder, config, resume=resume)
+    path = folder / CONFIG
+    if _has_checkpoint(folder):
+        return
+    data = {"format": FORMAT, "morphgen": version("morphgen"), **config.as_data()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(data, indent=2) + "\n")
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
+    """Require that ``open_run`` can create or resume a run in a folder; write nothing.
+
+    Raises:
+        TaskError: If the folder has a run that is not to be resumed, another run, or other files.
+    """
+    path = folder / CONFIG
+    if _has_checkpoint(folder):
+        if not resume:
+            raise TaskError(f"{folder} has a run: pass --resume to continue it, or another --out")
+        require_same_run(folder, config)
+    elif path.is_file():
+        read_config(folder)
+    elif folder.is_dir():
+        leftovers = (LOCK, partial_path(path).name)  # of a run that was killed at its start
+        if any(entry.name not in leftovers for entry in folder.iterdir()):
+            raise TaskError(
+                f"{folder} exists and is not the folder of a run: name another with --out"
+            )
+    elif folder.exists():
+        raise TaskError(f"{folder} is a file: name a folder with --out")
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    """Return whether a run, or its part for any single robot, has a checkpoint."""
+    return (folder / CONFIG).is_file() and next(folder.rglob(CHECKPOINT), None) is not None
+
+
+def read_config(folder: Path) -> RunConfig:
+    """Return the config of a run.
+
+    Raises:
+        TaskError: If the folder has no config, or an invalid one.
+    """
+    path = folder / CONFIG
+    try:
+        data = read_json(path)
+        _require_format(path, data)
+    except OSError as error:
+        raise TaskError(f"{folder} is not the folder of a run: it has no {CONFIG}") from error
+    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TaskError(f"{path} is not the config of a run: {error}") from error
+    try:
+        return config_from(data)
+    except TaskError as error:
+        raise TaskError(f"{path} is not the config of a run: {error}") from error
+
+
+def config_from(data: object) -> RunConfig:
+    """Return the run config of a JSON file or a checkpoint; earlier names of keys are read, too.
+
+    Raises:
+        TaskError: If an entry is missing, unknown, of another type or out of its range.
+    """
+    if not isinstance(data, Mapping):
+        raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
+    entries = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
+    tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
+    if "tasks" in entries:  # a field, but in files each task has an entry of its own
+        raise TaskError("run: unknown key 'tasks'")
+    for name, values in tasks.items():
+        if not isinstance(values, Mapping):
+            raise TaskError(f"run: {name}: invalid value {shown(values)}; expected keys and values")
+        read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
+    for name, values in entries.items():
+        if isinstance(values, Mapping) and name not in RunConfig.__dataclass_fields__:
+            raise TaskError(
+                f"run: unknown task {shown(name)}; run the script that registers it, or install "
+                "its package"
+            )
+    nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
+    values = read_fields(entries, RunConfig, "run", given=nested)
+    source = RobotSource(**read_fields(nested["source"], RobotSource, "run: source"))
+    for name in tasks_of(source):  # not of all tasks: some may be newer than the run
+        if name not in tasks:
+            raise TaskError(f"run: missing key {name!r}")
+    return RunConfig(
+        source,
+        policy_from(nested["policy"], "run: policy"),
+        PPOConfig(**read_fields(nested["ppo"], PPOConfig, "run: ppo")),
+        tasks=task_configs(tasks),
+        **values,
+    )
+
+
+def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
+    """Write the checkpoint of a run, in place of its last one.
+
+    Raises:
+        FormatError: If the file cannot be written.
+        TaskError: If a number is not finite; the last checkpoint is kept.
+    """
+    path = folder / CHECKPOINT
+    data = {"format": FORMAT, "run": config.as_data(), "learner": dict(learner)}
+    content = packed(data, f"{path} is not replaced")
+    try:
+        write_atomic(path, content)
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
+    """Return the run config and the learner's state of a checkpoint; nothing in it is executed.
+
+    Args:
+        path: The checkpoint, or the folder of its run.
+
+    Raises:
+        TaskError: If there is no checkpoint, or it is damaged, incomplete or beyond a limit, or a
+            number in it is not finite.
+    """
+    file = path / CHECKPOINT if path.is_dir() else path
+    if not file.is_file():
+        raise TaskError(f"{file}: no such checkpoint")
+    data, is_hashed = unpacked(file)
+    if data.keys() != {"format", "run", "learner"}:
+        raise TaskError(f"{file} is not a checkpoint of morphgen train")
+    _require_format(file, data)
+    try:
+        config = config_from(data["run"])
+    except TaskError as error:
+        raise TaskError(f"{file}: {error}") from error
+    learner = current_learner(data["learner"])
+    require_learner(learner, str(file))
+    if not is_hashed:
+        warn_of_no_hash(file)
+    return config, learner
+
+
+def _require_format(path: Path, data: Mapping[str, Any]) -> None:
+    found = data["format"]
+    if type(found) is not int or found not in READABLE:
+        raise TaskError(
+            f"{path} has format {shown(found)}; expected {' or '.join(map(str, READABLE))}: it "
+            "was written by another version of morphgen"
+        )
+
+
+def require_same_run(folder: Path, config: RunConfig) -> None:
+    """Require that a folder has a run with this config.
+
+    Raises:
+        TaskError: If the run in the folder has another config; the message lists the differences.
+    """
+    theirs, ours = _flat(read_config(folder)), _flat(config)
+    differences = [
+        f"{name} {_short(theirs.get(name))}, not {_short(value)}"
+        for name, value in ours.items()
+        if theirs.get(name) != value
+    ]
+    if differences:
+        raise TaskError(f"{folder} has another run: {'; '.join(differences)}")
+
+
+def _flat(config: RunConfig) -> dict[str, Any]:
+    """Return the entries of a config by dotted name; a run may continue on another GPU."""
+    device = config.device.partition(":")[0]
+    return _entries(config.as_data() | {"source": identity(config.source), "device": device})
+
+
+def _entries(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the entries of nested dictionaries by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in data.items():
+        nested = isinstance(value, dict) and value
+        flat |= _entries(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return flat
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) < 60 and "\n" not in text else f"of {len(text)} letters"

@@ -1,0 +1,737 @@
+"""Save the state of a learner, resume it, and begin with the networks of another."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import nn
+
+from morphgen.benchmark.tokens import require_max_links
+from morphgen.errors import TaskError
+from morphgen.formats.files import locked_folder
+from morphgen.model.kinematics import driving_joints
+from morphgen.model.robot import TOOL, Robot
+from morphgen.processes import Progress, no_progress
+from morphgen.rl.agents import AGENTS
+from morphgen.rl.config import PPOConfig, policy_from
+from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
+from morphgen.rl.observation_layout import last_link, layout_from, layout_of, require_layout
+from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner
+from morphgen.rl.runs.checkpoint import (
+    CHECKPOINT,
+    RunConfig,
+    in_main_memory,
+    open_run,
+    read_checkpoint,
+    read_config,
+    require_open,
+    write_checkpoint,
+)
+from morphgen.rl.runs.drawn_robots import DrawnRobots, draw, num_drawn, write_drawn
+from morphgen.rl.runs.recorders import Recorder, recording, require_wandb
+from morphgen.rl.runs.robot_source import (
+    RobotSource,
+    members,
+    require_links,
+    single_members,
+    specs_of,
+)
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.device import batch_device, require_device
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.scenes.make import batch_from_specs
+
+
+def state_of(learner: Learner) -> dict[str, Any]:
+    """Return the state of training; ``torch.load`` reads it with ``weights_only``.
+
+    The learner does not change. The state of the simulator is not part of it: a resumed run begins
+    new episodes, and equals one that continued only if that one calls ``restart_episodes`` when the
+    state is saved.
+    """
+    states = {name: net.state_dict() for name, net in _networks(learner).items()}
+    states["optimiser"] = learner.optimiser.state_dict()
+    batch: Any = in_main_memory(learner.batch.state_dict())
+    return {
+        **{name: in_main_memory(state) for name, state in states.items()},
+        "generators": {
+            name: learner.processes.joined(each.get_state()[None])
+            for name, each in learner.generators.items()
+        },
+        "batch": {
+            name: learner.processes.joined(value) if isinstance(value, torch.Tensor) else value
+            for name, value in batch.items()
+        },
+        "actor_lr_scale": learner.actor_lr_scale,
+        "update": learner.update,
+        "updates": learner.num_updates,
+        "device": learner.device.type,
+        "layout": learner.layout.as_data(),
+        "policy": asdict(learner.policy),
+        "config": asdict(learner.config),
+    }
+
+
+def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Continue where a learner of the same batch, configuration and device stopped.
+
+    All environments begin new episodes.
+
+    Raises:
+        TaskError: If these are not the same; nothing is changed then.
+    """
+    _require_networks(learner, state)
+    ours = {
+        **asdict(learner.config),
+        "updates": learner.num_updates,
+        "device": learner.device.type,
+        "processes": learner.processes.size,
+    }
+    stored = asdict(PPOConfig(**state["config"]))
+    processes = len(_states(state["generators"]["actions"]))
+    run = {"updates": state["updates"], "device": state["device"], "processes": processes}
+    _require_same({**stored, **run}, ours)
+    _resume_batch(learner, state["batch"])
+    for name, network in _networks(learner).items():
+        network.load_state_dict(state[name])
+    learner.optimiser.load_state_dict(state["optimiser"])
+    for name, generator in learner.generators.items():
+        generator.set_state(_states(state["generators"][name])[learner.processes.rank].cpu())
+    learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
+    learner.restart_episodes()
+
+
+def _states(generators: torch.Tensor) -> torch.Tensor:
+    """Return the state of a generator in each process, a row each; older files have one."""
+    return generators if generators.ndim > 1 else generators[None]
+
+
+def _resume_batch(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Restore the part of the state of all environments that belongs to this process."""
+    n, processes = learner.batch.num_envs, learner.processes
+    own = slice(processes.rank * n, (processes.rank + 1) * n)
+    if processes.size > 1:
+        state = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in state.items()}
+    learner.batch.load_state_dict(state)
+
+
+def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Load the networks of a learner's state and nothing else of it, to fine-tune them.
+
+    With a ``desired_kl``, the actor's learning rate begins at ``FINETUNING_ACTOR_LR_SCALE``.
+
+    Raises:
+        TaskError: If they are other networks, or for other observations.
+    """
+    _require_networks(learner, state)
+    for name, network in _networks(learner).items():
+        network.load_state_dict(state[name])
+    if learner.config.desired_kl:
+        learner.actor_lr_scale = FINETUNING_ACTOR_LR_SCALE
+
+
+def use_batch(learner: Learner, batch: TaskBatch) -> None:
+    """Continue with other environments; all of them begin new episodes.
+
+    Raises:
+        TaskError: If there are more or fewer environments, or their actions or observations differ.
+    """
+    observation = batch.observe()
+    require_layout(learner.layout, layout_of(observation), "the learner")
+    if (batch.num_envs, batch.action_kind) != (learner.batch.num_envs, learner.policy.kind):
+        raise TaskError(
+            f"{batch.num_envs} environments with {batch.action_kind} actions; expected "
+            f"{learner.batch.num_envs} with {learner.policy.kind} actions"
+        )
+    if (links := last_link(observation)) > learner.num_link_rows:
+        raise TaskError(
+            f"a robot has {links} links; the learner has room for {learner.num_link_rows}"
+        )
+    learner.use(batch)
+
+
+def _networks(learner: Learner) -> dict[str, nn.Module]:
+    return {
+        "actor": learner.actor,
+        "critic": learner.critic,
+        "target_critic": learner.target_critic,
+    }
+
+
+def _require_networks(learner: Learner, state: Mapping[str, Any]) -> None:
+    require_layout(layout_from(state["layout"]), learner.layout, "the checkpoint")
+    _require_same(asdict(policy_from(state["policy"])), asdict(learner.policy))
+
+
+def _require_same(stored: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    wrong = [f"{k} {stored.get(k)}, here {ours[k]}" for k in ours if stored.get(k) != ours[k]]
+    if wrong:
+        raise TaskError(f"the checkpoint is of another run: {'; '.join(wrong)}")
+
+
+SLICE_STEPS = 600
+"""Default time that a slice of the robots is trained on [control steps per environment]: two
+episodes. A new slice cuts running episodes short, and building its environments takes time."""
+
+
+def default_slice_updates(config: RunConfig) -> int:
+    """Return the default of ``RunConfig.slice_updates``: 0 if all drawn robots fit at once.
+
+    In a short run it is lower than ``SLICE_STEPS``, so that every robot is trained on.
+    """
+    slices = num_slices(config)
+    if slices <= 1:
+        return 0
+    return max(min(-(-SLICE_STEPS // config.ppo.num_steps), config.num_updates // slices), 1)
+
+
+def num_slices(config: RunConfig) -> int:
+    """Return the number of slices with which every drawn robot has been trained on."""
+    return -(-num_drawn(config.source) // config.num_envs)
+
+
+def slice_of(num_robots: int, size: int, number: int, seed: int) -> list[int]:
+    """Return the indices of the robots in a slice.
+
+    Args:
+        num_robots: Number of robots of the source.
+        size: Robots per slice, at most ``num_robots``.
+        number: Number of the slice, from 0.
+        seed: Seed of the order.
+    """
+    first, last = number * size, (number + 1) * size - 1
+    passes = range(first // num_robots, last // num_robots + 1)
+    order = np.concatenate(
+        [np.random.default_rng([seed, i]).permutation(num_robots) for i in passes]
+    )
+    start = first - passes[0] * num_robots
+    robots: list[int] = order[start : start + size].tolist()
+    return robots
+
+
+def num_actuated(robot: Robot, task: str) -> int:
+    """Return the number of joints that actions move."""
+    if TASKS[task].moves_fingers:
+        return robot.dof
+    return len(driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link)))
+
+
+class TrainingBatches:
+    """Makes the batches of a run; batches and their seeds depend on the config only.
+
+    Attributes:
+        drawn: The robots drawn from grammars; None for other sources.
+        most_links: Number of links of the largest robot.
+        tasks: Names of the tasks of all robots.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        *,
+        envs: range | None = None,
+        device: str | None = None,
+        workers: int = 1,
+        progress: Progress = no_progress,
+    ) -> None:
+        """Build the robots and their goal sets.
+
+        Args:
+            config: Config of the run.
+            envs: Numbers of the environments of this process; by default all.
+            device: Device of this process; by default that of the config.
+            workers: Number of processes of PyBullet, or of threads of MuJoCo.
+            progress: Called with the number of robots whose goal set is ready, and their total.
+
+        Raises:
+            BenchmarkError: If a robot has more links than the config's ``max_links``.
+            MorphgenError: If a robot cannot be built or cannot do its task.
+        """
+        self._config, self._workers = config, workers
+        self._envs = range(config.num_envs) if envs is None else envs
+        self._device = batch_device(config.sim, device or config.device)
+        goals = GoalConfig(tasks=config.tasks)
+        self._batch: TaskBatch | None = None
+        self.drawn: DrawnRobots | None = None
+        if config.source.grammars:
+            self.drawn = draw(config.source, goals, progress=progress)
+        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals, progress)
+        for spec in self._specs:
+            links = len(spec.robot.links)
+            require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
+        self.most_links = max(len(spec.robot.links) for spec in self._specs)
+        self.tasks = {spec.task for spec in self._specs}
+        self._channels = config.interface.channels
+        if config.slice_updates:
+            joints = max(num_actuated(spec.robot, spec.task) for spec in self._specs)
+            self._channels = replace(self._channels, tree_joints=joints)
+
+    def make(self, update: int) -> TaskBatch:
+        """Return a new batch, with which the run continues after so many updates.
+
+        The last batch is closed.
+
+        Raises:
+            SimulationError: If the simulator cannot hold a scene.
+            MissingDependencyError: If the simulator is not installed.
+        """
+        self.close()
+        config, interface = self._config, self._config.interface
+        robots, seed = self._robots_at(update), config.seed
+        if config.slice_updates:
+            seeds = np.random.SeedSequence([config.seed, update // config.slice_updates])
+            seed = int(seeds.generate_state(1)[0])
+        self._batch = batch_from_specs(
+            [self._specs[i] for i in robots],
+            len(self._envs),
+            first=self._envs.start,
+            sim=config.sim,
+            seed=seed,
+            kind=interface.kind,
+            observe=self._channels,
+            workers=self._workers,
+            max_links=config.max_links,
+            device=self._device,
+            geometry=config.geometry,
+            library=map(Path, config.source.library),
+        )
+        return self._batch
+
+    def close(self) -> None:
+        """Close the last batch."""
+        if self._batch is not None:
+            self._batch.close()
+        self._batch = None
+
+    def changes_at(self, update: int) -> bool:
+        """Return whether a run continues with another batch after so many updates."""
+        every = self._config.slice_updates
+        return bool(every) and update % every == 0 and update < self._config.num_updates
+
+    def recorded_scores(self, scores: Sequence[float], update: int) -> tuple[float, ...]:
+        """Return the scores to record after an update: those of robots, or means of grammars.
+
+        Thousands of drawn robots would fill the records, and a slice has others than the last.
+
+        Args:
+            scores: Mean score of each robot of the batch.
+            update: Number of updates so far, the one of the scores included.
+        """
+        if self.drawn is None:
+            return tuple(scores)
+        grammars = [member.category for member in self.drawn.members]
+        by_grammar: dict[str, list[float]] = {name: [] for name in grammars}
+        for robot, score in zip(self._robots_at(update - 1), scores, strict=True):
+            by_grammar[grammars[robot]].append(score)
+        return tuple(
+            float(np.mean(values)) if values else math.nan for values in by_grammar.values()
+        )
+
+    def _robots_at(self, update: int) -> list[int]:
+        """Return the indices of the robots that are trained on after so many updates."""
+        config = self._config
+        if not config.slice_updates:
+            return list(range(len(self._specs)))
+        number = update // config.slice_updates
+        return slice_of(len(self._specs), config.num_envs, number, config.seed)
+
+
+NUM_ENVS = 64
+"""Default number of environments."""
+CONSTANTS: Mapping[str, Any] = {
+    "num_steps": 32,
+    "minibatches": 4,
+    "learning_rate": 3e-4,
+    "desired_kl": 0.01,
+    "curriculum": False,
+}
+"""Default hyperparameters that differ from those of the training. A new optimiser has no moments of
+the gradient, so that its first steps are large: without a bound of the policy's change they undo
+what the training taught (docs/results.md, "Fine-tuning")."""
+
+
+def finetuning_config(
+    initial: RunConfig, source: RobotSource, checkpoint: str, changes: Mapping[str, Any]
+) -> RunConfig:
+    """Return the config of a run that begins with the networks of another run.
+
+    Agent and hyperparameters are those of the other run, besides ``CONSTANTS`` and ``NUM_ENVS``.
+
+    Args:
+        initial: Config of the other run.
+        source: The robots to train on.
+        checkpoint: Path of the other run's checkpoint; relative to the folder of the new run.
+        changes: Hyperparameters of PPO that differ, such as ``total_timesteps``.
+    """
+    return replace(
+        initial,
+        source=source,
+        ppo=replace(initial.ppo, **{**CONSTANTS, **changes}),
+        num_envs=NUM_ENVS,
+        initial_checkpoint=checkpoint,
+        slice_updates=0,
+    )
+
+
+MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
+"""Bounds of the interval between checkpoints [control steps per environment]: 5 and 10 episodes.
+
+A checkpoint has no simulator state, so that it cuts all running episodes short: it must be rare."""
+CHECKPOINTS, MIN_CHECKPOINTS = 10, 4
+"""Intended number of checkpoints, and the minimum for runs that are short for these bounds."""
+ROBOTS = "robots"
+"""Subfolder with a run per robot, in the folder of a run of ``se`` on a split."""
+
+ShowMetrics = Callable[[UpdateMetrics, int], None]
+"""Callback with the metrics of an update, and the number of updates of the run."""
+
+
+@dataclass(frozen=True)
+class ExecutionConfig:
+    """How a run is executed; the weights do not depend on it."""
+
+    workers: int = 1
+    """Number of PyBullet processes, or of MuJoCo threads."""
+    tensorboard: bool = True
+    """Write TensorBoard events."""
+    wandb: bool = False
+    """Send metrics to Weights & Biases."""
+    minutes: int | None = None
+    """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            TaskError: If the number of workers is below 1.
+            MissingDependencyError: If ``wandb`` is set and the package is not installed.
+        """
+        if self.wandb:
+            require_wandb()
+        if self.workers < 1:
+            raise TaskError(f"--workers {self.workers}: expected 1 or more")
+
+
+@dataclass(frozen=True)
+class Subrun:
+    """A part of a run that trains one set of weights."""
+
+    folder: Path
+    """Folder of the part's config, metrics and checkpoint."""
+    config: RunConfig
+    """Config with the part's share of robots, environments, timesteps and its own seed."""
+
+
+def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
+    """Return the parts of a run: the run itself, or one per robot for an agent of single robots.
+
+    A part per robot has a seed of its own, and an equal share of the environments and timesteps,
+    rounded up.
+    """
+    per_robot = AGENTS[config.policy.agent].per_robot
+    if not per_robot or not config.source.split or config.source.member:
+        return [Subrun(folder, config)]
+    sources = list(single_members(config.source))
+    share = 1 if config.full_budget else len(sources)
+    num_envs = -(-config.num_envs // share)
+    ppo = replace(config.ppo, total_timesteps=-(-config.ppo.total_timesteps // share))
+    parts = []
+    for i, source in enumerate(sources):
+        seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
+        part = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
+        parts.append(Subrun(folder / ROBOTS / str(source.member), part))
+    return parts
+
+
+def train(
+    folder: Path,
+    config: RunConfig,
+    *,
+    resume: bool = False,
+    execution: ExecutionConfig | None = None,
+    show: Callable[[Subrun], ShowMetrics] | None = None,
+    prepare: Progress = no_progress,
+    hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
+) -> list[Subrun]:
+    """Train all parts of a run to their end; see ``subruns_of``.
+
+    Training may be interrupted or killed at any time. SIGINT, SIGTERM and the end of
+    ``ExecutionConfig.minutes`` let the running update end and write a checkpoint; a second signal
+    acts at once. A resumed run continues from its last checkpoint. One that was killed ends with
+    the same weights as an uninterrupted one; one that was stopped does not, since all its episodes
+    begin anew at another update. Nothing is written before all robots and networks are built.
+
+    Args:
+        folder: Folder of the run.
+        config: Config of the run.
+        resume: Whether to continue a run that is already in the folder.
+        execution: How the run is executed.
+        show: Called at the start of every part; returns the callback for its updates.
+        prepare: Called with the number of robots whose goal set is ready, and their total.
+        hold: Context manager that locks the folder against other runs.
+
+    Returns:
+        The parts, of which the last are unfinished or not begun after ``minutes``; none in
+        processes of ``torchrun`` other than the first, which alone writes files.
+
+    Raises:
+        TaskError: If the folder has another run, or a metric is not finite.
+        FormatError: If another process writes to the folder.
+        MorphgenError: If a robot or simulator cannot be built.
+        KeyboardInterrupt: If it was stopped by SIGINT.
+    """
+    execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
+    for part in parts:
+        require_runnable(part.config)
+    require_open(folder, config, resume=resume)
+    unfinished = [part for part in parts if not is_done(part)]
+    if unfinished:  # a finished run is evaluated on machines without its GPU
+        require_device(config.device)
+    with _StopRequest(execution.minutes) as stop, ExitStack() as held:
+        processes, device = held.enter_context(process_group(config.device))
+        holds = False
+        for part in unfinished:
+            if not holds:
+                require_links(config.source, config.max_links)
+            envs = processes.share(part.config.num_envs, "--envs")
+            batches = TrainingBatches(
+                part.config,
+                envs=envs,
+                device=device,
+                workers=execution.workers,
+                progress=prepare if processes.is_first else no_progress,
+            )
+            with _learner(part, batches, processes, device) as learner:
+                if not processes.is_first:
+                    if _learn(learner, batches, part, None, None, stop):
+                        break
+                    continue
+                if not holds:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    held.enter_context(hold(folder))
+                    open_run(folder, config, resume=resume)
+                    holds = True
+                open_run(part.folder, part.config, resume=True)
+                if batches.drawn is not None:
+                    write_drawn(part.folder, part.config.source, batches.drawn)
+                if _learn(learner, batches, part, execution, show(part) if show else None, stop):
+                    break
+    return parts if processes.is_first else []
+
+
+def require_runnable(config: RunConfig) -> None:
+    """Require timesteps for at least one update, and an environment for every robot.
+
+    Drawn robots may have environments one after another; see ``RunConfig.slice_updates``.
+
+    Raises:
+        TaskError: If there are fewer, or a rollout cannot be split into equal minibatches, or the
+            agent is for single robots and the robots are drawn.
+    """
+    robots = len(members(config.source)) or num_drawn(config.source)
+    if config.source.grammars and AGENTS[config.policy.agent].per_robot:
+        raise TaskError(
+            f"--agent {config.policy.agent}: learns one robot; --robots {config.source.name} needs "
+            "an agent of many"
+        )
+    if config.num_envs < robots and not config.slice_updates:
+        raise TaskError(
+            f"--envs {config.num_envs}: fewer than the {robots} robots, each of which has one"
+        )
+    update_timesteps = config.ppo.num_steps * config.num_envs
+    if config.ppo.total_timesteps < update_timesteps:
+        share = f", the share of {config.source.member}" if config.source.member else ""
+        raise TaskError(
+            f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}{share}: an update "
+            f"takes {update_timesteps:,} transitions ({config.ppo.num_steps} steps of every "
+            "environment)"
+        )
+    slices = -(-config.num_updates // config.slice_updates) if config.slice_updates else 1
+    if slices < num_slices(config):
+        raise TaskError(
+            f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}: only "
+            f"{slices * config.num_envs} of {robots} robots would be trained on; use more --steps "
+            "or --envs, or a lower --slice-updates"
+        )
+    config.ppo.minibatch_size(config.num_envs)
+
+
+def checkpoint_files(path: Path) -> Iterator[Path]:
+    """Yield the checkpoint files of a run.
+
+    Args:
+        path: A checkpoint file, or the folder of a run.
+
+    Raises:
+        TaskError: If there is no checkpoint, or some robots of the run have none yet.
+    """
+    if path.is_file() or (path / CHECKPOINT).is_file():
+        yield path if path.is_file() else path / CHECKPOINT
+        return
+    files = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
+    if not files:
+        raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
+    parts = subruns_of(path, read_config(path))
+    missing = [part.folder.name for part in parts if not (part.folder / CHECKPOINT).is_file()]
+    if missing:
+        raise TaskError(
+            f"{path}: {len(missing)} of its {len(parts)} robots have no policy yet, such as "
+            f"{missing[0]}; train goes on with --resume"
+        )
+    yield from files
+
+
+def is_done(part: Subrun) -> bool:
+    """Return whether the checkpoint of a part is its last one."""
+    if not (part.folder / CHECKPOINT).is_file():
+        return False
+    return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.num_updates)
+
+
+def updates_between(config: RunConfig) -> int:
+    """Return the number of updates between two checkpoints of a run."""
+    num_steps = config.ppo.num_steps
+    interval = config.num_updates * num_steps // CHECKPOINTS
+    interval = min(max(interval, MIN_CHECKPOINT_STEPS), MAX_CHECKPOINT_STEPS)
+    return max(min(-(-interval // num_steps), config.num_updates // MIN_CHECKPOINTS), 1)
+
+
+@contextmanager
+def _learner(
+    part: Subrun, batches: TrainingBatches, processes: ProcessGroup, device: str
+) -> Iterator[Learner]:
+    """Build the learner of a part, and resume its checkpoint if there is one."""
+    config, state = part.config, None
+    if (part.folder / CHECKPOINT).is_file():
+        state = read_checkpoint(part.folder)[1]
+    with closing(batches):
+        learner = Learner(
+            batches.make(state["update"] if state else 0),
+            config.policy,
+            config.ppo,
+            seed=config.seed,
+            device=device,
+            least_links=batches.most_links,
+            tasks=batches.tasks,
+            processes=processes,
+        )
+        if state:
+            resume_learner(learner, state)
+        elif config.initial_checkpoint:
+            initial = (part.folder / config.initial_checkpoint).resolve()
+            load_networks(learner, read_checkpoint(initial)[1])
+        yield learner
+
+
+def _learn(
+    learner: Learner,
+    batches: TrainingBatches,
+    part: Subrun,
+    execution: ExecutionConfig | None,
+    show: ShowMetrics | None,
+    stop: _StopRequest,
+) -> bool:
+    """Make the remaining updates of a part; record their metrics and write its checkpoints.
+
+    Args:
+        learner: The learner.
+        batches: Its batches.
+        part: The part.
+        execution: How the run is executed; None in a process that writes no files.
+        show: Called after every update.
+        stop: Request to stop before the last update.
+
+    Returns:
+        Whether it has stopped early.
+    """
+    is_stopped = False
+    interval = updates_between(part.config)
+    with ExitStack() as stack:
+        recorders: Sequence[Recorder] = ()
+        if execution is not None:
+            recorders = stack.enter_context(
+                recording(
+                    part.folder,
+                    part.config,
+                    learner.update,
+                    tensorboard=execution.tensorboard,
+                    wandb=execution.wandb,
+                )
+            )
+        while not learner.done and not is_stopped:
+            metrics = learner.iterate()
+            scores = batches.recorded_scores(metrics.scores, learner.update)
+            metrics = replace(metrics, scores=scores)
+            for recorder in recorders:
+                recorder.record(metrics)
+            if batches.changes_at(learner.update):
+                use_batch(learner, batches.make(learner.update))
+            # A checkpoint has the state of the batch that the run continues with.
+            left = learner.num_updates - learner.update
+            is_stopped = any(learner.processes.gather(stop.is_requested)) and left > 0
+            is_due = learner.update % interval == 0 and left >= interval
+            if not left or is_due or is_stopped:
+                state = state_of(learner)  # of all processes
+                if execution is not None:
+                    write_checkpoint(part.folder, part.config, state)
+                # A resumed run begins new episodes here, and must end with the same weights.
+                learner.restart_episodes()
+            if show:
+                show(metrics, learner.num_updates)
+    return is_stopped
+
+
+class _StopRequest:
+    """Asks training to stop after the running update: by a signal, or because its time is over.
+
+    In this block the first SIGINT or SIGTERM waits for the end of the update, and acts at the end
+    of the block; the next one acts at once.
+    """
+
+    def __init__(self, minutes: int | None) -> None:
+        """Begin to count the minutes, if there is a limit."""
+        self._end = math.inf if minutes is None else time.monotonic() + 60 * minutes
+        self._received: list[int] = []
+        self._handlers: dict[int, Any] = {}
+
+    @property
+    def is_requested(self) -> bool:
+        return bool(self._received) or time.monotonic() >= self._end
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+            # Workers ignore Ctrl-C; handlers of other languages are unknown, and stay.
+            self._handlers = {
+                n: handler
+                for n, handler in handlers.items()
+                if handler not in (None, signal.SIG_IGN)
+            }
+            for number in self._handlers:
+                signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._restore()
+        if self._received and kind is None:
+            signal.raise_signal(self._received[0])
+
+    def _note(self, number: int, _: object) -> None:
+        self._received.append(number)
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}

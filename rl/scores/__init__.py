@@ -1,0 +1,1 @@
+"""Scores of policies: evaluations, studies, tables and submissions."""

@@ -1,0 +1,235 @@
+"""Scores of submissions with their intervals, computed from the episodes, and their ranking."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from tabulate import tabulate
+
+from morphgen.benchmark.split import SIDES, Side
+from morphgen.errors import BenchmarkError
+from morphgen.formats.records import FiniteNumber, Record
+from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
+from morphgen.rl.scores.scores import (
+    Interval,
+    episode_interval,
+    finite_or_none,
+    score_decimals,
+    success_interval,
+)
+from morphgen.rl.scores.submission import RobotOutcomes, Submission
+from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
+
+Source = Literal["submission", "reference", "study"]
+RandomScores = Mapping[tuple[Side, str], Sequence[float]]
+"""Scores of the random policy's episodes, by side and name of the robot."""
+
+
+class SideScore(Record, frozen=True):
+    """Mean result over the robots of a side that do one task."""
+
+    side: Side
+    task: str
+    robots: int
+    score: FiniteNumber
+    """Mean score, relative to the random policy where the task wants it."""
+    success: FiniteNumber
+    """Mean success rate, 0 to 1."""
+    low: FiniteNumber | None = None
+    """Lower end of the 95% interval of ``score``; None if it is not known."""
+    high: FiniteNumber | None = None
+    """Upper end of the interval."""
+
+    def __post_init__(self) -> None:
+        if self.robots < 1 or not 0 <= self.success <= 1:
+            raise ValueError(
+                f"{self.robots} robots, success {self.success:g}: expected 1 robot or more, and a "
+                "success rate from 0 to 1"
+            )
+        if (self.low is None) != (self.high is None):
+            raise ValueError("an interval with one end; expected low and high, or neither")
+
+
+class Row(Record, frozen=True):
+    """A method in a ranking."""
+
+    method: str
+    source: Source
+    """``submission``; ``reference``, a submission in a release; or ``study``, its stored scores."""
+    mode: str
+    seeds: tuple[int, ...]
+    """Seeds of the training; empty for a baseline."""
+    episodes: int
+    """Episodes per robot."""
+    sides: tuple[SideScore, ...]
+    finetuned: int = 0
+    """Transitions of fine-tuning on the test robots."""
+
+    def __post_init__(self) -> None:
+        if not self.method.isprintable():
+            raise ValueError(f"method {self.method!r}; expected printable characters")
+        groups = [(side.side, side.task) for side in self.sides]
+        if len(set(groups)) < len(groups):
+            raise ValueError("a side and task is there twice; expected once")
+
+    @property
+    def run(self) -> tuple[object, ...]:
+        """Method, mode, seeds and fine-tuning: no two rows of a split share all four."""
+        return self.method, self.mode, self.seeds, self.finetuned
+
+    @property
+    def label(self) -> str:
+        """Method, and how the policy acts and was fine-tuned if that is not the usual way."""
+        remarks = ["stochastic"] if self.mode == "stochastic" else []
+        if self.finetuned:
+            remarks.append(f"fine-tuned {self.finetuned:,}")
+        return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
+
+    def success(self, side: SideScore) -> Interval:
+        """Return the success rate of a side with its Wilson interval over all episodes."""
+        episodes = side.robots * self.episodes * max(len(self.seeds), 1)
+        return success_interval(side.success, episodes)
+
+    def group(self, side: Side, task: str) -> SideScore | None:
+        """Return the result of a side at a task."""
+        return next((s for s in self.sides if (s.side, s.task) == (side, task)), None)
+
+
+def score_submission(
+    submission: Submission, random: RandomScores | None = None, source: Source = "submission"
+) -> Row:
+    """Compute the scores of a submission that was checked.
+
+    Args:
+        submission: The submission.
+        random: Scores of the random policy; by default those in the submission.
+        source: Source of the row.
+
+    Raises:
+        BenchmarkError: If ``random`` lacks a robot of the submission.
+    """
+    groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
+    for side in SIDES:
+        for outcomes in submission.robots:
+            if outcomes.side == side:
+                groups.setdefault((side, outcomes.task), []).append(outcomes)
+    sides = []
+    for (side, task), robots in groups.items():
+        interval = episode_interval(
+            [relative_scores(each, random) for each in robots],
+            [each.success for each in robots],
+            relative=TASKS[task].relative_to_random,
+        )
+        success = float(np.mean([np.mean(each.success) for each in robots]))
+        ends = finite_or_none((interval.low, interval.high))
+        sides.append(SideScore(side, task, len(robots), interval.value, success, *ends))
+    seed = submission.training_seed
+    return Row(
+        submission.method,
+        source,
+        submission.mode,
+        () if seed is None else (seed,),
+        min(len(each.score) for each in submission.robots),
+        tuple(sides),
+        submission.finetuned,
+    )
+
+
+def random_scores(submission: Submission) -> RandomScores:
+    """Return the scores of the random policy's episodes in a submission."""
+    return {(each.side, each.robot): each.random_score for each in submission.robots}
+
+
+def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None) -> Array:
+    """Return the score of each episode, relative to the random policy where the task wants it.
+
+    Args:
+        outcomes: The episodes of a robot.
+        random: Scores of the random policy; None for those in ``outcomes``.
+
+    Raises:
+        BenchmarkError: If ``random`` lacks the robot.
+    """
+    scores = np.array(outcomes.score)
+    if not TASKS[outcomes.task].relative_to_random:
+        return scores
+    if random is None:
+        random = {(outcomes.side, outcomes.robot): outcomes.random_score}
+    if (outcomes.side, outcomes.robot) not in random:
+        raise BenchmarkError(
+            f"{outcomes.side} robot {outcomes.robot}: the release has no episodes of the random "
+            "policy; leave the robots of this side out"
+        )
+    own = np.array(random[outcomes.side, outcomes.robot])
+    if len(scores) % len(own):  # of another run: some episodes would count more often than others
+        own = np.array([own.mean()])
+    relative: Array = scores - np.resize(own, len(scores))
+    return relative
+
+
+def ranked(rows: Sequence[Row]) -> list[Row]:
+    """Return rows by their result on the test robots, the best first.
+
+    It is the mean score if the test robots have one task; scores of different tasks cannot be
+    added, so with several tasks it is the mean success rate. Rows without all of these tasks come
+    last.
+    """
+    tasks = {side.task for row in rows for side in row.sides if side.side == "test"}
+
+    def result(row: Row) -> float:
+        test = [side for side in row.sides if side.side == "test"]
+        if not test or len(test) < len(tasks):
+            return -math.inf
+        if len(tasks) == 1:
+            return test[0].score
+        robots = sum(side.robots for side in test)
+        return sum(side.success * side.robots for side in test) / robots
+
+    return sorted(rows, key=result, reverse=True)
+
+
+def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
+    """Return the ranking as a table; ``style`` is one of tabulate's."""
+    pairs = {(side.side, side.task): None for row in rows for side in row.sides}
+    groups = sorted(pairs, key=lambda pair: (pair[0] != "test", pair[1]))
+    headers = ["rank", "method", "from", "seeds"]
+    for side, task in groups:
+        headers += [f"{SIDE_NAMES[side]} {task}", "95%", "success"]
+    decimals = {}
+    for group in groups:
+        scores = [row.group(*group) for row in rows]
+        decimals[group] = score_decimals(side.score for side in scores if side is not None)
+    lines = []
+    for rank, row in enumerate(ranked(rows), 1):
+        cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
+        for side, task in groups:
+            cells += _cells(row, row.group(side, task), decimals[side, task])
+        lines.append([*cells, str(row.episodes)])
+    return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
+
+
+def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the ranking for JSON; every side has the ends of its success rate's interval, too."""
+    table = []
+    for row in ranked(rows):
+        sides = []
+        for side in row.sides:
+            success = row.success(side)
+            ends = {"success_low": success.low, "success_high": success.high}
+            sides.append(msgspec.to_builtins(side) | ends)
+        table.append(msgspec.to_builtins(row) | {"sides": sides})
+    return table
+
+
+def _cells(row: Row, side: SideScore | None, decimals: int) -> list[str]:
+    if side is None:
+        return ["-", "", ""]
+    # Releases of version 0.3.0 have ends without a width, which say nothing.
+    ends = () if side.low == side.high else (side.low, side.high)
+    interval = " to ".join(f"{end:.{decimals}f}" for end in ends if end is not None)
+    return [f"{side.score:.{decimals}f}", interval, row.success(side).as_percent()]

@@ -1,0 +1,366 @@
+"""Averages with their intervals: bootstrap for scores, Wilson for successes.
+
+After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binomtest, bootstrap, trim_mean
+from tabulate import tabulate
+
+from morphgen.benchmark.split import Side
+from morphgen.errors import TaskError, nearest
+from morphgen.formats.files import require_writable_file, write_file
+
+LEVEL = 0.95
+"""Confidence level of the intervals."""
+RESAMPLES = 2000
+MAX_RESAMPLED = 2**26
+"""Largest number of values that are resampled at once: 512 MB."""
+_MAX_DIGITS = 6
+"""Largest number of decimals of a rate's ends, which have as many as tell them apart."""
+TRIM = 0.25
+"""Fraction that the interquartile mean leaves out at each end."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An average or a rate with its interval.
+
+    The ends are nan if the samples cannot tell them: there is one, or all resamples have one mean.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def as_percent(self) -> str:
+        """Return a rate as text, such as ``85% (64% to 95%)``."""
+        ends = (self.low, self.high)
+        texts = [[f"{end:.{digits}%}" for end in ends] for digits in range(_MAX_DIGITS + 1)]
+        low, high = next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
+        return f"{self.value:.0%} ({low} to {high})"
+
+
+def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
+    """Return the mean of the strata's means, with a bootstrap that resamples every stratum.
+
+    Args:
+        strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
+
+    Raises:
+        ValueError: If there is no stratum, or one has no samples.
+    """
+    tables = tuple(_table(samples, 1) for samples in strata)
+    mean = float(np.mean([table.mean() for table in tables]))
+    if min(len(table) for table in tables) < 2:
+        return Interval(mean, math.nan, math.nan)
+
+    def statistic(*samples: NDArray[Any], axis: int = -1) -> NDArray[Any]:
+        values: NDArray[Any] = np.mean([sample.mean(axis=axis) for sample in samples], axis=0)
+        return values
+
+    return _interval(mean, tables, statistic, paired=False)
+
+
+def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
+    """Return a mean success rate with its interval (Wilson 1927), which stays within 0 and 1.
+
+    It has a width at 0 and 1, too. It is that of one rate for all strata: strata of different rates
+    make it too wide, never too narrow.
+
+    Args:
+        rates: Success rate of each stratum, such as the episodes of a robot and seed, shape (k,);
+            or that of all, a number.
+        trials: Number of trials of each stratum, at least 1, shape (k,) or a number.
+    """
+    rates, trials = np.broadcast_arrays(np.asarray(rates, dtype=np.float64), trials)
+    mean = float(rates.mean())
+    # As many trials as have the variance of the mean of the strata: all, if they are equally large.
+    total = round(rates.size**2 / float(np.sum(1 / trials)))
+    result = binomtest(round(mean * total), total).proportion_ci(LEVEL, method="wilson")
+    return Interval(mean, float(result.low), float(result.high))
+
+
+def episode_interval(
+    scores: Sequence[ArrayLike], successes: Sequence[ArrayLike], *, relative: bool
+) -> Interval:
+    """Return the mean over robots of their mean scores.
+
+    Its interval is ``success_interval`` if the score of an episode is its success, as that of push;
+    else ``stratified_mean_interval``.
+
+    Args:
+        scores: Scores of the episodes of each robot, shape (k,).
+        successes: Whether each of these episodes was a success, shape (k,).
+        relative: Whether the scores are relative to the random policy, and so no successes.
+
+    Raises:
+        ValueError: If there is no robot, or one has no episodes.
+    """
+    if not relative and all(map(np.array_equal, scores, successes)):
+        tables = [_table(each, 1) for each in successes]
+        return success_interval([each.mean() for each in tables], [len(each) for each in tables])
+    return stratified_mean_interval(scores)
+
+
+def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
+    """Return the interquartile mean of all scores, with a stratified bootstrap over seeds.
+
+    Robots are the strata: every resample has as many scores of each robot as the original.
+
+    Args:
+        scores: Scores of every seed on every robot, shape (seeds, robots).
+        together: Resample whole seeds, as the scores of a seed come from one policy; otherwise
+            resample the scores of each robot independently.
+
+    Raises:
+        ValueError: If there are no scores.
+    """
+    table = _table(scores, 2)
+    iqm = float(trim_mean(table.ravel(), TRIM))
+    if len(table) < 2:
+        return Interval(iqm, math.nan, math.nan)
+
+    def statistic(*strata: NDArray[Any], axis: int = -1) -> NDArray[Any]:
+        values: NDArray[Any] = trim_mean(np.concatenate(strata, axis=axis), TRIM, axis=axis)
+        return values
+
+    return _interval(iqm, tuple(table.T), statistic, paired=together)
+
+
+def _interval(
+    value: float,
+    samples: tuple[NDArray[np.float64], ...],
+    statistic: Callable[..., Any],
+    *,
+    paired: bool,
+) -> Interval:
+    if all(np.ptp(sample) == 0 for sample in samples):
+        return Interval(value, math.nan, math.nan)
+    num_values = sum(len(sample) for sample in samples)
+    interval = bootstrap(
+        samples,
+        statistic,
+        paired=paired,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=min(RESAMPLES, max(1, MAX_RESAMPLED // num_values)),
+        confidence_level=LEVEL,
+        method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval
+    if interval.low == interval.high:
+        return Interval(value, math.nan, math.nan)
+    return Interval(value, float(interval.low), float(interval.high))
+
+
+def _table(values: ArrayLike, axes: int) -> NDArray[np.float64]:
+    table = np.asarray(values, dtype=np.float64)
+    if table.ndim != axes or not table.size:
+        raise ValueError(f"scores of shape {table.shape}: expected {axes} axes, none of them empty")
+    return table
+
+
+_TEXTS = ("robot", "side", "task")
+"""Fields of a score that are no numbers."""
+_SUCCESS_ENDS = ("success_low", "success_high")
+"""Ends of the 95% Wilson interval of ``success``, which follow from the fields of a score."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Result of one robot in an evaluation."""
+
+    robot: str
+    """Name of the robot."""
+    side: Side
+    """Side of the split that the robot is on."""
+    task: str
+    """Task of the robot."""
+    episodes: int
+    """Number of episodes."""
+    steps: int
+    """Total length of the episodes [control steps]."""
+    score: float
+    """``raw``, or ``raw - random`` for tasks with ``Task.relative_to_random``."""
+    low: float
+    """Lower end of the 95% interval of ``score`` over episodes; see ``episode_interval``."""
+    high: float
+    """Upper end of the interval; nan like ``low`` if the episodes cannot tell it."""
+    raw: float
+    """Mean score of the episodes; see ``Task.episode_score``."""
+    random: float
+    """Mean score of the random policy's episodes."""
+    success: float
+    """Success rate of the episodes, 0 to 1."""
+    random_success: float
+    """Success rate of the random policy's episodes, 0 to 1."""
+    distance: float
+    """Mean distance from success at the end of an episode [m]."""
+    relative_distance: float
+    """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
+    unstable: int = 0
+    """Number of episodes that ended because the simulation diverged."""
+    angle: float = math.nan
+    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
+
+
+SCORE_KEYS = (*(field.name for field in fields(Score)), *_SUCCESS_ENDS)
+"""Keys of a score in JSON, and columns of CSV."""
+
+
+def success_of(scores: Sequence[Score]) -> Interval:
+    """Return the mean success rate of robots, or of robots and seeds, with its Wilson interval."""
+    return success_interval([each.success for each in scores], [each.episodes for each in scores])
+
+
+def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:
+    """Return scores as JSON values, with null instead of nan, and the interval of the success."""
+    table = []
+    for score in scores:
+        success = success_of([score])
+        ends = dict(zip(_SUCCESS_ENDS, (success.low, success.high), strict=True))
+        table.append(finite_or_none(asdict(score) | ends))
+    return table
+
+
+def finite_or_none(value: Any) -> Any:  # noqa: ANN401
+    """Return nested dictionaries and sequences for JSON, with None for numbers not finite."""
+    if isinstance(value, Mapping):
+        return {key: finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [finite_or_none(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def score_decimals(scores: Iterable[float]) -> int:
+    """Return the number of decimals with which scores of a task are shown, at least three digits.
+
+    Args:
+        scores: All scores of a column; those of push are from 0 to 1, those of reach up to 300.
+    """
+    return 1 if any(abs(score) >= 10 for score in scores) else 2
+
+
+def score_from_json(data: Mapping[str, Any]) -> Score:
+    """Return the score that ``scores_to_json`` made a dictionary of.
+
+    Raises:
+        TypeError: If a field is missing or unknown.
+        ValueError: If a field is of another type, or score or success is not finite.
+    """
+    values: dict[str, Any] = {
+        key: math.nan if value is None else value
+        for key, value in data.items()
+        if key not in _SUCCESS_ENDS
+    }
+    score = Score(**values)
+    where = f"{score.side} robot {score.robot}"
+    for field in fields(Score):
+        value = getattr(score, field.name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if is_number is (field.name in _TEXTS):
+            expected = "text" if field.name in _TEXTS else "a number"
+            raise ValueError(f"{where}: {field.name} {value!r}; expected {expected}")
+        if field.name in ("score", "success") and not math.isfinite(value):
+            raise ValueError(f"{where}: {field.name} {value!r}; expected a finite number")
+    return score
+
+
+SIDES = {"train": "MT", "test": "ZS"}
+"""The paper's names of the mean score of a side: multi-task and zero-shot."""
+HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "random", "distance")
+UNSTABLE = "episodes that ended because their simulation became unstable"
+SUFFIXES = (".csv", ".json", ".md")
+
+Scores = Mapping[str, Sequence[Score]]
+"""Scores by mode, or by the name of a baseline."""
+
+
+def score_table(scores_by_mode: Scores, style: str = "simple") -> str:
+    """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
+    rows = [_row(mode, each) for mode, scores in scores_by_mode.items() for each in scores]
+    return tabulate(rows, HEADERS, tablefmt=style, disable_numparse=True)
+
+
+def summary(scores_by_mode: Scores) -> str:
+    """Return a line per mode: mean scores of each side and task, and diverged episodes."""
+    lines = []
+    for mode, scores in scores_by_mode.items():
+        groups = dict.fromkeys((each.side, each.task) for each in scores)
+        means = []
+        for side, task in groups:
+            own = [each for each in scores if (each.side, each.task) == (side, task)]
+            score = np.mean([each.score for each in own])
+            success = success_of(own).as_percent()
+            means.append(f"{SIDES[side]} {task} {score:.2f}, success {success}")
+        unstable = sum(each.unstable for each in scores)
+        if unstable:
+            means.append(f"{UNSTABLE}: {unstable}")
+        lines.append(f"{mode}: " + "; ".join(means))
+    return "\n".join(lines)
+
+
+def require_table(path: Path) -> None:
+    """Require that a table can be written to a path.
+
+    Raises:
+        TaskError: If its suffix is unknown.
+        FormatError: If its folder is missing or cannot be written.
+    """
+    if path.suffix not in SUFFIXES:
+        raise TaskError(
+            f"{path}: no name of a table ends in {path.suffix!r}{nearest(path.suffix, SUFFIXES)}"
+        )
+    require_writable_file(path)
+
+
+def write_scores(path: Path, scores_by_mode: Scores) -> None:
+    """Write CSV, JSON or Markdown, by the suffix of the path.
+
+    Raises:
+        TaskError: If the suffix is another one.
+        FormatError: If it cannot be written.
+    """
+    require_table(path)
+    data = {mode: scores_to_json(scores) for mode, scores in scores_by_mode.items()}
+    if path.suffix == ".json":
+        write_file(path, json.dumps(data, indent=2) + "\n")
+    elif path.suffix == ".md":
+        write_file(path, score_table(scores_by_mode, "github") + "\n")
+    else:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, ["mode", *SCORE_KEYS], lineterminator="\n")
+        writer.writeheader()
+        for mode, rows in data.items():
+            writer.writerows({"mode": mode, **row} for row in rows)
+        write_file(path, text.getvalue())
+
+
+def _row(mode: str, score: Score) -> tuple[str, ...]:
+    angle = "" if math.isnan(score.angle) else f", {math.degrees(score.angle):.1f} deg"
+    interval = "" if math.isnan(score.low) else f"{score.low:.2f} to {score.high:.2f}"
+    return (
+        score.robot,
+        score.side,
+        score.task,
+        mode,
+        f"{score.score:.2f}",
+        interval,
+        success_of([score]).as_percent(),
+        f"{score.raw:.2f}",
+        f"{score.random:.2f}",
+        f"{score.distance:.3f} m{angle}",
+    )

@@ -1,0 +1,507 @@
+"""A submission: the outcome of every episode of one policy on a split, as JSON.
+
+Scores are not part of it: ``morphgen.rl.scores.leaderboard`` computes them from the episodes. Lists
+of a robot have an entry per episode, in the order of the evaluation, which the seed determines.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from morphgen.benchmark.split import Side, Split, split_id
+from morphgen.errors import BenchmarkError, FormatError
+from morphgen.formats.data_files import read_json
+from morphgen.formats.files import write_file
+from morphgen.formats.records import FiniteNumber, Record, read_record
+from morphgen.rl.rollouts import Episode
+from morphgen.tasks.goals.eval_protocol import EvalProtocol, ExpectedRobot
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import EnvSpec
+
+FORMAT = 1
+KIND = "morphgen submission"
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+
+
+class SplitName(Record, frozen=True):
+    """The split that a submission is for."""
+
+    name: Name
+    id: Name
+    """Id of the split, see ``morphgen.benchmark.split.split_id``."""
+
+
+class RobotOutcomes(Record, frozen=True):
+    """The episodes of one robot."""
+
+    robot: Name
+    side: Side
+    task: Name
+    body: Name
+    """Hash of the robot in the split."""
+    goal_set: Name
+    """Key of the robot's goal set: a hash of all that goals and starts follow from."""
+    success: tuple[bool, ...]
+    score: tuple[FiniteNumber, ...]
+    """Score of each episode, not relative to the random policy."""
+    distance: tuple[FiniteNumber, ...]
+    """Distance from success at the end of each episode [m]."""
+    steps: tuple[Count, ...]
+    """Length of each episode [control steps]."""
+    diverged: tuple[bool, ...]
+    """Whether each episode ended because the simulation diverged."""
+    random_score: tuple[FiniteNumber, ...]
+    """Score of each episode of the random policy with the same starts and goals."""
+    random_success: tuple[bool, ...]
+
+
+class Training(Record, frozen=True):
+    """How a policy was trained."""
+
+    simulator: Name
+    transitions: Annotated[int, Meta(ge=0, le=10**15)]
+    finetuned: Count = 0
+    """Transitions of fine-tuning on the test robots, after ``transitions`` on the train robots."""
+
+
+class Submission(Record, frozen=True):
+    """The content of a submission."""
+
+    kind: Literal["morphgen submission"]
+    format: int
+    method: Name
+    """Name of the method in rankings."""
+    mode: Literal["", "deterministic", "stochastic"]
+    """How the policy acts; empty for a baseline."""
+    training_seed: Seed | None
+    """Seed of the training; None for a baseline."""
+    morphgen: Name
+    """Version of morphgen that ran the episodes."""
+    split: SplitName
+    evaluation: dict[str, Any]
+    """Rules of the evaluation, see ``morphgen.tasks.goals.eval_protocol``."""
+    robots: tuple[RobotOutcomes, ...]
+    training: Training | None = None
+    """How the policy was trained, if it is known."""
+
+    @property
+    def finetuned(self) -> int:
+        """Transitions of fine-tuning on the test robots."""
+        return self.training.finetuned if self.training else 0
+
+    def __post_init__(self) -> None:
+        if self.format != FORMAT:
+            raise ValueError(f"format {self.format}; this version reads {FORMAT}")
+        if not self.method.isprintable():
+            raise ValueError(f"method {self.method!r}; expected printable characters")
+
+
+class SubmissionRecorder:
+    """Collects the episodes of an evaluation; an instance is its ``record`` callback."""
+
+    def __init__(self, split: Split) -> None:
+        self._split = split
+        self.robots: list[RobotOutcomes] = []
+        """Outcomes of the robots so far."""
+
+    def __call__(
+        self,
+        spec: EnvSpec,
+        side: Side,
+        episodes: Sequence[Episode],
+        random_episodes: Sequence[Episode],
+    ) -> None:
+        """Add a robot."""
+        name = spec.robot.name
+        member = next(each for each in self._split.side(side) if each.name == name)
+        self.robots.append(
+            RobotOutcomes(
+                robot=name,
+                side=side,
+                task=spec.task,
+                body=member.robot_hash,
+                goal_set=spec.goals.key,
+                success=tuple(each.success for each in episodes),
+                score=tuple(each.score for each in episodes),
+                distance=tuple(each.distance for each in episodes),
+                steps=tuple(each.steps for each in episodes),
+                diverged=tuple(each.unstable for each in episodes),
+                random_score=tuple(each.score for each in random_episodes),
+                random_success=tuple(each.success for each in random_episodes),
+            )
+        )
+
+    def submission(
+        self,
+        method: str,
+        mode: str,
+        training_seed: int | None,
+        evaluation: dict[str, Any],
+        training: Training | None = None,
+    ) -> Submission:
+        """Return the submission of the recorded episodes; for the arguments see ``Submission``.
+
+        Raises:
+            BenchmarkError: If the method has no valid name.
+        """
+        data = {
+            "kind": KIND,
+            "format": FORMAT,
+            "method": method,
+            "mode": mode,
+            "training_seed": training_seed,
+            "morphgen": version("morphgen"),
+            "split": {"name": self._split.name, "id": split_id(self._split)},
+            "evaluation": evaluation,
+            "training": msgspec.to_builtins(training),
+            "robots": msgspec.to_builtins(self.robots),
+        }
+        return read_record(data, Submission, "submission", BenchmarkError)
+
+
+def submission_text(submission: Submission) -> str:
+    """Return the text of a submission: a line per list of a robot."""
+    data = msgspec.to_builtins(submission)
+    robots = data.pop("robots")
+    if submission.training is None:
+        del data["training"]
+    head = json.dumps(data, indent=2).removesuffix("\n}")
+    blocks = [
+        ",\n".join(f"      {json.dumps(key)}: {json.dumps(value)}" for key, value in robot.items())
+        for robot in robots
+    ]
+    body = ",\n".join(f"    {{\n{block}\n    }}" for block in blocks)
+    return f'{head},\n  "robots": [\n{body}\n  ]\n}}\n'
+
+
+def write_submission(path: Path, submission: Submission) -> None:
+    """Write a submission.
+
+    Raises:
+        FormatError: If it cannot be written; then nothing is left behind.
+    """
+    write_file(path, submission_text(submission))
+
+
+def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
+    """Yield a JSON file with its content, or those of a folder in the order of their paths.
+
+    Args:
+        path: The file or folder.
+        patterns: Patterns of the files in the folder.
+
+    Raises:
+        BenchmarkError: If there is no such file or folder, or a file is no JSON.
+    """
+    if path.is_dir():
+        files = sorted({file for pattern in patterns for file in path.glob(pattern)})
+    elif path.is_file():
+        files = [path]
+    else:
+        raise BenchmarkError(f"{path}: no such file or folder")
+    for file in files:
+        try:
+            data = read_json(file)
+        except FormatError as error:  # which names the file
+            raise BenchmarkError(str(error)) from error
+        except OSError as error:
+            raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
+        yield file, data
+
+
+def is_submission(data: object) -> bool:
+    """Return whether the content of a JSON file claims to be a submission."""
+    return isinstance(data, dict) and data.get("kind") == KIND
+
+
+def read_submission(path: Path) -> Submission:
+    """Read a submission and check its form; ``submission_checks`` checks what it claims.
+
+    Raises:
+        BenchmarkError: If it is missing or malformed; the message names robot and field.
+    """
+    try:
+        data = read_json(path)
+    except FileNotFoundError as error:
+        raise BenchmarkError(f"{path}: no such file") from error
+    except OSError as error:
+        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
+    if not is_submission(data):
+        raise BenchmarkError(
+            f"{path}: no submission; expected an object with the kind {KIND!r}, as morphgen eval "
+            "--submission writes it"
+        )
+    return submission_from(data, path)
+
+
+def submission_from(data: object, path: Path) -> Submission:
+    """Return the submission of a JSON file's content, and check its form.
+
+    Raises:
+        BenchmarkError: If it is malformed; the message names file, robot and field.
+    """
+    return read_record(data, Submission, str(path), BenchmarkError)
+
+
+LISTS = ("success", "score", "distance", "steps", "diverged")
+"""Lists of a robot with an entry per episode of the policy."""
+MAX_EPISODES = 10_000
+"""Largest number of episodes of a robot."""
+MAX_DISTANCE = 1e3
+"""Largest distance from success [m]."""
+ROUNDING = 1e-4
+"""Relative error of a sum of an episode's scores in single precision, which a valid score may
+exceed its range by."""
+RANDOM_TOLERANCE = 1.0
+"""Largest difference of the mean scores of the same episodes of the random policy: processors
+differ in the last bits, as for ``doctor.reference.SCORE_TOLERANCE``."""
+RANDOM_ERRORS = 4.0
+"""Largest difference of the mean scores of different episodes of it [standard errors]."""
+
+
+def check_submission(
+    submission: Submission,
+    where: str,
+    split: Split,
+    protocol: EvalProtocol,
+    expected: Sequence[ExpectedRobot],
+    version: str,
+) -> None:
+    """Check all that a submission claims.
+
+    Args:
+        submission: The submission.
+        where: Its file, for messages.
+        split: The split.
+        protocol: Rules of the evaluation.
+        expected: What it must hold for every member, see ``expected_robots``.
+        version: Version of morphgen that it must come from, up to the last number.
+
+    Raises:
+        BenchmarkError: At the first fault; the message names robot and field.
+    """
+    _check_head(submission, where, split, protocol, version)
+    wanted = {(each.side, each.member.name): each for each in expected}
+    require_each_once(submission, where)
+    for outcomes in submission.robots:
+        key = (outcomes.side, outcomes.robot)
+        at = f"{where}: {outcomes.side} robot {outcomes.robot}"
+        if key not in wanted:
+            raise BenchmarkError(f"{at}: the split has no such robot")
+        _check_robot(outcomes, at, wanted[key], protocol)
+    seen = {(outcomes.side, outcomes.robot) for outcomes in submission.robots}
+    sides = {side for side, _ in seen} | {"test"}
+    for side, name in wanted:
+        if side in sides and (side, name) not in seen:
+            raise BenchmarkError(
+                f"{where}: {side} robot {name}: is missing; expected all robots of the side"
+            )
+
+
+def require_each_once(submission: Submission, where: str) -> None:
+    """Require that a submission has no robot of a side twice.
+
+    Raises:
+        BenchmarkError: If it has; the message names ``where``, its file.
+    """
+    seen: set[tuple[str, str]] = set()
+    for outcomes in submission.robots:
+        if (outcomes.side, outcomes.robot) in seen:
+            at = f"{where}: {outcomes.side} robot {outcomes.robot}"
+            raise BenchmarkError(f"{at}: is there twice; expected once")
+        seen.add((outcomes.side, outcomes.robot))
+
+
+def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:
+    """Require that submissions agree about the random policy, whose scores follow from the split.
+
+    Episodes of a test robot are the same if there are as many. Those of a train robot may be
+    others: policies of single robots are evaluated robot by robot, and so is the random policy.
+
+    Args:
+        submissions: File and content of submissions that were checked.
+
+    Raises:
+        BenchmarkError: If two disagree about a robot whose score is relative to the random policy.
+    """
+    first: dict[tuple[str, str], tuple[str, RobotOutcomes]] = {}
+    for where, submission in submissions:
+        for outcomes in submission.robots:
+            if not TASKS[outcomes.task].relative_to_random:
+                continue
+            key = (outcomes.side, outcomes.robot)
+            earlier, other = first.setdefault(key, (where, outcomes))
+            found, expected = np.array(outcomes.random_score), np.array(other.random_score)
+            if abs(found.mean() - expected.mean()) > _random_tolerance(outcomes, other):
+                raise BenchmarkError(
+                    f"{where}: {outcomes.side} robot {outcomes.robot}: random_score: mean "
+                    f"{found.mean():.2f}; expected {expected.mean():.2f}, as in {earlier}: the "
+                    "random policy has the same episodes in all submissions; evaluate again, or "
+                    "rank them in a release with a submission of random"
+                )
+
+
+def _random_tolerance(outcomes: RobotOutcomes, other: RobotOutcomes) -> float:
+    """Return the largest valid difference of two mean scores of the random policy."""
+    counts = len(outcomes.random_score), len(other.random_score)
+    if outcomes.side == "test" and counts[0] == counts[1]:
+        return RANDOM_TOLERANCE
+    # The smaller deviation: edited scores cannot widen their own tolerance.
+    deviation = min(float(np.std(each.random_score)) for each in (outcomes, other))
+    error = deviation * math.sqrt(1 / counts[0] + 1 / counts[1])
+    return max(RANDOM_TOLERANCE, RANDOM_ERRORS * error)
+
+
+def require_rules(found: Mapping[str, Any], rules: Mapping[str, Any], where: str) -> None:
+    """Require that an evaluation followed the rules of a protocol.
+
+    Args:
+        found: Rules of the evaluation, see ``EvalProtocol.as_data``.
+        rules: Those that it must follow; it may have more episodes.
+        where: The file, for messages.
+
+    Raises:
+        BenchmarkError: If a rule differs.
+    """
+    for key in ("simulator", "seed", "goal_seed"):
+        if found.get(key) != rules[key]:
+            raise BenchmarkError(
+                f"{where}: evaluation.{key}: {found.get(key)!r}; expected {rules[key]!r}"
+            )
+    constants = found.get("constants")
+    for task, values in rules["constants"].items():
+        own = constants.get(task) if isinstance(constants, Mapping) else None
+        for name, value in values.items():
+            given = own.get(name) if isinstance(own, Mapping) else None
+            if given != value:
+                raise BenchmarkError(
+                    f"{where}: evaluation.constants.{task}.{name}: {given!r}; expected {value!r}"
+                )
+    episodes = found.get("episodes")
+    if type(episodes) is not int or episodes < rules["episodes"]:
+        raise BenchmarkError(
+            f"{where}: evaluation.episodes: {episodes!r}; expected {rules['episodes']} or more"
+        )
+
+
+def _check_head(
+    submission: Submission, where: str, split: Split, protocol: EvalProtocol, version: str
+) -> None:
+    expected_id = split_id(split)
+    if submission.split.id != expected_id:
+        raise BenchmarkError(
+            f"{where}: split.id: {submission.split.id} ({submission.split.name}); expected "
+            f"{expected_id} ({split.name})"
+        )
+    require_series(submission.morphgen, version, where)
+    require_rules(submission.evaluation, protocol.as_data(split), where)
+
+
+def require_series(found: str, expected: str, where: str) -> None:
+    """Require that two versions of morphgen have scores that compare: the first numbers are equal.
+
+    Raises:
+        BenchmarkError: If they have not.
+    """
+    if _series(found) != _series(expected):
+        raise BenchmarkError(
+            f"{where}: morphgen: {found}; scores are compared with those of version "
+            f"{_series(expected)}"
+        )
+
+
+def _series(version: str) -> str:
+    """Return the first two numbers of a version."""
+    return ".".join(version.split(".")[:2])
+
+
+def _check_robot(
+    outcomes: RobotOutcomes, at: str, expected: ExpectedRobot, protocol: EvalProtocol
+) -> None:
+    member = expected.member
+    for key, found, wanted in (
+        ("task", outcomes.task, member.task),
+        ("body", outcomes.body, member.robot_hash),
+        ("goal_set", outcomes.goal_set, expected.goal_set),
+    ):
+        if found != wanted:
+            raise BenchmarkError(f"{at}: {key}: {found}; expected {wanted}")
+    count = len(outcomes.score)
+    if not protocol.episodes <= count <= MAX_EPISODES:
+        raise BenchmarkError(
+            f"{at}: score: {count} episodes; expected {protocol.episodes} to {MAX_EPISODES}"
+        )
+    require_full_lists(outcomes, at)
+    random_count = len(outcomes.random_score)
+    if random_count < protocol.episodes:
+        raise BenchmarkError(
+            f"{at}: random_score: {random_count} episodes, random_success: "
+            f"{len(outcomes.random_success)}; expected {protocol.episodes} or more, as many of both"
+        )
+    _check_episodes(outcomes, at, expected, protocol)
+
+
+def require_full_lists(outcomes: RobotOutcomes, at: str) -> None:
+    """Require an entry for every episode in the lists of a robot, and one episode or more.
+
+    Args:
+        outcomes: The episodes of the robot.
+        at: Its place, for the message.
+
+    Raises:
+        BenchmarkError: If a list is shorter or longer than the others.
+    """
+    count, random_count = len(outcomes.score), len(outcomes.random_score)
+    if not count:
+        raise BenchmarkError(f"{at}: score: no episodes; expected one or more")
+    for name in LISTS:
+        if len(getattr(outcomes, name)) != count:
+            raise BenchmarkError(
+                f"{at}: {name}: {len(getattr(outcomes, name))} episodes; expected {count}, as in "
+                "score"
+            )
+    if len(outcomes.random_success) != random_count:
+        raise BenchmarkError(
+            f"{at}: random_score: {random_count} episodes, random_success: "
+            f"{len(outcomes.random_success)}; expected as many of both"
+        )
+    if not random_count and TASKS[outcomes.task].relative_to_random:
+        raise BenchmarkError(f"{at}: random_score: no episodes; expected one or more")
+
+
+def _check_episodes(
+    outcomes: RobotOutcomes, at: str, expected: ExpectedRobot, protocol: EvalProtocol
+) -> None:
+    task = TASKS[expected.member.task]
+    config = protocol.goals.task_config(expected.member.task)
+    low, high = task.score_range(config, expected.reach)
+    for name in ("score", "random_score"):
+        for i, score in enumerate(getattr(outcomes, name)):
+            if not low - ROUNDING * abs(low) <= score <= high + ROUNDING * abs(high):
+                raise BenchmarkError(f"{at}: {name}[{i}]: {score:g}; expected {low:g} to {high:g}")
+    rows = zip(*(getattr(outcomes, name) for name in LISTS), strict=True)
+    for i, (success, score, distance, steps, diverged) in enumerate(rows):
+        fault = ""
+        if not 1 <= steps <= config.max_episode_steps:
+            fault = f"steps[{i}]: {steps}; expected 1 to {config.max_episode_steps}"
+        elif not 0 <= distance <= MAX_DISTANCE:
+            fault = f"distance[{i}]: {distance:g}; expected 0 to {MAX_DISTANCE:g}"
+        elif diverged and success:
+            fault = f"success[{i}]: true in an episode that diverged; expected false"
+        elif not diverged and (why := task.outcome_fault(config, success, score, distance)):
+            fault = f"episode {i}: {why}"
+        if fault:
+            raise BenchmarkError(f"{at}: {fault}")

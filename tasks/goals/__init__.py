@@ -1,0 +1,1 @@
+"""Goal sets: sampling, audits and the goals of splits."""

@@ -1,0 +1,168 @@
+"""How policies are evaluated for the scores of a release, so that scores can be compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from morphgen.benchmark.split import SIDES, Member, Side, Split
+from morphgen.errors import BenchmarkError, MorphgenError, TaskError, nearest
+from morphgen.grammar.library import Library
+from morphgen.model.kinematics import reach
+from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.tasks.goals.goal_sets import goal_set_key
+from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.scenes.env_specs import (
+    GoalConfig,
+    ground_under,
+    member_with_primitives,
+    task_configs,
+)
+
+SIMULATOR = "mujoco"
+"""Default simulator: the one that every installation has."""
+EPISODES = 34
+"""Default number of episodes per robot: 10,000 control steps."""
+
+
+@dataclass(frozen=True)
+class EvalProtocol:
+    """Rules of an evaluation."""
+
+    simulator: str = SIMULATOR
+    episodes: int = EPISODES
+    """Minimum number of episodes per robot."""
+    seed: int = 0
+    """Seed of the episodes."""
+    goals: GoalConfig = field(default_factory=GoalConfig)
+    """Seed of the goals, and constants of the tasks."""
+
+    def __post_init__(self) -> None:
+        """Check the simulator and the numbers.
+
+        Raises:
+            BenchmarkError: If the simulator is unknown or has no contacts, or a number is invalid.
+        """
+        valid = [name for name in SIMULATORS.builtin if name not in ("kinematic", "warp")]
+        if self.simulator not in valid:
+            raise BenchmarkError(
+                f"simulator {self.simulator!r}: no simulator with contacts that comes with morphgen"
+                f"{nearest(self.simulator, valid)}"
+            )
+        numbers = (self.episodes, self.seed)
+        is_whole = all(type(number) is int for number in numbers)
+        if not (is_whole and 1 <= self.episodes <= 10_000 and 0 <= self.seed < 2**63):
+            raise BenchmarkError(
+                f"{self.episodes} episodes of seed {self.seed}: expected 1 to 10000 episodes, and "
+                "a seed of 0 or more, both whole numbers"
+            )
+
+    def as_data(self, split: Split) -> dict[str, Any]:
+        """Return the rules as JSON data, with the constants of the split's tasks."""
+        tasks = tasks_of_split(split)
+        constants = self.goals.as_data(tasks)
+        return {
+            "simulator": self.simulator,
+            "episodes": self.episodes,
+            "seed": self.seed,
+            "goal_seed": self.goals.seed,
+            "constants": {task: _plain(constants[task]) for task in tasks},
+        }
+
+
+@dataclass(frozen=True)
+class ExpectedRobot:
+    """A robot of a split whose episodes a submission must hold."""
+
+    side: Side
+    member: Member
+    goal_set: str
+    """Key of the goal set."""
+    reach: float
+    """Reach [m]."""
+
+
+def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:
+    """Read what ``EvalProtocol.as_data`` returned.
+
+    Args:
+        data: The rules.
+        where: The file, for messages.
+
+    Raises:
+        BenchmarkError: If a rule is missing, unknown or invalid.
+    """
+    try:
+        rules = dict(data)
+        constants = rules.pop("constants")
+        goals = GoalConfig(int(rules.pop("goal_seed")), task_configs(constants))
+        return EvalProtocol(goals=goals, **rules)
+    except KeyError as error:
+        raise BenchmarkError(f"{where}: evaluation: missing key {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError, MorphgenError) as error:
+        raise BenchmarkError(f"{where}: evaluation: {error}") from error
+
+
+def tasks_of_split(split: Split) -> tuple[str, ...]:
+    """Return the tasks of a split's robots, without repetition."""
+    return tuple(dict.fromkeys(each.task for side in SIDES for each in split.side(side)))
+
+
+def expected_robots(
+    split: Split,
+    protocol: EvalProtocol,
+    library: Library,
+    *,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> list[ExpectedRobot]:
+    """Return what a submission must hold for every member, train robots first.
+
+    Args:
+        split: The split.
+        protocol: Rules of the evaluation.
+        library: The library of parts.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished, and of all.
+
+    Raises:
+        MorphgenError: If a robot cannot be composed, or differs from the split's.
+    """
+    expect = _Expect(library.folders, protocol.goals)
+    members = [(side, member) for side in SIDES for member in split.side(side)]
+    return list(parallel_map(expect, members, jobs, progress))
+
+
+@dataclass(frozen=True, eq=False)
+class _Expect:
+    """Compute the key of a member's goal set without sampling it; sent to worker processes."""
+
+    folders: tuple[Path, ...]
+    goals: GoalConfig
+
+    @cached_property
+    def library(self) -> Library:
+        return Library(self.folders)
+
+    def __call__(self, sided: tuple[Side, Member]) -> ExpectedRobot:
+        side, member = sided
+        if not TASKS.is_installed(member.task):
+            raise TaskError(f"robot {member.name!r}: unknown task {member.task!r}")
+        robot = member_with_primitives(member, self.library)
+        key = goal_set_key(
+            robot,
+            TASKS[member.task],
+            self.goals.task_config(member.task),
+            obstacles=member.obstacles,
+            seed=self.goals.seed,
+            ground=ground_under(robot),
+        )
+        return ExpectedRobot(side, member, key, reach(robot))
+
+
+def _plain(constants: Mapping[str, Any]) -> dict[str, Any]:
+    """Return constants as JSON reads them: lists instead of tuples."""
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in constants.items()}

@@ -1,0 +1,267 @@
+"""Goal sets of the benchmark's scenarios that come with the package, verified by hash when read.
+
+They are the sets that would be sampled, number by number, in double precision: a set of lower
+precision would give other episodes than the same set sampled anew. ``package_sets`` makes them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import lzma
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from functools import cache
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from platformdirs import user_cache_path
+
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.errors import BenchmarkError, TaskError
+from morphgen.formats.files import write_cache_file
+from morphgen.formats.zip_files import read_npz
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Robot
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import GoalSet, Task, TaskConfig
+
+FOLDER = Path(__file__).parents[1] / "goal_set_files"
+"""Folder of the compressed sets and of their index."""
+INDEX = "index.json"
+
+
+@cache
+def packaged_index() -> Mapping[str, Mapping[str, Any]]:
+    """Return a record of each packaged set by the set's key.
+
+    A record has ``file`` with its ``sha256`` and ``bytes``, ``task``, ``obstacles``, and
+    ``robot``, the hash of the robot in splits.
+    """
+    records: dict[str, dict[str, Any]] = json.loads((FOLDER / INDEX).read_text(encoding="utf-8"))
+    return records
+
+
+def packaged_set(key: str) -> bytes | None:
+    """Return the content of the packaged set with a key, as ``set_npz`` returns it, or None.
+
+    Raises:
+        TaskError: If the file is missing, or is not the one that the index lists.
+    """
+    record = packaged_index().get(key)
+    if record is None:
+        return None
+    path = FOLDER / record["file"]
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise TaskError(f"{path}: {error.strerror}; install morphgen again") from error
+    if hashlib.sha256(content).hexdigest() != record["sha256"]:
+        raise TaskError(f"{path}: not the file that {INDEX} lists; install morphgen again")
+    return lzma.decompress(content)
+
+
+G = TypeVar("G", bound=GoalSet)
+
+
+def goal_set(
+    robot: Robot,
+    task: Task[Any, Any],
+    config: TaskConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    ground: float = 0.0,
+    cache: str | PathLike[str] | None = None,
+    shipped: GoalSet | None = None,
+    anew: bool = False,
+) -> GoalSet:
+    """Return a robot's goal set: the shipped one, the packaged one, the cached one, or a new one.
+
+    A set depends on what ``goal_set_key`` says. A smaller set is the beginning of a larger one.
+
+    Args:
+        robot: The robot, with a tool.
+        task: The task.
+        config: Constants of the task, such as the number of goals.
+        obstacles: Whether there are obstacles.
+        seed: Seed of all random numbers, at least 0.
+        ground: Height of the ground in the root frame [m].
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        shipped: Goal set that came with a split; it must be the one that would be sampled.
+        anew: Whether to sample the set even if it is packaged or cached; it is not stored then.
+
+    Raises:
+        BenchmarkError: If a number is invalid, or the robot cannot have such a set.
+        TaskError: If the robot cannot have such a set, its file is broken, or ``shipped`` is
+            another set.
+        MeshError: If a mesh cannot be read.
+    """
+    if seed < 0 or config.num_goals < 1:
+        raise BenchmarkError(
+            f"{config.num_goals} goals with seed {seed}: at least one goal, and no negative seed"
+        )
+    task.check(robot, config)
+    key = goal_set_key(robot, task, config, obstacles=obstacles, seed=seed, ground=ground)
+    if shipped is not None:
+        if shipped.key != key:
+            raise TaskError(
+                f"robot {robot.name!r}: the shipped goal set is of another robot, seed, ground or "
+                "constants of the task; build it again: morphgen split build --goals"
+            )
+        return shipped
+
+    def sample() -> GoalSet:
+        digest = int(robot_hash(robot, visuals=False), 16)
+        seeds = np.random.SeedSequence([seed, digest, int(obstacles)])
+        identity = {"robot": robot.name, "key": key, "seed": seed}
+        goals = task.sample(
+            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+        )
+        if not isinstance(goals, task.goal_set_type):
+            raise TaskError(
+                f"task {task.name!r}: sample returned {type(goals).__name__}; expected "
+                f"{task.goal_set_type.__name__}"
+            )
+        sampled: GoalSet = goals
+        return sampled
+
+    if anew:
+        return sample()
+    kind: type[GoalSet] = task.goal_set_type
+    if (content := packaged_set(key)) is not None:
+        return replace(set_from_npz(content, kind), robot=robot.name)
+    folder = user_cache_path("morphgen") / task.cache_folder if cache is None else Path(cache)
+    return _cached(kind, folder / f"{key}.npz", robot.name, sample)
+
+
+def goal_set_key(
+    robot: Robot,
+    task: Task[Any, Any],
+    config: TaskConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    ground: float,
+) -> str:
+    """Return the hash of everything that a goal set depends on: 64 hexadecimal digits.
+
+    These are robot, ignored pairs of links, seed, ground, constants and obstacles, not the robot's
+    name. For the arguments see ``goal_set``.
+    """
+    index = robot.link_index
+    ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
+    layouts = config.train_layouts, config.eval_layouts
+    boxes = [config.obstacles, *map(float, config.obstacle_size), *layouts] if obstacles else None
+    constants = [*task.key_parts(config), boxes]
+    digest = robot_hash(robot, visuals=False)
+    parts = [task.goal_format, digest, ignored, *constants, seed, float(ground)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def set_npz(goals: GoalSet) -> bytes:
+    """Return a goal set as the content of a file.
+
+    Blocks are rows of 12: edges, pose (x, y, z, qw, qx, qy, qz), mass and friction.
+    """
+    content = io.BytesIO()
+    np.savez(content, **arrays_of(goals))  # type: ignore[arg-type]  # they are not allow_pickle
+    return content.getvalue()
+
+
+def set_from_npz(content: bytes, kind: type[G]) -> G:
+    """Read what ``set_npz`` wrote.
+
+    Raises:
+        ValueError: If it is not such a set; with the reason.
+    """
+    names = [field.name for field in fields(kind)]
+    arrays = read_npz(io.BytesIO(content), names)
+    return kind(**{name: _value(name, array) for name, array in zip(names, arrays, strict=True)})
+
+
+def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:
+    """Return the fields of a set as arrays, by name; see ``set_npz``."""
+    return {field.name: _array(getattr(goals, field.name)) for field in fields(goals)}
+
+
+def goals_from_npz(content: bytes, task: str, path: Path) -> GoalSet:
+    """Read a set that came with a split.
+
+    Args:
+        content: Content of the file.
+        task: Name of the task that the set is for.
+        path: Path of the file, for messages.
+
+    Raises:
+        BenchmarkError: If it is not such a set.
+        TaskError: If the task is unknown.
+    """
+    kind: type[GoalSet] = TASKS[task].goal_set_type
+    try:
+        goals = set_from_npz(content, kind)
+    except ValueError as error:
+        raise BenchmarkError(f"{path}: not a goal set for {task}: {error}") from error
+    shapes = goals.q.shape, goals.goal_poses.shape
+    if len(shapes[0]) != 2 or shapes[1] != (shapes[0][0], 7):
+        raise BenchmarkError(
+            f"{path}: configurations and poses have shapes {shapes[0]} and {shapes[1]}"
+        )
+    return goals
+
+
+def _cached(kind: type[G], path: Path, robot: str, sample: Callable[[], G]) -> G:
+    """Return a goal set from the cache, or sample and store it.
+
+    Warns if it cannot be stored. The name of the file is the set's key.
+
+    Raises:
+        TaskError: If the file is broken, or of another set.
+    """
+    if path.is_file():
+        try:
+            cached = set_from_npz(path.read_bytes(), kind)
+        except (OSError, ValueError) as error:
+            raise TaskError(f"{path}: not a {kind.__name__}: {error}; delete it") from error
+        if cached.key != path.stem:
+            raise TaskError(f"{path}: its key is {cached.key}, not its name; delete it")
+        return replace(cached, robot=robot)
+    goals = sample()
+    try:
+        write_cache_file(path, set_npz(goals))
+    except OSError as error:
+        warnings.warn(f"cannot store a {kind.__name__} in {path}: {error.strerror}", stacklevel=3)
+    return goals
+
+
+def _array(value: object) -> NDArray[Any]:
+    if isinstance(value, Block):
+        return np.array(_row(value))
+    if isinstance(value, tuple):
+        return np.array([_row(block) for block in value], dtype=np.float64).reshape(-1, 12)
+    return np.asarray(value)
+
+
+def _value(name: str, array: NDArray[Any]) -> object:
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} has a number that is not finite")
+    if name == "block":
+        return _block(array.tolist())
+    if name == "obstacles":
+        return tuple(_block(row) for row in array.tolist())
+    return array if array.ndim else array.item()
+
+
+def _row(block: Block) -> list[float]:
+    return [*block.size, *block.pose.position, *block.pose.quaternion, block.mass, block.friction]
+
+
+def _block(row: list[float]) -> Block:
+    a, b, c, x, y, z, qw, qx, qy, qz, mass, friction = row
+    return Block((a, b, c), Pose((x, y, z), (qw, qx, qy, qz)), mass, friction)

@@ -1,0 +1,148 @@
+"""Make the goal sets that come with the package: those of the splits that are shipped with it.
+
+    python -m morphgen.tasks.goals.package_sets           # sample all sets, replace the files
+    python -m morphgen.tasks.goals.package_sets --sizes   # how large the files are
+
+Run it after a change of robots, fits, tasks or their constants. Sets that are still the same keep
+their files. Splits that have a robot at a task in common share the set.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import lzma
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from morphgen.benchmark.split import Member
+from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.errors import BenchmarkError
+from morphgen.formats.files import write_atomic
+from morphgen.grammar.library import Library, default_library
+from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.tasks.goals.goal_sets import FOLDER, INDEX, packaged_index, set_npz
+from morphgen.tasks.goals.split_goals import certify_goal_set
+from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
+
+Identity = tuple[str, str, bool]
+"""Hash of a robot in splits, its task, and whether there are obstacles."""
+
+
+def identity(member: Member) -> Identity:
+    """Return what distinguishes the goal set of a member from those of other members."""
+    return member.robot_hash, member.task, member.obstacles
+
+
+def shipped_members() -> dict[Identity, Member]:
+    """Return the distinct members of all shipped splits."""
+    return {identity(member): member for name in split_names() for member in _members(name)}
+
+
+def _members(name: str) -> Iterator[Member]:
+    split = read_split(name)
+    yield from split.train
+    yield from split.test
+
+
+def write_sets(folder: Path = FOLDER, jobs: int = 1, progress: Progress = no_progress) -> None:
+    """Sample and certify the sets of all shipped splits, and write them with their index.
+
+    Args:
+        folder: Folder to write into; sets of other keys are deleted from it.
+        jobs: Number of processes.
+        progress: Called with the number of finished sets and their total.
+
+    Raises:
+        BenchmarkError: If a set cannot be sampled, or a goal has a fault.
+    """
+    members = list(shipped_members().values())
+    sampler = _Sampler(default_library(()).folders)
+    records: dict[str, dict[str, object]] = {}
+    for member, (key, content) in zip(
+        members, parallel_map(sampler, members, jobs, progress, chunk=1), strict=True
+    ):
+        file = f"{key[:16]}.npz.xz"
+        compressed = lzma.compress(content, preset=9)
+        if not _has(folder / file, content):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_bytes(compressed)
+        stored = (folder / file).read_bytes()
+        records[key] = {
+            "file": file,
+            "sha256": hashlib.sha256(stored).hexdigest(),
+            "bytes": len(stored),
+            "robot": member.robot_hash,
+            "task": member.task,
+            "obstacles": member.obstacles,
+        }
+    for path in folder.glob("*.npz.xz"):
+        if path.name not in {record["file"] for record in records.values()}:
+            path.unlink()
+    lines = ",\n".join(f'"{key}": {json.dumps(records[key])}' for key in sorted(records))
+    write_atomic(folder / INDEX, f"{{\n{lines}\n}}\n")
+
+
+def _has(path: Path, content: bytes) -> bool:
+    """Return whether a file has this content, whatever version of xz compressed it."""
+    return path.is_file() and lzma.decompress(path.read_bytes()) == content
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampler:
+    """Samples the set of a member in a worker process."""
+
+    folders: tuple[Path, ...]
+
+    @cached_property
+    def library(self) -> Library:
+        return Library(self.folders)
+
+    def __call__(self, member: Member) -> tuple[str, bytes]:
+        """Return the key and the content of a member's set."""
+        robot = member_with_primitives(member, self.library)
+        spec = env_spec(robot, member.task, GoalConfig(), obstacles=member.obstacles, anew=True)
+        faults = certify_goal_set(spec.goals, spec)
+        if faults:
+            raise BenchmarkError(f"robot {member.name!r} at {member.task}: {faults[0]}")
+        return spec.goals.key, set_npz(spec.goals)
+
+
+def sizes_text() -> str:
+    """Return a table of the sizes of the packaged sets by split."""
+    sizes = {
+        (record["robot"], record["task"], record["obstacles"]): int(record["bytes"])
+        for record in packaged_index().values()
+    }
+    lines = [f"{'split':<36} {'sets':>4} {'size':>10}"]
+    for name in split_names():
+        used = [sizes[one] for one in {identity(member) for member in _members(name)}]
+        lines.append(f"{name:<36} {len(used):>4} {sum(used) / 1000:>7.0f} kB")
+    lines.append(f"{'all distinct':<36} {len(sizes):>4} {sum(sizes.values()) / 1000:>7.0f} kB")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write the sets and print their sizes, or print the sizes alone."""
+    parser = argparse.ArgumentParser(prog="python -m morphgen.tasks.goals.package_sets")
+    parser.add_argument("--sizes", action="store_true", help="print the sizes of the sets only")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
+    args = parser.parse_args()
+    if not args.sizes:
+        write_sets(jobs=args.jobs, progress=_show)
+        packaged_index.cache_clear()
+    print(sizes_text())
+
+
+def _show(done: int, total: int) -> None:
+    if sys.stderr.isatty() or done == total:
+        end = "\n" if done == total else "\r"
+        print(f"{done} of {total} goal sets", end=end, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,399 @@
+"""Goal sets of robots and of all members of a split: sampling them, and files that ship them.
+
+goals/index.json             seed and constants of all sets, and a record of each set
+goals/<side>/<name>.npz      fields of a goal set; the task determines its class
+goals/README.md              explanation of these files
+
+A set depends on robot, task, constants, obstacles and seed, but not on the split, the side or the
+other robots, so that single- and multi-embodiment training have the same goals.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import Member, Side, Split, require_side, sided_members
+from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError
+from morphgen.formats.data_files import read_bytes, read_json
+from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
+from morphgen.grammar.library import Library
+from morphgen.model.robot import Robot
+from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.tasks.goals.goal_sets import goals_from_npz, set_npz
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import (
+    GoalConfig,
+    env_spec,
+    member_with_primitives,
+    task_configs,
+)
+from morphgen.tasks.task import EnvSpec, GoalSet
+
+GOALS = "goals"
+"""Name of the folder of goal sets in a built split."""
+INDEX = "index.json"
+FORMAT = 2
+
+_README = """\
+# Goal sets
+
+`{index}` says how the sets were made (seed and constants of the tasks) and lists them: robot, side,
+task, obstacles, hash of the body with fitted primitives as its collision shapes, key (a hash of all
+that the set follows from), seed, number of goals, configurations tried and accepted, SHA-256 of the
+file.
+
+{tasks}- `obstacles` (m, 12) and `block` (12,): edges, pose, mass and friction of boxes
+- `layouts` (L, m, 7): poses of the obstacles in each layout, those for training first, and `usable`
+  (L, n): which goals or starts a layout leaves possible
+
+Poses are x, y, z, qw, qx, qy, qz in the world, whose origin is the robot's root; metres and rad.
+
+```python
+from morphgen.tasks.goals.split_goals import read_goals
+
+for name, goals in read_goals("..", "test").items():
+    print(name, goals.q.shape)
+```
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class GoalResult:
+    """A robot's goal set, or the reason why it cannot be sampled."""
+
+    robot: str
+    """Name of the robot."""
+    side: Side | None
+    """Side of the split; None for a robot without a split."""
+    task: str
+    """Name of the task."""
+    obstacles: bool
+    """Whether obstacles were requested."""
+    goals: GoalSet | None = None
+    """The goal set, if it could be sampled."""
+    robot_hash: str = ""
+    """Hash of the robot with the collision shapes that the set was made for."""
+    error: str = ""
+    """Reason why there is no set."""
+    certificate_errors: tuple[str, ...] | None = None
+    """Faults of goals, a line each; None if the set was not certified."""
+
+    @property
+    def acceptance(self) -> float | None:
+        """Fraction of the tested candidates that became goals."""
+        return self.goals.accepted / self.goals.tried if self.goals else None
+
+
+@dataclass(frozen=True, eq=False)
+class SplitGoals:
+    """Goal sets of a split."""
+
+    config: GoalConfig
+    """Seed and constants that the sets were made with."""
+    sets: Mapping[tuple[Side, str], GoalResult]
+    """Results with a goal set, by side and name of the member."""
+
+    @classmethod
+    def from_results(cls, results: Sequence[GoalResult], config: GoalConfig) -> SplitGoals:
+        """Collect the results that have a goal set."""
+        return cls(config, {(r.side, r.robot): r for r in results if r.side and r.goals})
+
+    def get(self, side: Side, name: str) -> GoalSet | None:
+        """Return a member's goal set, or None."""
+        result = self.sets.get((side, name))
+        return result.goals if result else None
+
+
+def certify_goal_set(goals: GoalSet, spec: EnvSpec) -> tuple[str, ...]:
+    """Test the goals of a set among its own obstacles; return their faults, a line each."""
+    scene = replace(spec.scene, obstacles=goals.obstacles)
+    return tuple(TASKS[spec.task].certify(goals, spec.robot, scene))
+
+
+def sample_robot_goals(
+    robot: Robot,
+    task: str,
+    config: GoalConfig | None = None,
+    *,
+    obstacles: bool,
+    certified: bool = False,
+    cache: Path | None = None,
+) -> GoalResult:
+    """Sample a robot's goal set, or take it from the cache; a failure becomes ``error``.
+
+    Args:
+        robot: The robot with its final collision shapes.
+        task: Name of the task.
+        config: Seed and constants; by default those of the benchmark.
+        obstacles: Whether there are obstacles.
+        certified: Whether to test every goal.
+        cache: Folder of stored goal sets; by default one in the user's cache.
+    """
+    result = GoalResult(robot.name, None, task, obstacles)
+    try:
+        spec = env_spec(robot, task, config, obstacles=obstacles, cache=cache)
+        return replace(
+            result,
+            goals=spec.goals,
+            robot_hash=robot_hash(robot, visuals=False),
+            certificate_errors=certify_goal_set(spec.goals, spec) if certified else None,
+        )
+    except MorphgenError as error:
+        return replace(result, error=str(error))
+
+
+def sample_split_goals(
+    split: Split,
+    library: Library,
+    config: GoalConfig | None = None,
+    *,
+    jobs: int = 1,
+    certified: bool = False,
+    cache: Path | None = None,
+    progress: Progress = no_progress,
+) -> list[GoalResult]:
+    """Sample the goal sets of all members, train first, or take them from the cache.
+
+    A robot without a goal set does not stop the others. An interrupted run continues from the sets
+    in the cache.
+
+    Args:
+        split: The split.
+        library: Library of its parts.
+        config: Seed and constants; by default those of the benchmark.
+        jobs: Number of processes.
+        certified: Whether to test every goal.
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        progress: Called with the number of finished robots and their total.
+
+    Raises:
+        MorphgenError: If ``jobs`` is below 1, or a process died.
+    """
+    sampler = _MemberSampler(library.folders, config or GoalConfig(), certified, cache)
+    return list(parallel_map(sampler, sided_members(split), jobs, progress, chunk=1))
+
+
+@dataclass(frozen=True, eq=False)
+class _MemberSampler:
+    """Samples the goal set of a member in a worker process."""
+
+    folders: tuple[Path, ...]
+    config: GoalConfig
+    certified: bool
+    cache: Path | None
+
+    @cached_property
+    def library(self) -> Library:
+        return Library(self.folders)
+
+    def __call__(self, sided_member: tuple[Side, Member]) -> GoalResult:
+        side, member = sided_member
+        try:
+            robot = member_with_primitives(member, self.library)
+        except MorphgenError as error:
+            return GoalResult(member.name, side, member.task, member.obstacles, error=str(error))
+        result = sample_robot_goals(
+            robot,
+            member.task,
+            self.config,
+            obstacles=member.obstacles,
+            certified=self.certified,
+            cache=self.cache,
+        )
+        return replace(result, side=side)
+
+
+def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
+    """Write the goal sets of a split into the folder where it is built, and their checksums.
+
+    The same sets give the same bytes. Earlier sets are replaced.
+
+    Args:
+        home: Folder of the built split.
+        results: A goal set for every member.
+        config: Seed and constants that they were made with.
+
+    Returns:
+        The folder of the sets.
+
+    Raises:
+        BenchmarkError: If a member has no set, or the folder is not built or cannot be written.
+        FormatError: If another run writes to it.
+    """
+    require_goal_sets(results)
+    folder = home / GOALS
+    files = dict(_files(results, config))
+    read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
+    try:
+        with locked_folder(home):
+            sums = read_sums(home / SUMS_FILE)
+            (home / SUMS_FILE).unlink()
+            for leftover in home.glob(f".{GOALS}.*"):
+                shutil.rmtree(leftover, ignore_errors=True)
+            with replacing_folder(folder) as partial:
+                for name, content in files.items():
+                    (partial / name).parent.mkdir(exist_ok=True)
+                    (partial / name).write_bytes(content)
+            other_sums = {
+                name: value for name, value in sums.items() if not name.startswith(f"{GOALS}/")
+            }
+            goal_sums = {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
+            write_atomic(home / SUMS_FILE, sums_text(other_sums | goal_sums))
+    except OSError as error:
+        path = error.filename or home
+        raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
+    return folder
+
+
+def require_goal_sets(results: Sequence[GoalResult]) -> None:
+    """Require that every robot has a goal set.
+
+    Raises:
+        BenchmarkError: If not; with the reason of the first and the names of the others.
+    """
+    failed = [result for result in results if result.goals is None]
+    if failed:
+        first, *rest = failed
+        more = f"; nor has {', '.join(result.robot for result in rest)}" if rest else ""
+        raise BenchmarkError(
+            f"{first.side} robot {first.robot} has no goal set: {first.error}{more}"
+        )
+
+
+def has_goals(folder: Path) -> bool:
+    """Return whether a built split ships goal sets."""
+    return (folder / GOALS).is_dir()
+
+
+def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
+    """Return the goal sets of one side of a built split, by the names of its members.
+
+    Args:
+        folder: The built split, such as ``data/extrapolation/arms/reach``.
+        side: ``train`` or ``test``; a name may be on both, at different tasks.
+
+    Raises:
+        BenchmarkError: If it was built without goals, or a file is broken; the message names it. If
+            there is no such side.
+    """
+    require_side(side)
+    sets = read_split_goals(folder).sets
+    return {
+        name: result.goals
+        for (result_side, name), result in sets.items()
+        if result_side == side and result.goals
+    }
+
+
+def shipped_goal_set(
+    sets: Mapping[str, GoalSet] | None, robot: str, folder: str | Path | None
+) -> GoalSet | None:
+    """Return a robot's goal set among those that a folder ships; None if ``sets`` is None.
+
+    Raises:
+        BenchmarkError: If the folder ships none: it is of another split, or of the other side.
+    """
+    if sets is None:
+        return None
+    if robot not in sets:
+        raise BenchmarkError(
+            f"{folder}: ships no goal set for robot {robot!r}; it is of another split"
+        )
+    return sets[robot]
+
+
+def read_split_goals(folder: str | Path) -> SplitGoals:
+    """Return all goal sets of a built split with the config that made them; see ``read_goals``."""
+    folder = Path(folder) / GOALS
+    path = folder / INDEX
+    try:
+        return _parse_index(read_json(path), folder)
+    except FileNotFoundError as error:
+        raise BenchmarkError(
+            f"{error.filename}: no such file; morphgen split build --goals makes goal sets"
+        ) from error
+    except OSError as error:
+        raise BenchmarkError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BenchmarkError(f"{path}: not an index of goal sets: {error!r}") from error
+
+
+def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
+    """Return the goal sets that the index of a folder lists."""
+    if index["format"] != FORMAT:
+        raise BenchmarkError(
+            f"{folder / INDEX}: format {index['format']!r}; this version reads {FORMAT}: build the "
+            "goal sets again with morphgen split build --goals"
+        )
+    for record in index["sets"]:  # not all tasks: some may be newer than the index
+        index[record["task"]]  # a KeyError if it is missing
+    constants = {key: index[key] for key in index if key not in ("format", "seed", "sets")}
+    config = GoalConfig(int(index["seed"]), task_configs(constants))
+    return SplitGoals.from_results([_read_set(folder, record) for record in index["sets"]], config)
+
+
+def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:
+    """Read the goal set of a record in the index, and compare its checksum."""
+    path = folder / record["file"]
+    content = read_bytes(path)
+    if _sha256(content) != record["sha256"]:
+        raise BenchmarkError(f"{path} is not the file that {INDEX} was written for")
+    goals = goals_from_npz(content, record["task"], path)
+    facts = {key: record[key] for key in ("robot", "side", "task", "obstacles")}
+    return GoalResult(**facts, robot_hash=record["body"], goals=goals)
+
+
+def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of goal sets: paths in their folder, and contents."""
+    records = []
+    for result in results:
+        if result.goals is None:
+            raise ValueError(f"{result.robot} has no goals")
+        name = f"{result.side}/{result.robot}.npz"
+        content = set_npz(result.goals)
+        records.append(goal_record(result) | {"file": name, "sha256": _sha256(content)})
+        yield name, content
+    task_names = [result.task for result in results]
+    constants = {"format": FORMAT, "seed": config.seed, **config.as_data(task_names)}
+    head_text = json.dumps(constants, indent=2).removesuffix("\n}")
+    lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
+    yield INDEX, f'{head_text},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
+    documented = dict.fromkeys((*TASKS.builtin, *task_names))
+    arrays = "".join(TASKS[name].goal_files_readme for name in documented)
+    yield README_FILE, _README.format(index=INDEX, tasks=arrays).encode()
+
+
+def goal_record(result: GoalResult) -> dict[str, object]:
+    """Return a result as JSON data, without the goals themselves."""
+    record: dict[str, object] = {
+        "robot": result.robot,
+        "side": result.side,
+        "task": result.task,
+        "obstacles": result.obstacles,
+    }
+    if result.goals is None:
+        return record
+    return record | {
+        "body": result.robot_hash,
+        "key": result.goals.key,
+        "seed": result.goals.seed,
+        "goals": len(result.goals.q),
+        "tried": result.goals.tried,
+        "accepted": result.goals.accepted,
+        "acceptance": result.acceptance,
+    }
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,301 @@
+"""Build the folder of a split together with its goal sets."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from morphgen.benchmark.audit import Audit, audit, audit_survey
+from morphgen.benchmark.difficulty import BaselineResults, difficulty_csv, survey_difficulty
+from morphgen.benchmark.licences import licence_ids, licenced_parts, require_allowed
+from morphgen.benchmark.private_test import draw_private_test
+from morphgen.benchmark.release_file import (
+    CROISSANT_FILE,
+    DIFFICULTY_FILE,
+    LICENCES_FILE,
+    LICENCES_TEXT,
+    RELEASE_FILE,
+    PrivateTest,
+    Release,
+    release_text,
+)
+from morphgen.benchmark.release_texts import card_text, croissant_text, licences_json, licences_text
+from morphgen.benchmark.split import Split, split_id
+from morphgen.benchmark.split_build import BuildReport, build_split, split_folder_path
+from morphgen.benchmark.split_folder import (
+    BUNDLED,
+    README_FILE,
+    SUMS_FILE,
+    BuildSettings,
+    read_sums,
+    sums_text,
+)
+from morphgen.benchmark.survey import DIGITS, SplitSurvey, summarize_survey, survey_split
+from morphgen.errors import BenchmarkError, FormatError
+from morphgen.formats.files import file_sha256, write_atomic
+from morphgen.formats.records import read_record
+from morphgen.formats.zip_files import write_zip
+from morphgen.grammar.library import Library
+from morphgen.processes import Progress, no_progress
+from morphgen.tasks.goals.eval_protocol import EvalProtocol
+from morphgen.tasks.goals.split_goals import (
+    GOALS,
+    GoalResult,
+    has_goals,
+    require_goal_sets,
+    sample_split_goals,
+    write_goals,
+)
+from morphgen.tasks.scenes.env_specs import GoalConfig
+
+
+def build_with_goals(
+    split: Split,
+    folder: Path,
+    library: Library,
+    settings: BuildSettings,
+    goals: Sequence[GoalResult] = (),
+    config: GoalConfig | None = None,
+    *,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> BuildReport:
+    """Write a split, all its robots and, if there are any, its goal sets; see ``build_split``.
+
+    Args:
+        split: The split.
+        folder: Parent folder, such as ``data``.
+        library: The library of parts.
+        settings: Settings of the build.
+        goals: Goal sets of all members; empty to ship none.
+        config: Seed and constants that they were made with.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished, and of all.
+
+    Raises:
+        BenchmarkError: As ``build_split``; or if a member has no goal set; or if there are no goal
+            sets, but some of an earlier build.
+        MorphgenError: If a robot cannot be composed.
+    """
+    require_goal_sets(goals)
+    built = split_folder_path(split, folder)
+    if not goals and built.is_dir() and has_goals(built):
+        raise BenchmarkError(
+            f"{built} was built with goals: ask for goals (--goals), delete {built / GOALS}, or "
+            "name another folder"
+        )
+    report = build_split(split, folder, library, jobs=jobs, settings=settings, progress=progress)
+    if goals:
+        write_goals(report.folder, goals, config or GoalConfig())
+    return report
+
+
+@dataclass(frozen=True)
+class ReleaseRequest:
+    """Request for a release."""
+
+    version: str
+    """Version, such as ``1.0.0``."""
+    date: str = ""
+    """Date of publication, such as ``2027-01-31``."""
+    creators: tuple[str, ...] = ()
+    url: str = ""
+    """Address where the release will be."""
+    allowed_licences: tuple[str, ...] = ()
+    """Licences with restrictions that parts may have."""
+    protocol: EvalProtocol = field(default_factory=EvalProtocol)
+    """Rules of the evaluation."""
+    goals: bool = True
+    """Ship the goal set of every robot."""
+    settings: BuildSettings = BUNDLED
+    """Settings of the build."""
+    private_robots: int = 0
+    """Number of private test robots; 0 for no private test side."""
+    secret: str = field(default="", repr=False)
+    """Secret that the private robots are drawn with."""
+
+
+@dataclass(frozen=True)
+class ReleaseReport:
+    """Result of a release."""
+
+    archive: Path
+    sha256: str
+    """SHA-256 of the archive, hexadecimal."""
+    content: str
+    """SHA-256 of ``SHA256SUMS``: the same for the same files, however they are compressed."""
+    files: int
+    """Number of files in the archive."""
+    size: int
+    """Size of the archive [bytes]."""
+    release: Release
+
+
+def release_split(
+    split: Split,
+    out: Path,
+    library: Library,
+    request: ReleaseRequest,
+    *,
+    extra: Mapping[str, bytes] | None = None,
+    results: BaselineResults | None = None,
+    jobs: int = 1,
+    progress: Progress = no_progress,
+) -> ReleaseReport:
+    """Write the archive of a release into a folder.
+
+    Args:
+        split: The split; it must pass its audit.
+        out: Folder of the archive.
+        library: The library of parts.
+        request: Version, licences and contents.
+        extra: Further files by path, such as reference scores.
+        results: Results of baselines, for the columns of the difficulty.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished, and of all, in each stage.
+
+    Raises:
+        BenchmarkError: If a part's licence is not allowed, the split fails its audit, a robot has
+            no goal set, or the release exists with another content.
+        MorphgenError: If a robot cannot be composed, or the archive cannot be written.
+    """
+    parts = licenced_parts(split, library)
+    require_allowed(split, parts, request.allowed_licences)
+    release = _release(split, request, {})
+    survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
+    audited = audit_survey(survey, library)
+    require_passed(audited)
+    rows = survey_difficulty(survey, results)
+    private = None
+    if request.private_robots:
+        drawn, private = draw_private_test(
+            split, request.version, request.private_robots, request.secret, library
+        )
+        require_allowed(split, (*parts, *licenced_parts(drawn, library)), request.allowed_licences)
+        _require_fit(audit(drawn, library, jobs=jobs, progress=progress))
+    release = _release(split, request, _difficulty(survey, audited), private)
+    goals: list[GoalResult] = []
+    if request.goals:
+        goals = sample_split_goals(
+            split, library, request.protocol.goals, jobs=jobs, progress=progress
+        )
+        require_goal_sets(goals)
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".release-", dir=out) as temporary:
+        report = build_with_goals(
+            split,
+            Path(temporary),
+            library,
+            request.settings,
+            goals,
+            request.protocol.goals,
+            jobs=jobs,
+            progress=progress,
+        )
+        texts = {
+            RELEASE_FILE: release_text(release),
+            LICENCES_FILE: licences_json(parts),
+            LICENCES_TEXT: licences_text(parts),
+            DIFFICULTY_FILE: difficulty_csv(rows, tuple(results or ())),
+        }
+        files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
+        known = [*read_sums(report.folder / SUMS_FILE), *files]
+        files[README_FILE] = card_text(split, release, parts, known, rows).encode()
+        _add_files(report.folder, files)
+        sums = read_sums(report.folder / SUMS_FILE)
+        croissant = croissant_text(split, release, licence_ids(parts), sums)
+        _add_files(report.folder, {CROISSANT_FILE: croissant.encode()})
+        return _write_archive(report.folder, out, release)
+
+
+def require_passed(result: Audit) -> None:
+    """Require that a split has passed its audit.
+
+    Raises:
+        BenchmarkError: If not; with the first finding.
+    """
+    if not result.passed():
+        first = next(each for each in result.findings if each.severity == "error")
+        raise BenchmarkError(
+            f"{result.split} fails its audit: {first.code} at {first.where}: {first.why}; see "
+            "morphgen split audit"
+        )
+
+
+def _require_fit(result: Audit) -> None:
+    """Require that private robots pass the audit; the error does not describe them."""
+    if not result.passed():
+        codes = {each.code for each in result.findings if each.severity == "error"}
+        raise BenchmarkError(
+            f"the private test robots fail the audit of the split ({', '.join(sorted(codes))}); "
+            "name another --secret-file, so that others are drawn"
+        )
+
+
+def _release(
+    split: Split,
+    request: ReleaseRequest,
+    difficulty: Mapping[str, Any],
+    private: PrivateTest | None = None,
+) -> Release:
+    data = {
+        "name": split.name,
+        "id": split_id(split),
+        "version": request.version,
+        "morphgen": version("morphgen"),
+        "date": request.date,
+        "creators": list(request.creators),
+        "url": request.url,
+        "evaluation": request.protocol.as_data(split),
+        "difficulty": dict(difficulty),
+        "private_test": None if private is None else msgspec.to_builtins(private),
+    }
+    return read_record(data, Release, "release", BenchmarkError)
+
+
+def _difficulty(survey: SplitSurvey, audited: Audit) -> dict[str, Any]:
+    """Return the similarity of test and train robots as JSON data."""
+    nearest: dict[str, dict[str, object]] = {}
+    for neighbour in audited.neighbours:
+        nearest.setdefault(neighbour.test, {})[neighbour.measure] = {
+            "train": neighbour.train,
+            "value": round(neighbour.value, DIGITS),
+        }
+    return {"cosine": summarize_survey(survey)["cosine"], "nearest": nearest}
+
+
+def _add_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files into a split folder and list them in its checksums."""
+    sums = read_sums(folder / SUMS_FILE)
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(folder / name, content)
+        sums[name] = hashlib.sha256(content).hexdigest()
+    write_atomic(folder / SUMS_FILE, sums_text(sums))
+
+
+def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
+    """Zip a folder; an archive of this version with another content is kept and refused."""
+    names = [*read_sums(folder / SUMS_FILE), SUMS_FILE]
+    files = {f"{release.stem}/{name}": folder / name for name in names}
+    made, archive = folder.parent / "archive.zip", out / f"{release.stem}.zip"
+    write_zip(made, files)
+    digest = file_sha256(made)
+    if archive.is_file() and file_sha256(archive) != digest:
+        raise BenchmarkError(
+            f"{archive} exists with another content; a release does not change: name another "
+            "--version or --out"
+        )
+    try:
+        made.replace(archive)
+    except OSError as error:
+        raise FormatError(f"cannot write {archive}: {error.strerror}") from error
+    content = file_sha256(folder / SUMS_FILE)
+    return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size, release)

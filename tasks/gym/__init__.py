@@ -1,0 +1,1 @@
+"""Environments as Gymnasium and stable-baselines3 expect them."""

@@ -1,0 +1,406 @@
+"""One robot at a task as a plain Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from inspect import currentframe
+from os import PathLike
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
+
+from morphgen.errors import TaskError
+from morphgen.grammar.library import LibraryFolders
+from morphgen.grammar.robot_source import RobotLike
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics_torch import frame_pose
+from morphgen.processes import Progress, no_progress
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.gym.numpy_step import EnvStep, numpy_stepper, pad_action
+from morphgen.tasks.gym.vector import (
+    LINK_ENTRIES,
+    RENDER_MODES,
+    NumpyObservation,
+    action_space,
+    final_state,
+    from_mapping,
+    numpy_observation,
+    observation_space,
+    render_arguments,
+    require_limit,
+    task_config,
+    text_spec,
+)
+from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.scenes.obstacles import LayoutSide
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
+
+
+class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
+    """A robot at a task, such as ``gymnasium.make("morphgen/Reach-v0")`` makes.
+
+    Observations are those of ``TaskBatch`` without padding, masks and fields of other tasks; tokens
+    have the shape (links, 48).
+
+    An action has a number for each joint that the task controls, in the order of their links: for
+    reach the joints between root and tool, for push fingers too. Continuous actions are fractions
+    of a joint's largest step, in [-1, 1]; discrete ones are indices of
+    ``morphgen.tasks.actions.BINS``.
+
+    ``info`` has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
+    ``terms``, for goals that are poses ``angle`` (see ``Step``), and ``self_collision``: whether
+    links collide with each other in this environment. Episodes end by themselves, after
+    ``spec.max_episode_steps`` at the latest: no time limit wrapper is needed.
+
+    ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
+
+    With ``goal_env=True`` observations are ``achieved_goal``, ``desired_goal`` and
+    ``observation``, a vector of all other entries in the order of their names, as hindsight replay
+    needs them. The reward is then ``compute_reward``: the terms that depend on the goal alone.
+
+    A copy (``copy.deepcopy``, ``pickle``) goes on exactly as the original would; with simulators
+    that hold their state elsewhere, such as PyBullet, it is refused.
+
+    Reach and push on the CPU step in NumPy (``NumpyStepper``), several times as fast as the batch;
+    all results equal the batch's to the rounding of single precision. A task whose ``TaskEnvs`` has
+    no ``numpy_row``, such as one of another package, steps the batch in torch.
+
+    Attributes:
+        batch: The batch of one environment.
+        env_spec: Specification of the environment.
+        action_joints: Names of the joints that the entries of an action move.
+        action_links: Indices of the links of these joints, which are rows of the tokens.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": list(RENDER_MODES),
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+
+    def __init__(
+        self,
+        task: str,
+        robot: RobotLike = "ur5-plane",
+        *,
+        sim: str | None = None,
+        obstacles: bool = False,
+        layouts: LayoutSide = "train",
+        kind: ActionKind = "continuous",
+        observe: ObservationConfig | Mapping[str, Any] | None = None,
+        contacts: Contacts | Mapping[str, Any] | None = None,
+        config: TaskConfig | Mapping[str, Any] | None = None,
+        goal_seed: int = 0,
+        cache: str | PathLike[str] | None = None,
+        library: LibraryFolders = (),
+        max_links: int | None = None,
+        progress: Progress = no_progress,
+        render_mode: str | None = None,
+        size: tuple[int, int] = SIZE,
+        goal_env: bool = False,
+    ) -> None:
+        """Load the robot, sample its goal set if it is not cached, and load the simulation.
+
+        Args:
+            task: Name of a task, such as ``reach`` or ``push``.
+            robot: A robot, or a name that ``load_robot`` accepts: ``ur5-plane``, words of
+                ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
+                fitted primitives.
+            sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
+                ``DEFAULT_SIMULATOR``.
+            obstacles: Whether there are obstacles.
+            layouts: Layouts of obstacles that episodes draw from: those of training or of
+                evaluation.
+            kind: Actions are ``continuous`` or ``discrete``.
+            observe: Optional entries of observations.
+            contacts: Pairs of things that collide; by default everything.
+            config: Constants of the task. Like ``observe`` and ``contacts`` it may be a dictionary,
+                as in the JSON of ``spec.to_json()``.
+            goal_seed: Seed of goals, starts and obstacles.
+            cache: Folder of stored goal sets; by default one in the user's cache.
+            library: Folders of your own parts.
+            max_links: Number that link indices in tokens are relative to; by default the paper's
+                23, or the links of the robot if it has more.
+            progress: Called with the number of robots whose goal set is ready, and their total.
+            render_mode: ``rgb_array`` or None.
+            size: Width and height of rendered pictures [pixels].
+            goal_env: Whether observations and rewards have the form for hindsight replay.
+
+        Raises:
+            TaskError: If an argument is invalid, or ``gym.make`` was given a ``max_episode_steps``
+                beyond the task's.
+            MorphgenError: As ``make_batch``.
+        """
+        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
+        sim = sim or DEFAULT_SIMULATOR
+        task_kind = TASKS[task]
+        observe = from_mapping("observe", ObservationConfig, observe)
+        contacts = from_mapping("contacts", Contacts, contacts)
+        config = from_mapping("config", partial(task_config, task), config)
+        self._self_collision = (contacts or Contacts()).self_collision
+        self._self_collision &= SIMULATORS[sim].simulates_contacts
+        config_type = task_kind.config_type
+        if config is not None and not isinstance(config, config_type):
+            raise TaskError(
+                f"{type(config).__name__} is not the config of {task}: expected "
+                f"{config_type.__name__}"
+            )
+        limit = (config or config_type()).max_episode_steps
+        require_limit(_limit_for_make(), limit)
+        if goal_env and not task_kind.goal_field:
+            raise TaskError(
+                f"goal_env: task {task} has no goals for hindsight replay; see Task.goal_field"
+            )
+        self.task = task
+        self._spec: EnvSpec | None = None
+        self._goal_env = goal_env
+        if goal_env:  # others take an environment with this method for one with goals
+            self.compute_reward = self._reward_of_goals
+        self._renderer: Renderer | None = None
+        self.batch = make_batch(
+            self.task,
+            [robot],
+            1,
+            obstacles=obstacles,
+            layouts=layouts,
+            goal_seed=goal_seed,
+            configs=() if config is None else (config,),
+            cache=cache,
+            library=library,
+            sim=sim,
+            kind=kind,
+            observe=observe,
+            contacts=contacts,
+            max_links=max_links,
+            progress=progress,
+        )
+        self.env_spec = self.batch.specs[0]
+        robot_links = self.env_spec.robot.joints
+        other_fields = set(STANDARD_FIELDS) - set(task_kind.fields)
+        self._hidden = {field.name for field in other_fields}
+        self.action_links: tuple[int, ...] = tuple(
+            torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
+        )
+        self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
+        self._running = self._closed = self._was_reset = self._next_has_begun = False
+        self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._final_state: RenderState | None = None
+        self._stepper = numpy_stepper(self.batch, self._without_padding)
+        first = self._in_goal_form(self._without_padding(self.batch.observe()))
+        self.observation_space = cast(
+            gym.Space[NumpyObservation],
+            observation_space({k: v[None] for k, v in first.items()}, task_kind.fields),
+        )
+        self.action_space = action_space(kind, len(self.action_links))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NumpyObservation, dict[str, Any]]:
+        """Begin an episode: the next one, or with a seed the first; the very first is random.
+
+        Args:
+            seed: Seed of the episodes from now on.
+            options: Where this episode begins: joint positions ``q``, for reach a ``goal`` of the
+                tool (a position, or a pose with a quaternion wxyz), for push the position or pose
+                of the ``block``; all in the root frame. The rest is drawn as always.
+
+        Raises:
+            TaskError: If the seed is out of range, or an option is unknown, malformed, out of
+                limits or reach, or collides.
+        """
+        self._require_open()
+        super().reset(seed=seed)
+        if seed is None and not self._was_reset:
+            seed = int(self.np_random.integers(2**63))
+        self._running = False
+        next_has_begun = self._next_has_begun and seed is None and not options
+        observation = self._without_padding(
+            self.batch.observe() if next_has_begun else self.batch.reset(seed, options=options)
+        )
+        if self._stepper is not None:
+            self._stepper.begin(observation)
+        self._running = self._was_reset = True
+        self._next_has_begun, self._final_state, self._final_physics = False, None, None
+        return self._in_goal_form(observation), {"self_collision": self._self_collision}
+
+    def step(
+        self, action: NDArray[Any]
+    ) -> tuple[NumpyObservation, float, bool, bool, dict[str, Any]]:
+        """Act for one control step.
+
+        Raises:
+            TaskError: If the action is invalid, or no episode is running.
+            SimulationError: If the simulator failed.
+        """
+        self._require_open()
+        if not self._running:
+            raise TaskError("no episode is running; call reset()")
+        action = self._checked(action)
+        step = self._torch_step if self._stepper is None else self._stepper.step
+        observation, reward, terminated, truncated, info = step(action)
+        self._running = not (terminated or truncated)
+        info["self_collision"] = self._self_collision
+        if self._goal_env:
+            observation = self._in_goal_form(observation)
+            goals = observation["achieved_goal"], observation["desired_goal"]
+            reward = float(self._reward_of_goals(*goals, info))
+        return observation, reward, terminated, truncated, info
+
+    def _reward_of_goals(
+        self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: object
+    ) -> NDArray[np.float32]:
+        """Return the reward of achieving a goal while another is desired, with ``goal_env=True``.
+
+        Args:
+            achieved_goal: Goals, shape (g,) or (..., g).
+            desired_goal: Goals of the same shape.
+            info: Unused: the reward depends on nothing else.
+
+        Returns:
+            Rewards, shape () or (...), such as those of ``step``.
+
+        Raises:
+            TaskError: If the shapes differ.
+        """
+        achieved, desired = (
+            np.ascontiguousarray(goals, np.float32) for goals in (achieved_goal, desired_goal)
+        )
+        size = self.observation_space["desired_goal"].shape  # type: ignore[index]  # a Dict
+        if achieved.shape != desired.shape or achieved.shape[-1:] != size:
+            raise TaskError(
+                f"compute_reward: goals of shapes {achieved.shape} and {desired.shape}; expected "
+                f"(..., {size[0]}) both"
+            )
+        rows = (torch.from_numpy(goals.reshape(-1, *size)) for goals in (achieved, desired))
+        rewards = TASKS[self.task].goal_reward(self.env_spec.config, *rows)
+        return rewards.numpy().reshape(achieved.shape[:-1])
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = text_spec(spec, self.env_spec.config.max_episode_steps)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which makes stepper and renderer anew.
+
+        Raises:
+            TaskError: If the environment is closed.
+        """
+        self._require_open()
+        return vars(self) | {"_stepper": None, "_renderer": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy: views of tensors must be of its own tensors."""
+        vars(self).update(state)
+        self._stepper = numpy_stepper(self.batch, self._without_padding)
+        if self._stepper is not None and self._was_reset:
+            self._stepper.begin(self._without_padding(self.batch.observe()))
+
+    def render(self) -> Frame | None:
+        """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
+        self._require_open()
+        if self.render_mode is None:
+            gym.logger.warn(
+                'nothing is rendered: make the environment with render_mode="rgb_array"'
+            )
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer.of_spec(self.env_spec, self._size)
+        return self._renderer.frame(self._final_state or render_state(self.batch))
+
+    def close(self) -> None:
+        """Free everything; a second call does nothing."""
+        self._closed = True
+        self.batch.close()
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise TaskError("this environment is closed")
+
+    def _checked(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Return an action with a number for each of the task's joints."""
+        action = np.asarray(action)
+        expected = (len(self.action_links),)
+        if action.shape != expected:
+            joints = ", ".join(self.action_joints)
+            raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
+        return action
+
+    def _torch_step(self, action: NDArray[Any]) -> EnvStep:
+        """Step the batch, which begins the next episode where one ends."""
+        before = render_state(self.batch) if self.render_mode is not None else None
+        step = self.batch.step(pad_action(self.batch, action))
+        if step.terminated[0] or step.truncated[0]:
+            self._next_has_begun = True
+            self._final_physics = step.q, step.block_pose
+            if before is not None:
+                self._final_state = final_state(before, step)
+        info = {
+            "success": bool(step.success[0]),
+            "is_success": bool(step.success[0]),
+            "distance": float(step.distance[0]),
+            "score": float(step.score[0]),
+            "diverged": bool(step.diverged[0]),
+            "terms": {name: float(term[0]) for name, term in step.terms.items()},
+        }
+        if step.angle is not None:
+            info["angle"] = float(step.angle[0])
+        observation, ended = self._without_padding(step.final_observation), step.terminated
+        return observation, float(step.reward[0]), bool(ended[0]), bool(step.truncated[0]), info
+
+    def _in_goal_form(self, observation: NumpyObservation) -> NumpyObservation:
+        """Return an observation of the current state as ``goal_env`` asks for it."""
+        if not self._goal_env:
+            return observation
+        task, batch = TASKS[self.task], self.batch
+        q, block_pose = self._final_physics or (batch.q, batch.simulation.block_pose)
+        chain = batch.robot_tables.tool_chain
+        tool = Pose.from_matrix(frame_pose(chain, batch.env_robot_index, q)[0].double().numpy())
+        achieved = task.achieved_goal(
+            self.env_spec.config,
+            np.array([*tool.position, *tool.quaternion], np.float32),
+            block_pose[0].clone().numpy(),
+        )
+        rest = {name: value for name, value in observation.items() if name != task.goal_field}
+        return {
+            "achieved_goal": achieved,
+            "desired_goal": observation[task.goal_field][: len(achieved)],
+            "observation": np.concatenate([rest[name].ravel() for name in sorted(rest)]),
+        }
+
+    def _without_padding(self, observation: Observation) -> NumpyObservation:
+        """Return the observation of a batch of one without padding, masks and foreign fields."""
+        links = slice(len(self.env_spec.robot.links))
+        rows: dict[str, Any] = dict.fromkeys(LINK_ENTRIES, links)
+        rows["previous_action"] = list(self.action_links)
+        return {
+            name: np.array(values[0][rows.get(name, slice(None))])
+            for name, values in numpy_observation(observation).items()
+            if values.dtype == np.float32 and name not in self._hidden
+        }
+
+
+def _limit_for_make() -> int | None:
+    """Return the ``max_episode_steps`` that ``gym.make`` was called with, if it was.
+
+    It gives them to a wrapper alone, which would be without effect beyond the task's limit; so they
+    are looked up in its frame.
+    """
+    frame = currentframe()
+    while frame is not None and frame.f_code is not gym.make.__code__:
+        frame = frame.f_back
+    return None if frame is None else frame.f_locals.get("max_episode_steps")

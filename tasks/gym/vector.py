@@ -1,0 +1,491 @@
+"""A task batch as a Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
+from functools import partial
+from inspect import signature
+from os import PathLike
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from morphgen.arguments import whole_number
+from morphgen.errors import TaskError, nearest
+from morphgen.grammar.robot_source import RobotLike
+from morphgen.model.robot import Robot
+from morphgen.tasks.actions import BINS
+from morphgen.tasks.batch import Step, TaskBatch
+from morphgen.tasks.channels import KINEMATIC_CHANNELS
+from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.registry import register_gym_envs
+from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.scenes.env_specs import task_configs
+from morphgen.tasks.scenes.make import BatchOptions, make_batch
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.task import BOUND, ObservationField, TaskConfig
+
+register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
+
+T = TypeVar("T")
+RENDER_MODES = ("rgb_array",)
+LINK_ENTRIES = ("tokens", "velocity", *KINEMATIC_CHANNELS)
+"""Entries of observations with a row for each link."""
+_INFO_KEYS = ("success", "distance", "score", "diverged")
+"""Fields of a ``Step`` in ``infos``, besides the terms."""
+
+
+Array = NDArray[Any]
+NumpyObservation = dict[str, Array]
+
+
+def numpy_observation(observation: Observation) -> NumpyObservation:
+    """Return the observation of n environments as NumPy copies: float32, masks as int8.
+
+    Entries with one number per environment get an axis, so that every space is at least a vector.
+    Empty entries, such as obstacles if there are none, are left out.
+    """
+    entries = {}
+    for name, values in observation.items():
+        wide = values.reshape(len(values), -1) if values.dim() == 1 else values
+        if wide[0].numel():
+            dtype = np.int8 if values.dtype == torch.bool else np.float32
+            entries[name] = np.array(wide.cpu().numpy(), dtype=dtype)
+    return entries
+
+
+def observation_space(
+    observation: NumpyObservation, fields: Iterable[ObservationField]
+) -> spaces.Dict:
+    """Return the space of one environment from an observation of a batch: boxes, and masks.
+
+    Args:
+        observation: Observation of n environments.
+        fields: Observation fields of the tasks, which declare the bounds of their entries.
+    """
+    bounds = {field.name: (field.low, field.high) for field in fields}
+    entries: dict[str, spaces.Space[Any]] = {}
+    for name, values in sorted(observation.items()):
+        shape = values.shape[1:]
+        if values.dtype == np.int8:
+            entries[name] = spaces.MultiBinary(shape)
+        else:
+            low, high = bounds.get(name, (-BOUND, BOUND))
+            entries[name] = spaces.Box(low, high, shape, np.float32)
+    return spaces.Dict(entries)
+
+
+def action_space(kind: str, actions: int) -> spaces.Box | spaces.MultiDiscrete:
+    """Return the space of one environment's actions: fractions of joint steps, or bin indices."""
+    if kind == "continuous":
+        return spaces.Box(-1.0, 1.0, (actions,), np.float32)
+    return spaces.MultiDiscrete([len(BINS)] * actions)
+
+
+def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[int, int]:
+    """Return a valid size of pictures [pixels].
+
+    Raises:
+        TaskError: If the mode is unknown, or the size is none.
+    """
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        hint = nearest(render_mode, RENDER_MODES)
+        raise TaskError(f"unknown render mode {render_mode!r}{hint}")
+    try:
+        width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
+    except (TypeError, ValueError) as error:
+        raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
+    return width, height
+
+
+def require_limit(given: int | None, limit: int) -> None:
+    """Require a ``max_episode_steps`` of ``gym.make`` that the task's own limit leaves an effect.
+
+    Raises:
+        TaskError: If it is beyond that limit.
+    """
+    if given is not None and given > limit:
+        raise TaskError(
+            f"max_episode_steps {given}: episodes end after {limit} control steps; for longer ones "
+            f"pass a config of the task with max_episode_steps={given}"
+        )
+
+
+def from_mapping(
+    name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
+) -> T | None:
+    """Return an argument that may be a dictionary, as in JSON, as the object that it describes.
+
+    Raises:
+        TaskError: If the dictionary has an unknown key.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    try:
+        return make(**value)
+    except TypeError as error:
+        raise TaskError(f"{name} {dict(value)}: {error}") from error
+
+
+def task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of the task's types
+    """Return the config of a task from its constants as JSON data."""
+    return task_configs({task: constants})[0]
+
+
+class TextSpec(EnvSpec):
+    """Specification whose arguments may be robots and configs, which ``to_json`` writes as text."""
+
+    def to_json(self) -> str:
+        """Return the specification as JSON.
+
+        A robot that is no text is named only: ``gym.make`` of the JSON refuses it.
+        """
+        kwargs = {name: _plain(value) for name, value in self.kwargs.items() if name != "progress"}
+        return EnvSpec.to_json(replace(self, kwargs=kwargs))
+
+
+def text_spec(spec: EnvSpec | None, limit: int) -> TextSpec | None:
+    """Return a specification of ``gym.make`` with the time limit of episodes [control steps]."""
+    if spec is None:
+        return None
+    values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.init}
+    return TextSpec(**values | {"max_episode_steps": spec.max_episode_steps or limit})
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument of an environment
+    """Return an argument of an environment as JSON data."""
+    if isinstance(value, Robot):
+        return f"<Robot {value.name!r}>"
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, AutoresetMode):
+        return value.value
+    return str(value) if isinstance(value, PathLike) else value
+
+
+class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
+    """A batch with a NumPy interface. It owns the batch: ``close`` frees it.
+
+    Observations are those of ``TaskBatch``, float32; masks are int8, with at least one axis; empty
+    entries are left out. They are padded to the largest robot, and an action has a number for every
+    link whose joint the task controls in any of the robots, (n, K), of which those count that
+    ``observation["actions"]`` marks: all robots of a batch share this one space.
+
+    With ``AutoresetMode.SAME_STEP`` the next episode begins in the step in which one ends:
+    ``infos["final_obs"]`` is then an array of observations, with None where no episode ended, and
+    ``infos["final_info"]`` has the infos of the last step. With ``NEXT_STEP`` the last observation
+    of an episode is returned, and the next step ignores the action there, returns the first
+    observation of the next episode, and a reward of 0.
+
+    Every step has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
+    ``terms`` and, for goals that are poses, ``angle`` (see ``Step``), each with its mask, such as
+    ``_success``: the environments whose episode goes on, or in ``final_info`` those whose episode
+    ended; with ``NEXT_STEP`` all that have acted.
+
+    Attributes:
+        batch: The batch.
+        autoreset_mode: When the next episode begins.
+        action_links: Links whose joints the entries of an action move, K indices below L.
+        max_episode_steps: Time limit of episodes, of the longest if tasks differ [control steps].
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": list(RENDER_MODES),
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+
+    def __init__(
+        self,
+        batch: TaskBatch,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+        size: tuple[int, int] = SIZE,
+    ) -> None:
+        """Wrap a batch; ``reset`` begins new episodes.
+
+        Args:
+            batch: The batch.
+            autoreset_mode: ``SAME_STEP`` or ``NEXT_STEP``, or their values, ``SameStep`` and
+                ``NextStep``.
+            render_mode: ``rgb_array`` or None.
+            size: Width and height of rendered pictures [pixels].
+
+        Raises:
+            TaskError: If an argument is invalid.
+        """
+        self.batch, self.num_envs = batch, batch.num_envs
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
+        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
+        self._renderers: dict[int, Renderer] = {}
+        self._final_states: dict[int, RenderState] = {}
+        self._spec: EnvSpec | None = None
+        self._running, self._ended = False, np.zeros(self.num_envs, dtype=np.bool_)
+        self.max_episode_steps = int(batch.max_episode_steps.max())
+        has_action, is_link = batch.action_mask.any(dim=0), batch.observe()["links"].any(dim=0)
+        self.action_links: tuple[int, ...] = tuple(torch.nonzero(has_action)[:, 0].tolist())
+        links = slice(int(torch.nonzero(is_link).max()) + 1)
+        self._columns: dict[str, Any] = dict.fromkeys((*LINK_ENTRIES, "links"), links)
+        self._columns |= {name: list(self.action_links) for name in ("actions", "previous_action")}
+        self.single_observation_space = observation_space(
+            self._numpy(batch.observe()), batch.groups.observation_fields
+        )
+        self.single_action_space = action_space(batch.action_kind, len(self.action_links))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NumpyObservation, dict[str, Any]]:
+        """Begin an episode everywhere.
+
+        Args:
+            seed: Seed of all episodes from now on, as in ``make_batch``; by default the random
+                streams continue. With a list, environment i has the episodes of ``TaskEnv`` with
+                its seed; one that is None is drawn.
+            options: Where these episodes begin, a vector for all environments or one for each; see
+                ``TaskEnv.reset``.
+
+        Raises:
+            TaskError: If a seed or an option is invalid.
+        """
+        self._require_open()
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        seeds: int | list[int] | None = None
+        if isinstance(seed, Sequence | np.ndarray):
+            drawn = [int(self.np_random.integers(2**63)) for _ in seed]
+            seeds = [
+                new if each is None else whole_number("seed", each, TaskError)
+                for each, new in zip(seed, drawn, strict=True)
+            ]
+        elif seed is not None:
+            seeds = whole_number("seed", seed, TaskError)
+        self._running = False
+        observation = self._numpy(self.batch.reset(seeds, options=options))
+        self._running, self._final_states = True, {}
+        self._ended[:] = False
+        return observation, {}
+
+    def step(self, actions: Array) -> tuple[NumpyObservation, Array, Array, Array, dict[str, Any]]:
+        """Act for one control step.
+
+        Raises:
+            TaskError: If the actions are invalid, or no episode is running.
+            SimulationError: If the simulator failed.
+        """
+        self._require_open()
+        if not self._running:
+            raise TaskError("no episode is running; call reset()")
+        held = torch.from_numpy(self._ended.copy()) if self._ended.any() else None
+        device = self.batch.device
+        is_shown = self.render_mode is not None and self.autoreset_mode is AutoresetMode.NEXT_STEP
+        before = [render_state(self.batch, env) for env in range(self.num_envs)] if is_shown else []
+        step = self.batch.step(self._padded(actions), None if held is None else held.to(device))
+        terminated, truncated = _numpy(step.terminated), _numpy(step.truncated)
+        over = terminated | truncated
+        reward = _numpy(step.reward)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            acted, self._ended = ~self._ended, over
+            observation = self._numpy(step.observation)
+            self._final_states = {
+                env: final_state(state, step, env) for env, state in enumerate(before) if over[env]
+            }
+            if over.any():
+                last = self._numpy(step.final_observation)
+                for name, values in observation.items():
+                    values[over] = last[name][over]
+            return observation, reward, terminated, truncated, _infos(step, acted)
+        infos = _infos(step, ~over)
+        if over.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            rows = self._numpy(step.final_observation)
+            for env in np.flatnonzero(over):
+                final[env] = {name: values[env].copy() for name, values in rows.items()}
+            infos |= {"final_obs": final, "_final_obs": over.copy()}
+            infos |= {"final_info": _infos(step, over), "_final_info": over.copy()}
+        return self._numpy(step.observation), reward, terminated, truncated, infos
+
+    def render(self) -> tuple[Frame, ...] | None:
+        """Return a picture of each environment if ``render_mode`` is ``rgb_array``.
+
+        With ``NEXT_STEP`` an environment whose episode has ended shows its end.
+        """
+        self._require_open()
+        if self.render_mode is None:
+            gym.logger.warn(
+                'nothing is rendered: make the environments with render_mode="rgb_array"'
+            )
+            return None
+        frames = []
+        for env, robot in enumerate(self.batch.env_robot_index.tolist()):
+            if robot not in self._renderers:
+                self._renderers[robot] = Renderer.of_spec(self.batch.specs[robot], self._size)
+            state = self._final_states.get(env) or render_state(self.batch, env)
+            frames.append(self._renderers[robot].frame(state))
+        return tuple(frames)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification of ``gym.make_vec``, with ``max_episode_steps``; None without it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = text_spec(spec, self.max_episode_steps)
+
+    def close_extras(self, **kwargs: object) -> None:
+        """Free the batch."""
+        self.batch.close()
+        for renderer in self._renderers.values():
+            renderer.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which makes renderers anew.
+
+        Raises:
+            TaskError: If the environments are closed.
+        """
+        self._require_open()
+        return vars(self) | {"_renderers": {}}
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise TaskError("these environments are closed")
+
+    def _padded(self, actions: Array) -> torch.Tensor:
+        """Return actions for all links, shape (n, L)."""
+        given, shape = np.asarray(actions), (self.num_envs, len(self.action_links))
+        if given.shape != shape:
+            raise TaskError(
+                f"the actions have shape {given.shape}; expected {shape}: a column for each link "
+                "of action_links"
+            )
+        padded = np.zeros((self.num_envs, self.batch.robot_tables.max_links), given.dtype)
+        padded[:, list(self.action_links)] = given
+        return torch.from_numpy(padded)
+
+    def _numpy(self, observation: Observation) -> NumpyObservation:
+        """Return an observation without the rows and columns that no robot has."""
+        return {
+            name: values[:, self._columns[name]] if name in self._columns else values
+            for name, values in numpy_observation(observation).items()
+        }
+
+
+def final_state(before: RenderState, step: Step, env: int = 0) -> RenderState:
+    """Return the last state of an episode: a batch has begun the next when a step returns.
+
+    Args:
+        before: State before the step, with the goals and obstacles of the episode.
+        step: Result of the last step.
+        env: The environment.
+    """
+    block = None if before.block is None else step.block_pose[env].cpu().numpy()
+    return replace(before, q=step.q[env, : len(before.q)].cpu().numpy(), block=block)
+
+
+def task_vector(
+    num_envs: int,
+    *,
+    task: str,
+    robot: RobotLike = "ur5-plane",
+    robots: Sequence[RobotLike] = (),
+    config: TaskConfig | Mapping[str, Any] | None = None,
+    max_episode_steps: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    render_mode: str | None = None,
+    size: tuple[int, int] = SIZE,
+    **options: Any,  # noqa: ANN401
+) -> TaskVector:
+    """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``.
+
+    Args:
+        num_envs: Number of environments.
+        task: Name of the task.
+        robot: The robot of all environments, if ``robots`` is empty.
+        robots: Robots; environment i has robot i modulo their number.
+        config: Constants of the task, instead of ``configs``. Like ``observe`` and ``contacts`` it
+            may be a dictionary, as in the JSON of ``spec.to_json()``.
+        max_episode_steps: Time limit of episodes [control steps], at most the task's.
+        autoreset_mode: As of ``TaskVector``, like the next two.
+        render_mode: Whether ``render`` returns pictures.
+        size: Size of pictures.
+        **options: Arguments of ``make_batch``. Without a ``seed`` there is a random one.
+
+    Raises:
+        TaskError: If an argument is invalid.
+    """
+    for name in options:
+        if name not in (valid := _batch_options()):
+            raise TaskError(f"vector environments: unknown option {name!r}{nearest(name, valid)}")
+    for name, kind in (("observe", ObservationConfig), ("contacts", Contacts)):
+        if name in options:
+            options[name] = from_mapping(name, kind, options[name])
+    if config is not None:
+        options["configs"] = (from_mapping("config", partial(task_config, task), config),)
+    if options.get("seed") is None:
+        options["seed"] = int(np.random.default_rng().integers(2**63))
+    autoreset_mode = _autoreset_mode(autoreset_mode)
+    render_arguments(render_mode, size)
+    batch = make_batch(task, robots or [robot], num_envs, **options)
+    try:
+        if max_episode_steps is not None:
+            require_limit(max_episode_steps, int(batch.max_episode_steps.max()))
+            whole_number("max_episode_steps", max_episode_steps, TaskError, 1)
+            batch.max_episode_steps.clamp_(max=max_episode_steps)
+        return TaskVector(batch, autoreset_mode=autoreset_mode, render_mode=render_mode, size=size)
+    except TaskError:
+        batch.close()
+        raise
+
+
+def _batch_options() -> set[str]:
+    """Return the names of the arguments of ``make_batch``."""
+    named = {each.name for each in signature(make_batch).parameters.values()}
+    return (named | set(BatchOptions.__optional_keys__)) - {"task", "num_envs", "options"}
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return a mode of ``TaskVector``.
+
+    Raises:
+        TaskError: If it is another one.
+    """
+    for known in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+        if mode in (known, known.value):
+            return known
+    raise TaskError(f"autoreset_mode {mode}: expected SAME_STEP or NEXT_STEP")
+
+
+def _infos(step: Step, where: Array) -> dict[str, Any]:
+    """Return the infos of a step, each with the mask of the environments that have it."""
+    names = _INFO_KEYS if step.angle is None else (*_INFO_KEYS, "angle")
+    values = {name: _numpy(getattr(step, name)) for name in names}
+    infos = _masked(values | {"is_success": values["success"].copy()}, where)
+    terms = _masked({name: _numpy(values) for name, values in step.terms.items()}, where)
+    return infos | {"terms": terms, "_terms": where.copy()}
+
+
+def _masked(values: dict[str, Array], where: Array) -> dict[str, Any]:
+    return values | {f"_{name}": where.copy() for name in values}
+
+
+def _numpy(values: torch.Tensor) -> Array:
+    return np.array(values.cpu().numpy())

@@ -1,0 +1,336 @@
+"""Pictures of environments, rendered without display or GPU, and videos of them."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import imageio_ffmpeg
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morphgen.errors import FormatError
+from morphgen.formats.files import replacing_file, require_writable_file
+from morphgen.formats.picture import gl_context
+from morphgen.model.kinematics import movable_positions
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.render.render_model import BLOCK, box_corners, render_model
+from morphgen.tasks.scenes.obstacles import place_boxes
+from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.task import EnvSpec, Marker
+
+Frame = NDArray[np.uint8]
+
+SIZE = (640, 480)
+"""Width and height of a frame [pixels]."""
+SUFFIXES = (".mp4", ".gif")
+"""Suffixes of video files."""
+
+_FOV = 35.0
+"""Vertical field of view [degrees]."""
+_AZIMUTH, _ELEVATION = 220.0, -25.0
+"""MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
+_MARGIN = 0.92
+"""Fraction of the picture that the points in view fill."""
+_SHADOW_SIZE = 1536
+"""Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take two
+thirds of the time; smoothed edges would take even longer, and are hardly visible in a video."""
+_SHADOW_CLIP = 2.0
+"""Half the width of the shadow map, as a multiple of the extent of the scene. With 1.5, dark dots
+appear on the ground at the edge of some pictures of a turn."""
+_AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
+"""Pose of bodies that must not be visible."""
+_NUM_STARTS = 32
+"""Number of configurations of a goal set that must be in view."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderState:
+    """State of an environment for a picture."""
+
+    q: NDArray[np.float32]
+    """Positions of the robot's independent joints, shape (dof,) [rad or m]."""
+    block: NDArray[np.float32] | None = None
+    """Pose of the block, (x, y, z, qw, qx, qy, qz), or None."""
+    markers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Poses of the markers by name; markers without a pose are invisible."""
+    obstacles: NDArray[np.float32] | None = None
+    """Poses of the obstacles, shape (O, 7); None for those of the scene."""
+
+
+class Renderer:
+    """Renders a scene from a fixed camera.
+
+    MuJoCo renders it with EGL or OSMesa, whichever simulator steps it. PyBullet's software renderer
+    would need no system library, but cannot draw translucent shapes.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        markers: Sequence[Marker],
+        configurations: NDArray[np.float64],
+        points: NDArray[np.float64],
+        size: tuple[int, int] = SIZE,
+    ) -> None:
+        """Compile the scene and place the camera.
+
+        Args:
+            scene: Scene of a robot that stands at the origin.
+            markers: Shapes that show a goal.
+            configurations: Joint positions at which the robot must be in view, shape (n, dof).
+            points: Further points that must be in view, shape (m, 3) [m].
+            size: Width and height of frames [pixels].
+
+        Raises:
+            MeshError: If a mesh cannot be read.
+            MissingDependencyError: If offscreen OpenGL is missing.
+        """
+        self.size, self._robot = size, scene.robot
+        self._model = render_model(scene, markers, configurations, points)
+        model = self._model.model
+        model.vis.global_.fovy = _FOV
+        model.vis.global_.offwidth, model.vis.global_.offheight = size
+        model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_SIZE, 0
+        low, high = self._model.points.min(axis=0), self._model.points.max(axis=0)
+        model.stat.center[:], model.stat.extent = (low + high) / 2, 1.5 * (high - low).max()
+        model.vis.map.shadowclip = _SHADOW_CLIP
+        light = model.vis.headlight
+        light.ambient[:], light.diffuse[:], light.specular[:] = 0.35, 0.35, 0.1
+        self._data = mujoco.MjData(model)
+        self._camera = _camera(self._model.points, size[0] / size[1])
+        self._view = (self._camera.lookat.copy(), model.light_pos.copy(), model.light_dir.copy())
+        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 100)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._context = gl_context(*size)
+        self._context.make_current()
+        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+        self._closed = False
+
+    @classmethod
+    def of_spec(cls, spec: EnvSpec, size: tuple[int, int] = SIZE) -> Renderer:
+        """Return a renderer with a view of the robot at home and at starts, and of all goals."""
+        task = TASKS[spec.task]
+        configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_NUM_STARTS]])
+        markers = task.markers(spec.config, spec.goals)
+        corners = [
+            box_corners(place_boxes(spec.scene.obstacles, layout))
+            for layout in (spec.goals.layouts if spec.scene.obstacles else ())
+        ]
+        points = np.concatenate([task.points_in_view(spec.goals), *corners])
+        return cls(spec.scene, markers, configurations, points, size)
+
+    def frame(self, state: RenderState, turn: float = 0.0) -> Frame:
+        """Render a state.
+
+        Args:
+            state: The state.
+            turn: Angle by which the camera and the light have gone around the middle of the points
+                in view [degrees]: the scene is on a turntable in front of a fixed camera.
+
+        Returns:
+            Shape (height, width, 3).
+
+        Raises:
+            ValueError: If the renderer is closed, or ``q`` has another shape.
+        """
+        if self._closed:
+            raise ValueError("this renderer is closed")
+        model, data = self._model.model, self._data
+        data.qpos[self._model.q_at] = movable_positions(self._robot, state.q)
+        poses = dict(state.markers)
+        if state.block is not None:
+            poses[BLOCK] = state.block
+        for name, index in self._model.mocap.items():
+            pose = np.asarray(poses.get(name, _AWAY))
+            data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
+        if state.obstacles is not None:
+            for index, pose in zip(self._model.obstacles, state.obstacles, strict=True):
+                data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
+        self._turn_view(turn)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        options = mujoco.MjvOption()
+        mujoco.mjv_updateScene(model, data, options, None, self._camera, everything, self._scene)
+        return self._pixels()
+
+    def close(self) -> None:
+        """Free the OpenGL context; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._context.make_current()
+            self._gpu.free()
+            self._context.free()
+
+    def _turn_view(self, turn: float) -> None:
+        """Turn camera and light around the vertical through the middle of the points in view."""
+        model = self._model.model
+        rotation, middle = Rotation.from_euler("Z", turn, degrees=True), model.stat.center
+        look_at, light_position, light_direction = self._view
+        self._camera.lookat[:] = middle + rotation.apply(look_at - middle)
+        self._camera.azimuth = _AZIMUTH + turn
+        model.light_pos[:] = middle + rotation.apply(light_position - middle)
+        model.light_dir[:] = rotation.apply(light_direction)
+
+    def _pixels(self) -> Frame:
+        """Render the scene; return its pixels with the top row first."""
+        width, height = self.size
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._context.make_current()
+        mujoco.mjr_render(rectangle, self._scene, self._gpu)
+        mujoco.mjr_readPixels(pixels, None, rectangle, self._gpu)
+        return np.ascontiguousarray(pixels[::-1])
+
+
+def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
+    """Return the current state of an environment of a batch."""
+    spec = batch.specs[int(batch.env_robot_index[env])]
+    block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
+    return RenderState(
+        _copied(batch.q[env, : spec.robot.dof]),
+        block,
+        batch.groups.marker_poses(env),
+        _copied(batch.layouts.poses[env, : len(spec.scene.obstacles)]),
+    )
+
+
+def _copied(values: torch.Tensor) -> NDArray[np.float32]:
+    return np.array(values.cpu().numpy(), dtype=np.float32)
+
+
+def require_video_path(path: Path) -> None:
+    """Require that a video can be written to a path, before anything is rendered.
+
+    Raises:
+        FormatError: If the suffix is not one of ``SUFFIXES``, or as ``require_writable_file``.
+    """
+    if path.suffix not in SUFFIXES:
+        raise FormatError(f"{path}: the name of a video ends in {' or '.join(SUFFIXES)}")
+    require_writable_file(path)
+
+
+def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
+    """Write a video: H.264 in ``.mp4``, or an endless ``.gif``.
+
+    The file appears when it is complete. The same frames give the same bytes.
+
+    Args:
+        frames: At least one frame, shape (height, width, 3) each; even sizes for ``.mp4``.
+        path: Path of the video.
+        fps: Frames per second.
+
+    Raises:
+        FormatError: If it cannot be written, or ffmpeg is missing, fails or is killed; then no file
+            is left.
+    """
+    require_video_path(path)
+    written = 0
+    try:
+        with replacing_file(path) as partial:
+            # In memory, a GIF's writer cannot fail again when Python deletes it.
+            image = io.BytesIO() if path.suffix == ".gif" else None
+            writer: Any = imageio.get_writer(image or partial, **_writer_options(path.suffix, fps))
+            with writer:
+                for frame in frames:
+                    _append(writer, frame)
+                    written += 1
+            if image:
+                partial.write_bytes(image.getvalue())
+            else:
+                _require_complete(partial, written)
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
+    except VideoError as error:
+        raise FormatError(f"cannot write {path}: {error}") from error
+
+
+class VideoError(Exception):
+    """Reason why ffmpeg did not write a video."""
+
+
+def _append(
+    writer: Any,  # noqa: ANN401 - imageio has no type for it
+    frame: Frame,
+) -> None:
+    """Append a frame to a video; raise ``VideoError`` if ffmpeg has ended."""
+    try:
+        writer.append_data(frame)
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise VideoError(
+            "ffmpeg ended early; does it have the codec libx264, and is there room on the disk?"
+        ) from error
+    except RuntimeError as error:
+        raise VideoError(str(error)) from error
+
+
+def _require_complete(video: Path, frames: int) -> None:
+    """Require that a video has all frames: imageio does not report ffmpeg's exit code.
+
+    Raises:
+        VideoError: If frames are missing, as on a full disk.
+    """
+    try:
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
+    except RuntimeError as error:
+        raise VideoError(
+            "ffmpeg left a video that cannot be read; is the disk full, or was ffmpeg ended?"
+        ) from error
+    if count != frames:
+        raise VideoError(
+            f"ffmpeg wrote {count} of {frames} frames; is the disk full, or was ffmpeg ended?"
+        )
+
+
+def _writer_options(suffix: str, fps: float) -> dict[str, Any]:
+    """Return the arguments of ``imageio.get_writer`` for a GIF or an MP4."""
+    if suffix == ".gif":
+        return {"format": "GIF", "mode": "I", "duration": 1000 / fps, "loop": 0}
+    return {
+        "format": "FFMPEG",
+        "mode": "I",
+        "fps": fps,
+        "codec": "libx264",
+        "quality": 8,
+        "ffmpeg_log_level": "quiet",
+        "macro_block_size": 2,
+        "output_params": ["-fflags", "+bitexact", "-flags:v", "+bitexact"],
+    }
+
+
+def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
+    """Return the nearest camera in the fixed direction that sees all points, shape (n, 3).
+
+    A camera at coordinate c on an axis v across the view, at distance d before the origin, sees a
+    point if ``|v - c| <= t (a + d)``, with the point's coordinate a along the view and half the
+    view's width t at 1 m. So ``d >= p - c / t`` and ``d >= n + c / t`` for the largest
+    p = v / t - a and n = -v / t - a.
+    """
+    rotation = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True)
+    R_world_camera = rotation.as_matrix()
+    across, ahead, up = (points @ R_world_camera).T
+    half = _MARGIN * math.tan(math.radians(_FOV / 2))
+    centres, distances = [], []
+    for v, t in ((across, half * aspect), (up, half)):
+        p, n = (v / t - ahead).max(), (-v / t - ahead).max()
+        centres.append(t * (p - n) / 2)
+        distances.append((p + n) / 2)
+    mid_depth = (ahead.min() + ahead.max()) / 2
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = R_world_camera @ (centres[0], mid_depth, centres[1])
+    camera.distance = max(distances) + mid_depth
+    camera.azimuth, camera.elevation = _AZIMUTH, _ELEVATION
+    return camera

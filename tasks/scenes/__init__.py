@@ -1,0 +1,1 @@
+"""Scenes of the tasks: robots, obstacles and collision shapes."""

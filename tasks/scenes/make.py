@@ -1,0 +1,291 @@
+"""Batches of environments from robots, a split or specifications, in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
+
+import torch
+
+from morphgen.arguments import whole_number
+from morphgen.benchmark.split import Side, Split
+from morphgen.benchmark.tokens import default_max_links
+from morphgen.errors import TaskError, nearest
+from morphgen.grammar.library import LibraryFolders, default_library, library_folders
+from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
+from morphgen.processes import Progress, no_progress
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.device import require_simulator_device
+from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.random_numbers import require_seed
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, installed_simulators
+from morphgen.tasks.scenes.collision_geometry import require_geometry, with_geometry
+from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
+from morphgen.tasks.scenes.obstacles import LayoutSide
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
+from morphgen.tasks.sim.base import CollisionGeometry, Contacts, Simulator
+from morphgen.tasks.task import EnvSpec, TaskConfig
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+T = TypeVar("T")
+
+
+class BatchOptions(TypedDict, total=False):
+    """Keyword arguments that every function of this module passes to ``batch_from_specs``."""
+
+    sim: str | None
+    seed: int
+    kind: ActionKind
+    workers: int
+    contacts: Contacts | None
+    observe: ObservationConfig | None
+    max_links: int | None
+    first: int
+    layouts: LayoutSide
+    device: str
+    geometry: CollisionGeometry
+
+
+def make_batch(
+    task: str | Sequence[str],
+    robots: Sequence[RobotLike],
+    num_envs: int,
+    *,
+    obstacles: bool | Sequence[bool] = False,
+    goal_seed: int = 0,
+    configs: Sequence[TaskConfig] = (),
+    cache: str | PathLike[str] | None = None,
+    library: LibraryFolders = (),
+    progress: Progress = no_progress,
+    **options: Unpack[BatchOptions],
+) -> TaskBatch:
+    """Make environments of robots at tasks; environment i has robot i modulo their number.
+
+    Args:
+        task: Name of a task, such as ``reach`` or ``push``; one for all robots, or one for each.
+        robots: Robots, or names that ``load_robot`` accepts: words of ``morphgen compose``, a
+            bundle's folder or a URDF. Their collision shapes are the fitted primitives.
+        num_envs: Number of environments, n.
+        obstacles: Whether there are obstacles; one for all robots, or one for each.
+        goal_seed: Seed of goals, starts and obstacles, which are kept in a cache.
+        configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        library: Folders of your own parts.
+        progress: Called with the number of robots whose goal set is ready, and their total;
+            sampling a set that is not in the cache takes seconds.
+        **options: Arguments of ``batch_from_specs``.
+
+    Raises:
+        TaskError: If an argument is invalid.
+        BenchmarkError: If a robot cannot do its task.
+        SimulationError: If the simulator cannot hold a scene.
+        MissingDependencyError: If the simulator is not installed.
+        MorphgenError: If a robot cannot be composed or read.
+    """
+    if is_one_robot(robots):
+        raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
+    robots = robot_list(robots)
+    num_envs = _env_for_each(num_envs, len(robots))
+    folders = library_folders(library)
+    tasks: list[str] = _one_for_each("task", task, robots)
+    with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
+    config = GoalConfig(goal_seed, configs)
+    loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
+    specs: list[EnvSpec] = []
+    for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
+        progress(len(specs), len(robots))
+        robot = loaded[source]
+        specs.append(env_spec(robot, name, config, obstacles=has_obstacles, cache=cache))
+    progress(len(specs), len(robots))
+    return batch_from_specs(specs, num_envs, library=folders, **options)
+
+
+def make_split_batch(
+    split: Split,
+    side: Side,
+    num_envs: int,
+    *,
+    goal_seed: int = 0,
+    configs: Sequence[TaskConfig] = (),
+    goals: Path | None = None,
+    cache: str | PathLike[str] | None = None,
+    library: LibraryFolders = (),
+    progress: Progress = no_progress,
+    **options: Unpack[BatchOptions],
+) -> TaskBatch:
+    """Make environments of a split's robots, at the tasks and with the obstacles of the split.
+
+    Args:
+        split: Robots to train and to test on.
+        side: ``train`` or ``test``.
+        num_envs: Number of environments, n; environment i has robot i modulo their number.
+        goal_seed: Seed of goals, starts and obstacles.
+        configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
+        goals: Folder of a split built with goals, whose goal sets are used.
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        library: Folders of your own parts.
+        progress: Called with the number of robots whose goal set is ready, and their total;
+            sampling a set that is not in the cache takes seconds.
+        **options: Arguments of ``batch_from_specs``.
+
+    Raises:
+        MorphgenError: As ``make_batch``; or if a robot differs from the one that the split was
+            made with, or a shipped goal set is not the one that would be sampled.
+    """
+    folders = library_folders(library)
+    parts, config = default_library(folders), GoalConfig(goal_seed, configs)
+    if not isinstance(split, Split):
+        raise TaskError(
+            f"split {split!r}: expected a Split, as read_split returns it, or the definition of a "
+            "LoadedSplit"
+        )
+    members = split.side(side)
+    num_envs = _env_for_each(num_envs, len(members))
+    sets = read_goals(goals, side) if goals is not None else None
+    specs: list[EnvSpec] = []
+    for member in members:
+        progress(len(specs), len(members))
+        shipped = shipped_goal_set(sets, member.name, goals)
+        specs.append(member_spec(member, parts, config, cache=cache, shipped=shipped))
+    progress(len(specs), len(members))
+    return batch_from_specs(specs, num_envs, library=folders, **options)
+
+
+def batch_from_specs(
+    specs: Sequence[EnvSpec],
+    num_envs: int,
+    *,
+    sim: str | None = None,
+    seed: int = 0,
+    kind: ActionKind = "continuous",
+    workers: int = 1,
+    contacts: Contacts | None = None,
+    observe: ObservationConfig | None = None,
+    max_links: int | None = None,
+    first: int = 0,
+    layouts: LayoutSide = "train",
+    device: str = "cpu",
+    geometry: CollisionGeometry = "primitive",
+    library: LibraryFolders = (),
+) -> TaskBatch:
+    """Make a batch of environments from their specifications.
+
+    Args:
+        specs: Specifications; environment i has specification i modulo their number.
+        num_envs: Number of environments, n.
+        sim: Name of a simulator: ``pybullet``, ``mujoco``, ``warp`` (on a GPU), ``kinematic``
+            (no contacts) or another of ``SIMULATORS``; by default ``DEFAULT_SIMULATOR``.
+        seed: Seed of the episodes.
+        kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
+        workers: Number of processes of PyBullet, or of threads of MuJoCo.
+        contacts: Pairs of things that collide; by default everything.
+        observe: Optional entries of observations.
+        max_links: Number of links, L, that observations and actions are padded to; by default the
+            paper's 23, or the links of the largest robot if it has more.
+        first: Number of the first environment, where a batch is made in parts.
+        layouts: Layouts of obstacles that episodes draw from: those of training or of evaluation.
+        device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
+        geometry: Collision shapes of the simulated robots: all (``primitive``), one for each link
+            (``light``), or convex pieces of the meshes (``convex``). Observations and goals do not
+            depend on it.
+        library: Folders of your own parts.
+
+    Raises:
+        TaskError: If an argument is invalid.
+        BenchmarkError: If a robot has more links than ``max_links``.
+        SimulationError: If the simulator cannot hold a scene.
+        MissingDependencyError: If the simulator is not installed.
+    """
+    if observe is not None and not isinstance(observe, ObservationConfig):
+        raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
+    workers, seed = (
+        whole_number(name, value, TaskError)
+        for name, value in (("workers", workers), ("seed", seed))
+    )
+    if num_envs < 1 or workers < 1 or not specs:
+        raise TaskError(
+            f"{num_envs} environments of {len(specs)} robots with {workers} workers: at least "
+            "one of each"
+        )
+    require_seed(seed)
+    if kind not in (kinds := get_args(ActionKind)):
+        raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
+    require_geometry(geometry)
+    simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
+    require_simulator_device(simulator.name, device)
+    if workers > 1 and not simulator.takes_workers:
+        raise TaskError(
+            f"simulator {simulator.name!r} steps all environments at once: {workers} workers; "
+            "expected 1"
+        )
+    _require_contacts(simulator, specs, geometry)
+    folders = default_library(library).folders
+    robots = [spec.robot for spec in specs]
+    if max_links is None:
+        max_links = default_max_links(len(robot.links) for robot in robots)
+    tables = build_robot_tables(robots, folders, max_links=max_links, device=device)
+    env_robot_index = [(first + i) % len(specs) for i in range(num_envs)]
+    simulated = with_geometry([spec.scene for spec in specs], geometry, folders)
+    scenes = [simulated[i] for i in env_robot_index]
+    simulation = simulator.load(scenes, contacts, workers, torch.device(device))
+    return TaskBatch(
+        tables,
+        specs,
+        env_robot_index,
+        simulation,
+        kind=kind,
+        observe=observe,
+        seed=seed,
+        first=first,
+        layouts=layouts,
+    )
+
+
+def _require_contacts(
+    simulator: Simulator, specs: Sequence[EnvSpec], geometry: CollisionGeometry
+) -> None:
+    """Require a simulator with contacts if a scene has something to touch.
+
+    Raises:
+        TaskError: If a scene has a block or obstacles, or a geometry was chosen, that the simulator
+            would ignore.
+    """
+    if simulator.simulates_contacts:
+        return
+    if geometry != "primitive":
+        raise TaskError(
+            f"collision geometry {geometry!r}: simulator {simulator.name!r} has no contacts"
+        )
+    for spec in specs:
+        if spec.scene.block is not None or spec.scene.obstacles:
+            thing = "a block" if spec.scene.block is not None else "obstacles"
+            others = installed_simulators(lambda other: other.simulates_contacts)
+            raise TaskError(
+                f"simulator {simulator.name!r} has no contacts, and {spec.task} of "
+                f"{spec.robot.name!r} has {thing}; expected simulator {' or '.join(others)}"
+            )
+
+
+def _env_for_each(num_envs: int, num_robots: int) -> int:
+    """Return a number of environments: a robot without one would silently be missing."""
+    num_envs = whole_number("number of environments", num_envs, TaskError)
+    if num_envs < num_robots:
+        raise TaskError(
+            f"{num_envs} environments for {num_robots} robots: expected at least one each"
+        )
+    return num_envs
+
+
+def _one_for_each(name: str, value: T | Sequence[T], robots: Sequence[object]) -> list[T]:
+    """Return an argument for every robot, which is given for each of them or once for all."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return [value] * len(robots)
+    if len(value) != len(robots):
+        raise TaskError(f"{name}: {len(value)} values for {len(robots)} robots; expected one each")
+    return list(value)

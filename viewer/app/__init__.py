@@ -1,0 +1,1 @@
+"""The server of the viewer, its sessions, uploads and workers."""

@@ -1,0 +1,187 @@
+"""The table of pages. To add a page, write a module with ``show(session)`` and add a row."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from typing import Any
+from urllib.parse import parse_qsl, quote, urlencode
+
+from morphgen.errors import MorphgenError, nearest
+
+PAGES: Mapping[str, str] = {
+    "library": "morphgen.viewer.pages.library:show",
+    "gallery": "morphgen.viewer.pages.gallery:show",
+    "population": "morphgen.viewer.pages.population:show",
+    "robot": "morphgen.viewer.pages.robot:show",
+    "compose": "morphgen.viewer.pages.compose:show",
+    "chosen": "morphgen.viewer.pages.chosen:show",
+    "compare": "morphgen.viewer.pages.compare:show",
+    "split": "morphgen.viewer.pages.split:show",
+    "play": "morphgen.viewer.pages.play:show",
+}
+"""The function that builds each page, by the page's key in the address (``?robot=...``)."""
+
+
+def load_page(name: str) -> Callable[[Any], None]:
+    """Import and return the function that builds a page for a ``Session``.
+
+    Pages are imported when they are first opened: ``play`` loads PyTorch and the simulators, which
+    takes seconds and much memory.
+    """
+    module, _, function = PAGES[name].partition(":")
+    show: Callable[[Any], None] = getattr(import_module(module), function)
+    return show
+
+
+MAX_QUERY = 8000
+"""Longest query [characters]."""
+MAX_DIGITS = 15
+"""Longest number in an address [digits]; larger integers are not exact in a browser."""
+MAX_PACKED = 4000
+"""Longest packed text [characters]; some browsers and mail programs cut longer addresses."""
+MAX_UNPACKED = 200_000
+"""Longest text that is unpacked [bytes], so that a short address cannot fill the memory."""
+ROBOT = "robot"
+"""Key of the page of a robot, and on the page ``play`` the key of each robot of the rollout."""
+CHOSEN = "chosen"
+"""Key of the page of chosen robots, and on other pages the key of each robot in the tray."""
+MAX_COMPARED, MAX_PLAYED = 4, 9
+"""Robots that are compared, and that do a task, at once."""
+MAX_CHOSEN = 3000
+"""Longest URIs of all chosen robots together, as the address writes them [characters]."""
+
+
+class AddressError(MorphgenError):
+    """An address does not lead to a page."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """A page with its subjects and its state."""
+
+    page: str
+    """Key of the page in ``PAGES``."""
+    subjects: tuple[str, ...] = ("",)
+    """Folder, robot URI or name of a split that the page shows; several on page ``compare``."""
+    state: Mapping[str, str] = field(default_factory=dict)
+    """Sort order, filter, joint positions, ... by key; default values are left out."""
+    robots: tuple[str, ...] = ()
+    """URIs of the robots of a rollout (page ``play`` only)."""
+    chosen: tuple[str, ...] = ()
+    """URIs of the robots in the tray; on the page ``chosen`` they are the subjects."""
+
+    @property
+    def subject(self) -> str:
+        """The first subject."""
+        return self.subjects[0]
+
+    @property
+    def query(self) -> str:
+        """The query of the URL, with its question mark."""
+        robots = ((ROBOT, robot) for robot in self.robots)
+        subjects = ((self.page, subject) for subject in self.subjects)
+        chosen = ((CHOSEN, uri) for uri in self.chosen)
+        return "?" + _encode([*subjects, *robots, *self.state.items(), *chosen])
+
+    def with_state(self, **changes: str) -> Address:
+        """Return the same page with other state; an empty value removes a key."""
+        state = {key: value for key, value in {**self.state, **changes}.items() if value}
+        return replace(self, state=state)
+
+
+def parse_address(query: str) -> Address | None:
+    """Parse the query of a URL, with or without its question mark.
+
+    Returns:
+        The address; None if the query is empty, which stands for the viewer's start page.
+
+    Raises:
+        AddressError: If the query names no page, or two different ones.
+    """
+    if len(query) > MAX_QUERY:
+        raise AddressError(f"the address has {len(query)} characters; at most {MAX_QUERY} are read")
+    # "+" stays a plus sign: addresses write spaces as %20.
+    pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
+    if not pairs:
+        return None
+    keys = {key for key, _ in pairs}
+    robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in keys else ()
+    pages = [page for page in PAGES if page in keys and not (page == ROBOT and robots)]
+    chosen: tuple[str, ...] = ()
+    if CHOSEN in pages and len(pages) > 1:
+        pages.remove(CHOSEN)
+        chosen = tuple(value for key, value in pairs if key == CHOSEN and value)
+    if not pages:
+        raise AddressError(f"address {query!r:.100} names no page{nearest(pairs[0][0], PAGES)}")
+    if len(pages) > 1:
+        raise AddressError(f"address {query!r:.100} names two pages: {' and '.join(pages)}")
+    subjects = tuple(value for key, value in pairs if key == pages[0])
+    state = {key: value for key, value in pairs if key not in PAGES}
+    return Address(pages[0], subjects, state, robots, chosen)
+
+
+def _encode(pairs: Iterable[tuple[str, str]]) -> str:
+    return urlencode(list(pairs), quote_via=quote, safe="/=:,@+")
+
+
+def require_few_chosen(chosen: Sequence[str]) -> None:
+    """Require that the tray's robots fit into every page's address.
+
+    Raises:
+        AddressError: If they do not.
+    """
+    n = len(_encode((CHOSEN, uri) for uri in chosen))
+    if n > MAX_CHOSEN:
+        raise AddressError(
+            f"{len(chosen)} chosen robots take {n} characters of the address; expected at most "
+            f"{MAX_CHOSEN}: choose fewer, or select them on the population page"
+        )
+
+
+def parse_count(text: str, default: int) -> int:
+    """Return a nonnegative integer of an address; the default if it is invalid or too long."""
+    is_number = text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS
+    return int(text) if is_number else default
+
+
+def pack_text(text: str) -> str:
+    """Compress a text into characters that an address keeps unescaped (base64url).
+
+    Raises:
+        AddressError: If the packed text is too long for an address.
+    """
+    content = base64.urlsafe_b64encode(zlib.compress(text.encode(), 9)).decode().rstrip("=")
+    if len(content) > MAX_PACKED:
+        raise AddressError(
+            f"the text is too long for the page's address ({len(content)} characters packed, at "
+            f"most {MAX_PACKED}): keep it in a file"
+        )
+    return content
+
+
+def unpack_text(content: str) -> str:
+    """Return the text that ``pack_text`` has packed.
+
+    Raises:
+        AddressError: If the content is invalid or too long.
+    """
+    if len(content) > MAX_PACKED:
+        raise AddressError(
+            f"the address has a text of {len(content)} characters; at most {MAX_PACKED} are read"
+        )
+    try:
+        data = base64.b64decode(content + "=" * (-len(content) % 4), altchars=b"-_", validate=True)
+        decompressor = zlib.decompressobj()
+        text = decompressor.decompress(data, MAX_UNPACKED)
+        if not decompressor.eof:
+            raise AddressError(
+                f"the address has an incomplete text, or one of more than {MAX_UNPACKED} bytes"
+            )
+        return text.decode()
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise AddressError(f"the address has no readable text: {error}") from error

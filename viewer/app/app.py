@@ -1,0 +1,251 @@
+"""The viewer: a server, and a session for every browser."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from html import escape
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from urllib.parse import parse_qsl
+
+import viser
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.urdf.read import UnsoundError
+from morphgen.grammar.library import default_library
+from morphgen.viewer import markup
+from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
+from morphgen.viewer.app.frame import call
+from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
+from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session, read_location
+from morphgen.viewer.app.start_address import start_address
+from morphgen.viewer.app.viser_internals import clear_page
+from morphgen.viewer.app.workers import SharedResults, Workers
+from morphgen.viewer.robot_files import change_tray
+from morphgen.viewer.robot_uri import (
+    FileAccess,
+)
+from morphgen.viewer.scene.stage import BRAND, set_stage
+
+NOTHING = "This address cannot be shown"
+"""Title of the page for an address that cannot be shown."""
+FAULT_WIDTH = 760.0
+"""Width of that page's panel [pixels]."""
+NUM_WORKERS = 2
+"""Processes that draw thumbnails and compare robots."""
+
+
+@dataclass(eq=False)
+class Viewer:
+    """A running viewer."""
+
+    server: viser.ViserServer
+    start: Address
+    """Page for browsers whose URL names none."""
+    files: FileAccess
+    workers: Workers
+    uploads: TemporaryDirectory[str]
+    """Folder of uploads; deleted with the viewer, at the latest when its process ends."""
+    sessions: dict[int, Session] = field(default_factory=dict)
+    """Current sessions of the connected browsers, by viser's client number."""
+    browsers: dict[str, int] = field(default_factory=dict)
+    """Numbers of the browsers by the secret token that their scripts send."""
+    cache: SharedResults = field(default_factory=SharedResults)
+    """Results of slow work that all sessions share."""
+
+    @property
+    def port(self) -> int:
+        """Port on which the viewer listens."""
+        return self.server.get_port()
+
+    def stop(self) -> None:
+        """End all sessions, the server and its workers, and delete the uploads."""
+        for session in list(self.sessions.values()):
+            session.disconnect()
+        stop_server(self.server)
+        self.workers.close()
+        self.uploads.cleanup()
+
+
+def serve(
+    words: Sequence[str] = (),
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    library: Sequence[Path] = (),
+    origins: Sequence[str] = (),
+) -> Viewer:
+    """Start a viewer.
+
+    Args:
+        words: Target of the start page, see ``start_address``.
+        host: Address to bind.
+        port: Port; if it is taken, the next free one.
+        library: Folders with further parts.
+        origins: Other sites whose pages may use the viewer.
+
+    Raises:
+        MorphgenError: If the target does not exist, or the address does not belong to this machine.
+    """
+    targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
+    folders = [path.parent if path.is_file() else path for path in targets]
+    roots = tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
+    files = FileAccess(default_library(library).folders, roots, Path("/nowhere"))
+    files.library.names()  # reports a missing folder or a broken part before the server starts
+    start = start_address(words, files)
+    policy = access_policy(host, origins)
+    _require_local_address(host)
+    uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
+    files = FileAccess(files.library_folders, roots, Path(uploads.name).resolve())
+    viewer: Viewer | None = None
+
+    def receive(token: str, query: str) -> bool:
+        return viewer is not None and _receive(viewer, token, query)
+
+    server = start_server(host, port, policy, receive)
+    viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
+    _accept_browsers(viewer)
+    return viewer
+
+
+def _accept_browsers(viewer: Viewer) -> None:
+    """Give every browser that connects a session."""
+
+    async def connect(client: viser.ClientHandle) -> None:
+        session = Session(client, viewer.files, viewer.workers, viewer.start, cache=viewer.cache)
+        viewer.sessions[client.client_id] = session
+        MessageFilter(client, lambda reason: _report(viewer, client.client_id, reason))
+        token = secrets.token_urlsafe(24)
+        viewer.browsers[token] = client.client_id
+        session.enqueue(lambda: open_first_page(session, token))
+
+    async def disconnect(client: viser.ClientHandle) -> None:
+        session = viewer.sessions.pop(client.client_id, None)
+        for token in [key for key, number in viewer.browsers.items() if number == client.client_id]:
+            del viewer.browsers[token]
+        if session is not None:
+            session.disconnect()
+
+    viewer.server.on_client_disconnect(disconnect)
+    viewer.server.on_client_connect(connect)
+
+
+def _report(viewer: Viewer, browser: int, reason: str) -> None:
+    """Show on a browser's page why its message was rejected."""
+    if (session := viewer.sessions.get(browser)) is not None:
+        session.report_error(reason)
+
+
+def _receive(viewer: Viewer, token: str, query: str) -> bool:
+    """Handle a request of a page's script; return whether the browser is connected.
+
+    The token is secret, so that only the script of a page can change what its browser shows.
+
+    Args:
+        viewer: The viewer.
+        token: Secret of the browser.
+        query: An action with its value; ``open`` replaces the page by that of an address, others
+            are actions of the tray. Then the number of the page, whether pages are dark, and the
+            width of the window [pixels].
+    """
+    browser = viewer.browsers.get(token)
+    session = None if browser is None else viewer.sessions.get(browser)
+    fields = parse_qsl(query, keep_blank_values=True)
+    if browser is None or session is None or not fields:
+        return False
+    (action, value), state = fields[0], dict(fields[1:])
+    if action != "open":
+        session.enqueue(lambda: change_tray(session, action, value), even_closed=True)
+        return True
+    following = session.next_session(
+        parse_count(state.get("visit", ""), 0),
+        dark=bool(state.get("dark")),
+        width=parse_count(state.get("width", ""), DEFAULT_WIDTH),
+    )
+    viewer.sessions[browser] = following
+
+    def find_address() -> None:
+        following.address = parse_address(value) or viewer.start
+        following.chosen = session.chosen  # after the changes that were queued before
+
+    following.enqueue(lambda: open_page(following, find_address))
+    return True
+
+
+def open_first_page(session: Session, token: str) -> None:
+    """Build the page that a browser's URL names.
+
+    Args:
+        session: The session of a browser that has just connected.
+        token: Secret of the browser, which its script sends with every request.
+    """
+
+    def find_address() -> None:
+        location = read_location(session.client)
+        session.dark, session.width = location.dark, location.width
+        session.run_script(call("connect", token))
+        session.address = parse_address(location.query) or session.address
+        session.chosen = session.address.chosen
+
+    open_page(session, find_address)
+
+
+def open_page(session: Session, find_address: Callable[[], object]) -> None:
+    """Build a page, or one that says why it cannot be shown.
+
+    Args:
+        session: The session.
+        find_address: Sets the session's address.
+    """
+    client, redact = session.client, session.files.redact
+    try:
+        clear_page(client)
+        find_address()
+        client.gui.configure_theme(
+            show_logo=False, show_share_button=False, dark_mode=session.dark, brand_color=BRAND
+        )
+        set_stage(client.scene, dark=session.dark)
+        address = session.address
+        if address.page == CHOSEN:
+            session.chosen = tuple(filter(None, address.subjects))
+        session.tabs = address.state.get("tab", "")
+        session.address = replace(address, chosen=()).with_state(theme="", tab="")
+        session.actions["tab"] = session.keep_tabs
+        session.show_address(session.title)
+        session.show_tray()
+        load_page(address.page)(session)
+        if session.tabs:
+            session.run_script(call("openTabs", session.tabs.split(",")))
+    except UnsoundError as error:
+        _show_fault(session, redact(error.origin), markup.findings_table(error.findings, redact))
+    except (MorphgenError, TimeoutError) as error:
+        _show_fault(session, NOTHING, escape(redact(error)))
+    except RecursionError:
+        _show_fault(session, NOTHING, "the address is nested too deeply")
+    except Exception:
+        if not session.closed.is_set():
+            _show_fault(session, NOTHING, BUG)
+            raise
+    finally:
+        if not session.closed.is_set():
+            session.reveal()
+
+
+def _show_fault(session: Session, title: str, html: str) -> None:
+    """Replace the page by a panel that says why it cannot be shown."""
+    gui = session.client.gui
+    clear_page(session.client)
+    session.open_panel(FAULT_WIDTH, markup.breadcrumbs((session.address.page, None)), left=True)
+    gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{html}"))
+
+
+def _require_local_address(host: str) -> None:
+    """Require that an address to bind belongs to this machine."""
+    try:
+        kind, _, _, _, address = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error

@@ -1,0 +1,146 @@
+"""The frame of all pages, which stays while pages are rebuilt: top bar, tray, and cover.
+
+viser's page gets the content of ``frame.html``: the bar with links to the pages, the tray of chosen
+robots, and the cover that hides viser's empty page until a page has its content. Its script asks
+the server for another page instead of loading it, so the browser keeps viser's client.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, lru_cache
+from html import escape
+from importlib.resources import files
+
+from websockets.http11 import Response
+
+from morphgen.viewer.app.address import CHOSEN, MAX_COMPARED, MAX_PLAYED, Address
+from morphgen.viewer.robot_uri import (
+    DEFAULT_WORDS,
+    DERIVATION,
+    MEMBER,
+    WORDS,
+    member_split,
+    parent_folder,
+    uri_name,
+)
+
+REVEAL = "window.morphgen?.reveal();"
+"""JavaScript that removes the cover, after the content before it has been drawn."""
+_BEFORE = b'<div id="root">'
+_SET_PAGES = ("gallery", "population")
+"""Pages whose subject is a set, a folder or a split."""
+
+
+def frame_page(response: Response) -> None:
+    """Put the frame into a response with viser's page.
+
+    Raises:
+        RuntimeError: If the installed viser has another page.
+    """
+    is_packed = response.headers.get("Content-Encoding") == "gzip"
+    response.body = _framed(bytes(response.body), is_packed=is_packed)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+
+
+@cache
+def _frame() -> bytes:
+    return files("morphgen.viewer").joinpath("frame.html").read_bytes()
+
+
+@lru_cache(maxsize=2)
+def _framed(body: bytes, *, is_packed: bool) -> bytes:
+    """Return the page with the frame; cached, because packing takes a tenth of a second."""
+    page = gzip.decompress(body) if is_packed else body
+    if page.count(_BEFORE) != 1:
+        raise RuntimeError("this version of viser has another page; see viewer/app/frame.py")
+    framed = page.replace(_BEFORE, _frame() + _BEFORE)
+    return gzip.compress(framed) if is_packed else framed
+
+
+def call(function: str, *arguments: object) -> str:
+    """Return JavaScript that calls a function of the frame with plain data."""
+    return f"window.morphgen?.{function}({', '.join(map(json.dumps, arguments))});"
+
+
+def page_links(address: Address, chosen: Sequence[str]) -> list[tuple[str, Address, bool]]:
+    """Return the links of the top bar: label, address, and whether it is the current page.
+
+    A link keeps what the current page is about: from a set's gallery, *Population* leads to the
+    population of the same set. *Compare* and *Playback* take the chosen robots.
+
+    Args:
+        address: Address of the current page.
+        chosen: URIs of the chosen robots.
+    """
+    uri = address.subject if address.page in ("robot", "compare") else ""
+    robots = tuple(chosen) or ((uri,) if uri else ())
+    folder, split = _surroundings(address)
+    is_derived = address.page == "robot" and uri.startswith((WORDS, DERIVATION, MEMBER))
+    composed = Address("compose", (uri.removeprefix(WORDS) if is_derived else DEFAULT_WORDS,))
+    play = Address("play", ("reach",), robots=robots[:MAX_PLAYED])
+    links = [
+        ("Library", Address("library"), ("library",)),
+        ("Gallery", Address("gallery", (folder,)), ("gallery",)),
+        ("Population", Address("population", (split or folder,)), ("population",)),
+        ("Compose", composed, ("compose",)),
+        ("Compare", Address("compare", robots[:MAX_COMPARED] or ("",)), ("compare",)),
+        ("Splits", Address("split", (split,)), ("split",)),
+        ("Playback", play, ("play",)),
+    ]
+    return [(label, target, address.page in pages) for label, target, pages in links]
+
+
+def _surroundings(address: Address) -> tuple[str, str]:
+    """Return the folder and the split of a page's robots; empty texts if there are none."""
+    subject = address.subject
+    if address.page == "split":
+        return "", subject
+    if address.page in _SET_PAGES:
+        return subject, ""
+    uri = subject if address.page in ("robot", "compare") else "".join(address.robots[:1])
+    return parent_folder(uri), member_split(uri)
+
+
+def bar_html(address: Address, chosen: Sequence[str], *, dark: bool) -> str:
+    """Return the content of the top bar."""
+    links = "".join(
+        f'<a href="{escape(target.query)}"{" class=current" if is_current else ""}>{label}</a>'
+        for label, target, is_current in page_links(address, chosen)
+    )
+    theme = "light" if dark else "dark"
+    switch = escape(address.with_state(theme=theme).query)
+    return f'{links}<a class="theme" href="{switch}">{theme}</a>'
+
+
+def tray_html(chosen: Sequence[str]) -> str:
+    """Return the content of the tray: how many robots are chosen, and what to do with them."""
+    if not chosen:
+        return ""
+    n, robots = len(chosen), tuple(chosen)
+
+    def link(label: str, address: Address, low: int, high: int) -> str:
+        if low <= n <= high:
+            return f'<a href="{escape(address.query)}">{label}</a>'
+        return f'<span class="off" title="takes {low} to {high} robots">{label}</span>'
+
+    names = escape(", ".join(map(uri_name, robots)))
+    return (
+        f'<b title="{names}">{n} chosen</b>'
+        + link("compare", Address("compare", robots), 2, MAX_COMPARED)
+        + link("play", Address("play", ("reach",), robots=robots), 1, MAX_PLAYED)
+        + link("split", Address(CHOSEN, robots), 2, n)
+        + '<a data-do="download" title="bundles as a zip">download</a>'
+        + '<a data-do="clear" title="choose no robot">clear</a>'
+    )
+
+
+def shown_address(address: Address, chosen: Sequence[str]) -> Address:
+    """Return a page's address with the robots that are chosen on it."""
+    if address.page == CHOSEN:
+        return replace(address, subjects=tuple(chosen) or ("",))
+    return replace(address, chosen=tuple(chosen))

@@ -1,0 +1,390 @@
+"""Read the URL, the theme and the width of the window from a browser that connects."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import traceback
+import uuid
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+import viser
+
+from morphgen.errors import MorphgenError
+from morphgen.viewer import markup
+from morphgen.viewer.app.address import Address, AddressError, require_few_chosen
+from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
+from morphgen.viewer.app.viser_internals import run_javascript
+from morphgen.viewer.app.workers import SharedResults, Workers
+from morphgen.viewer.robot_uri import FileAccess
+
+DEFAULT_WIDTH = 1400
+"""Width of a window that a browser does not tell [pixels]."""
+URL_TIMEOUT = 20.0
+"""Time in which a browser has to report its URL [s]."""
+
+_READ_LOCATION = """
+const name = Object.keys(localStorage).find((key) => key.endsWith(%s));
+const state = {query: window.location.search, dark: window.morphgen.theme(),
+  width: window.innerWidth};
+if (name) localStorage.setItem(name, JSON.stringify(state));
+"""
+
+
+@dataclass(frozen=True)
+class Location:
+    """The URL and the theme that a browser reports."""
+
+    query: str = ""
+    """Query of its URL with the question mark; empty if there is none."""
+    dark: bool = False
+    """Whether pages are dark: as the address says (``theme=dark``) or said before, else as the
+    browser prefers."""
+    width: int = DEFAULT_WIDTH
+    """Width of its window [pixels]."""
+
+
+def read_location(client: viser.ClientHandle) -> Location:
+    """Return the URL and the theme of a browser.
+
+    viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
+    local storage, under a key that no other tab uses, and viser reads it from there.
+
+    Raises:
+        AddressError: If the browser sends something else.
+        RuntimeError: If the browser has disconnected, or has no local storage.
+        TimeoutError: If it does not answer.
+    """
+    key = f"morphgen-{uuid.uuid4().hex}"
+    client.local_storage.set_item(key, "")
+    run_javascript(client, _READ_LOCATION % json.dumps(key))
+    try:
+        text = client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
+    finally:
+        client.local_storage.remove_item(key)
+    try:
+        return msgspec.json.decode(text, type=Location) if text else Location()
+    except msgspec.MsgspecError as error:
+        raise AddressError(f"the browser sent no valid location: {error}") from error
+
+
+BUG = "this is a bug of morphgen; its traceback is in the terminal where the viewer was started"
+"""Text that a page shows for an unexpected error."""
+Work = Callable[[], object]
+T = TypeVar("T")
+
+
+class Status(Protocol):
+    """Part of a page that shows HTML."""
+
+    content: str
+
+
+class SessionClosed(RuntimeError):  # noqa: N818
+    """The browser has left the session's page, or has disconnected."""
+
+
+def _new_events() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "morphgen-events")
+
+
+def _new_background() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "morphgen-background")
+
+
+@dataclass(eq=False)
+class Session:
+    """A page in a browser. A thread handles the user's actions one after the other.
+
+    The next page in the same browser has a session of its own, see ``next_session``.
+    """
+
+    browser: viser.ClientHandle
+    files: FileAccess
+    workers: Workers
+    """Processes for slow work, shared by all browsers."""
+    address: Address
+    """Address of the page with its state, as the URL shows it."""
+    dark: bool = False
+    """Whether the page is dark."""
+    width: int = DEFAULT_WIDTH
+    """Width of the browser's window when the page was opened [pixels]."""
+    chosen: tuple[str, ...] = ()
+    """URIs of the robots in the tray."""
+    visit: int = 0
+    """Number of the page in this browser, counted from the load of the browser's page."""
+    cache: SharedResults = field(default_factory=SharedResults)
+    """Results of slow work, shared by all browsers."""
+    closed: threading.Event = field(default_factory=threading.Event)
+    """Set when the browser has left the page or disconnected; long work has to check it."""
+    events: ThreadPoolExecutor = field(default_factory=_new_events)
+    """Thread of all pages in this browser, so that a page's work ends before the next begins."""
+    background: ThreadPoolExecutor = field(default_factory=_new_background)
+    pending: set[str] = field(default_factory=set)
+    """Keys of queued work that has not started yet."""
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    close_callbacks: list[Work] = field(default_factory=list)
+    status: Status | None = None
+    """Line of the page that shows the current activity."""
+    title: str = "morphgen"
+    """Title of the browser's tab."""
+    tabs: str = ""
+    """Titles of the open tabs, separated by commas; those that are open at first are left out."""
+    actions: dict[str, Callable[[str], object]] = field(default_factory=dict)
+    """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
+    called with the element's ``data-value``."""
+    on_choice: Work | None = None
+    """Called after the user has chosen other robots."""
+
+    @property
+    def client(self) -> viser.ClientHandle:
+        """The browser, for work on the page.
+
+        Raises:
+            SessionClosed: If the browser shows another page now.
+        """
+        if self.closed.is_set():
+            raise SessionClosed("the browser has left this page")
+        return self.browser
+
+    def next_session(self, visit: int, *, dark: bool, width: int) -> Session:
+        """Close the session; return one for another page in the same browser."""
+        self.close()
+        return Session(
+            self.browser,
+            self.files,
+            self.workers,
+            self.address,
+            dark,
+            width,
+            self.chosen,
+            visit,
+            self.cache,
+            events=self.events,
+        )
+
+    def enqueue(self, work: Work, key: str = "", *, even_closed: bool = False) -> None:
+        """Run work on the session's event thread, after everything that was enqueued before.
+
+        Args:
+            work: Called without arguments; the page shows a ``MorphgenError`` that it raises.
+            key: If work of the same key is still queued, this call is dropped: the queued work will
+                see the newest state.
+            even_closed: Whether to run it although the browser has left the page meanwhile.
+        """
+        self._submit(self.events, work, key, even_closed=even_closed)
+
+    def run_in_background(self, work: Work, key: str = "") -> None:
+        """Run slow work on the session's background thread; see ``enqueue``."""
+        self._submit(self.background, work, key)
+
+    def run_in_worker(self, work: Callable[..., T], *arguments: object) -> T:
+        """Run a function in a worker process and return its result.
+
+        Raises:
+            MorphgenError: If the function raises it, or the process died.
+        """
+        return self.workers.result(self.workers.submit(work, *arguments))
+
+    def cached(self, key: str, make: Callable[[], T]) -> T:
+        """Return the result of slow work, which is done once for all browsers.
+
+        Args:
+            key: Name of the result.
+            make: Computes it; it may show its progress in the status line.
+        """
+
+        def made() -> T:
+            result = make()
+            self.set_status("")
+            return result
+
+        return self.cache.get(key, made)
+
+    def call_later(self, seconds: float, work: Work, key: str) -> None:
+        """Enqueue work after a delay; calls of the same key until then are merged into one."""
+        timer_key = f"timer {key}"
+        with self.lock:
+            if self.closed.is_set() or timer_key in self.pending:
+                return
+            self.pending.add(timer_key)
+
+        def fire() -> None:
+            with self.lock:
+                self.pending.discard(timer_key)
+            self.enqueue(work, key)
+
+        timer = threading.Timer(seconds, fire)
+        timer.daemon = True
+        timer.start()
+
+    def on_change(self, handle: Any, work: Work, key: str = "") -> None:  # noqa: ANN401
+        """Enqueue work whenever the user changes or clicks a control.
+
+        Values that the server itself assigns to the control do not count.
+        """
+
+        async def changed(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:
+                self.enqueue(work, key)
+
+        attach = getattr(handle, "on_click", None) or handle.on_update
+        attach(changed)
+
+    def on_command(self, command: viser.CommandHandle, work: Work) -> None:
+        """Enqueue work whenever the user runs a command, or presses its keys."""
+
+        async def triggered(event: viser.CommandEvent) -> None:
+            self.enqueue(work)
+
+        command.on_trigger(triggered)
+
+    def on_close(self, work: Work) -> None:
+        """Call quick work when the browser leaves the page; immediately if it already has."""
+        with self.lock:
+            if not self.closed.is_set():
+                self.close_callbacks.append(work)
+                return
+        work()
+
+    def close(self) -> None:
+        """Drop the page's queued work; running work ends by itself."""
+        with self.lock:
+            self.closed.set()
+            callbacks, self.close_callbacks = self.close_callbacks, []
+        for work in callbacks:
+            work()
+        self.background.shutdown(wait=False, cancel_futures=True)
+
+    def disconnect(self) -> None:
+        """Close the session of a browser that has disconnected."""
+        self.close()
+        self.events.shutdown(wait=False, cancel_futures=True)
+
+    def open_panel(
+        self, width: float, header: str, status: str = "", *, left: bool = False
+    ) -> None:
+        """Open the page's panel with a header as HTML and the status line; width in pixels."""
+        gui = self.client.gui
+        gui.set_panel_label("morphgen")
+        (gui.main_panel.dock_left if left else gui.main_panel.dock_right)()
+        gui.main_panel.set_width(width)
+        gui.add_html(f"{markup.STYLE}{header}")
+        self.status = gui.add_html(markup.status(status))
+        if status:  # the page says what it does, so there is something to see
+            self.reveal()
+
+    def reveal(self) -> None:
+        """Remove the cover that hides the page until its content is there."""
+        self.run_script(REVEAL)
+
+    def run_script(self, source: str) -> None:
+        """Run JavaScript in the browser."""
+        run_javascript(self.client, source)
+
+    def set_status(self, text: str, fraction: float | None = None) -> None:
+        """Show the current activity and its progress in [0, 1]; an empty text clears the line."""
+        if self.status is not None and not self.closed.is_set():
+            self.status.content = markup.status(text, fraction)
+
+    def notify(self, title: str, text: str, *, error: bool = False) -> None:
+        """Show a notification; it closes after six seconds unless it is an error."""
+        self.client.add_notification(
+            title,
+            text,
+            auto_close_seconds=None if error else 6.0,
+            color="red" if error else None,
+        )
+
+    def report_error(self, error: object) -> None:
+        """Show on the page why an action failed."""
+        self.set_status("")
+        self.notify("That did not work", self.files.redact(error), error=True)
+
+    def show_address(self, title: str) -> None:
+        """Show the address in the browser's URL and top bar, and a title in its tab."""
+        self.title = title
+        address = shown_address(self.address, self.chosen).with_state(tab=self.tabs)
+        bar = bar_html(self.address.with_state(tab=self.tabs), self.chosen, dark=self.dark)
+        self.run_script(
+            call("address", self.visit, address.query, title) + call("bar", bar, self.dark)
+        )
+
+    def update_address(self, title: str, **state: str) -> None:
+        """Change the page's state in the URL; see ``Address.with_state``."""
+        self.address = self.address.with_state(**state)
+        self.show_address(title)
+
+    def keep_tabs(self, titles: str) -> None:
+        """Keep the open tabs in the address; see ``tabs``."""
+        self.tabs = titles
+        self.show_address(self.title)
+
+    def open_address(self, address: Address, *, instead: bool = False) -> None:
+        """Open another page, as a link would; ``instead``: Back will not lead to this one."""
+        self.run_script(call("visit", address.query, instead))
+
+    def choose(self, uris: Sequence[str]) -> None:
+        """Put robots into the tray in place of the previous ones.
+
+        Raises:
+            AddressError: If they do not fit into the address.
+        """
+        chosen = tuple(dict.fromkeys(uris))
+        try:
+            require_few_chosen(chosen)
+            self.chosen = chosen
+        finally:
+            self.show_tray()
+        self.show_address(self.title)
+        if self.on_choice is not None:
+            self.on_choice()
+
+    def show_tray(self) -> None:
+        """Show the chosen robots in the browser's tray and check boxes."""
+        self.run_script(call("tray", tray_html(self.chosen), self.chosen))
+
+    def _submit(
+        self, threads: ThreadPoolExecutor, work: Work, key: str, *, even_closed: bool = False
+    ) -> None:
+        with self.lock:
+            if self.closed.is_set() or (key and key in self.pending):
+                return
+            self.pending.add(key)
+            future = threads.submit(self._run, work, key, even_closed=even_closed)
+        future.add_done_callback(self._print_bug)
+
+    def _run(self, work: Work, key: str, *, even_closed: bool) -> None:
+        """Run queued work; show its error on the page, and raise an unexpected one again."""
+        with self.lock:
+            self.pending.discard(key)
+        if self.closed.is_set() and not even_closed:
+            return
+        try:
+            work()
+        except (MorphgenError, RecursionError) as error:
+            self.report_error(error)
+        except Exception:
+            if not self.closed.is_set():
+                self.report_error(BUG)
+            raise
+
+    def _print_bug(self, future: Future[None]) -> None:
+        """Print the traceback of an unexpected error, which a thread pool would hide.
+
+        Errors after the browser has disconnected are expected: the work needed the browser.
+        """
+        if future.cancelled() or self.closed.is_set():
+            return
+        if (error := future.exception()) is not None:
+            traceback.print_exception(error, file=sys.stderr)
+
+
+def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
+    """Set the value of a control, which viser's types declare as read-only."""
+    handle.value = value

@@ -1,0 +1,99 @@
+"""A pool of worker processes that serves all browsers and replaces processes that die."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from ctypes import c_byte
+from multiprocessing import get_context
+from typing import TypeVar, cast
+
+from morphgen.errors import MorphgenError
+from morphgen.processes import call_in_worker, init_worker, sigint_blocked
+
+T = TypeVar("T")
+
+
+class WorkerDied(MorphgenError):  # noqa: N818
+    """A worker process died; its pool has been replaced."""
+
+
+class Workers:
+    """A process pool that is replaced when one of its processes dies."""
+
+    def __init__(self, n: int) -> None:
+        """Prepare a pool of ``n`` processes; they start with the first work."""
+        self._n = n
+        self._lock = threading.Lock()
+        self._context = get_context("spawn")  # threads and OpenGL do not survive a fork
+        self._stopped: c_byte = self._context.RawValue("b", 0)
+        self._pool = self._new_pool()
+
+    def submit(self, work: Callable[..., T], *arguments: object) -> Future[T]:
+        """Queue a function call for a process."""
+        with self._lock, sigint_blocked():
+            try:
+                return self._pool.submit(call_in_worker, work, *arguments)
+            except BrokenProcessPool:
+                if not self._stopped.value:
+                    self._pool.shutdown(wait=False, cancel_futures=True)
+                    self._pool = self._new_pool()
+                return self._pool.submit(call_in_worker, work, *arguments)
+
+    def result(self, future: Future[T]) -> T:
+        """Wait for the result of a call.
+
+        Raises:
+            WorkerDied: If a process of the pool died before the call was done.
+            CancelledError: If the pool was closed before the call was done.
+            MorphgenError: If the call raises it.
+        """
+        try:
+            return future.result()
+        except BrokenProcessPool as error:
+            raise WorkerDied(
+                "a worker process died, perhaps for lack of memory; others were started: try again"
+            ) from error
+
+    def close(self) -> None:
+        """End the processes; calls that run or wait are dropped."""
+        with self._lock:
+            self._stopped.value = 1
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(self._n, self._context, init_worker, (self._stopped,))
+
+
+MAX_RESULTS = 24
+"""Number of results that are kept; a population of 1,000 robots takes tens of megabytes."""
+
+
+class SharedResults:
+    """The results that were used last, by their keys; safe to use from several threads."""
+
+    def __init__(self, max_results: int = MAX_RESULTS) -> None:
+        self._max = max_results
+        self._results: OrderedDict[str, object] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: str, make: Callable[[], T]) -> T:
+        """Return the result of a key.
+
+        Args:
+            key: Names the work and its input.
+            make: Computes the result if it is not kept. Two threads may both compute it.
+        """
+        with self._lock:
+            if key in self._results:
+                self._results.move_to_end(key)
+                return cast(T, self._results[key])
+        result = make()
+        with self._lock:
+            self._results[key] = result
+            while len(self._results) > self._max:
+                self._results.popitem(last=False)
+        return result

@@ -1,0 +1,662 @@
+"""The cards of a gallery: pictures and facts of robots, at a common scale or each at its own."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
+from dataclasses import dataclass, field, replace
+from html import escape
+from typing import Any
+
+import matplotlib
+import numpy as np
+import viser
+from matplotlib.figure import Figure
+from PIL import Image
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.bundle import PICTURE
+from morphgen.viewer import figures, markup, parallel_coordinates, robot_rows
+from morphgen.viewer.app.address import Address, AddressError, parse_count
+from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.workers import WorkerDied
+from morphgen.viewer.population_layout import UNITS
+from morphgen.viewer.robot_files import (
+    Thumbnail,
+    make_thumbnail,
+    measure_picture,
+    thumbnail_of_picture,
+)
+from morphgen.viewer.robot_rows import Row, facts_line
+from morphgen.viewer.scene.stage import bar_length, length_text
+
+SCALES = ("common", "own")
+"""Scales of pictures: the same for all robots, or for each one that fills its picture."""
+
+
+@dataclass(eq=False)
+class Gallery:
+    """A gallery in one browser."""
+
+    session: Session
+    title: str
+    rows: list[robot_rows.Row]
+    """All robots, shown or not."""
+    columns: tuple[str, ...] = ()
+    """Roles that are shown in a column each; without any, all robots are in one grid."""
+    scale: str = SCALES[1]
+    """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
+    noun: str = "robot"
+    """Singular word for what a row of ``rows`` shows: a robot, or a part of the library."""
+    thumbnails: dict[str, str] = field(default_factory=dict)
+    """Thumbnails drawn so far, by URI."""
+    faults: dict[str, str] = field(default_factory=dict)
+    """Errors of robots that cannot be read, by URI."""
+    controls: dict[str, Any] = field(default_factory=dict)
+    """Controls by their key in the address."""
+    histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+    """Distributions of the facts above their sliders."""
+    panel_width: float = 0.0
+    """Width of the panel of thumbnails [pixels]."""
+    coordinates: viser.GuiHtmlHandle | None = None
+    """Parallel coordinates, if at least two facts vary."""
+    notices: list[str] = field(default_factory=list)
+    """Messages about values of the address that were left out; cleared when a control changes."""
+    empty: str = ""
+    """HTML in place of the cards if no robot passes the filter."""
+    grid: viser.GuiHtmlHandle | None = None
+    summary: str = ""
+    """Number of robots that pass the filter, and of the page."""
+    page_rows: list[robot_rows.Row] = field(default_factory=list)
+    """Robots on the current page."""
+    page_number: int = 1
+
+
+def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) -> str:
+    """Return a robot's card in the grid: a link to its page, and a check box that chooses it.
+
+    Args:
+        row: The robot.
+        thumbnail: Its picture as a ``data:`` URL; empty while there is none.
+        fault: Why it cannot be read; else empty.
+        share: Size of the picture within the card, at most 1.
+    """
+    shrunk = f' style="transform:scale({share:.3f})"' if share < 1 else ""
+    image = f'<div class="picture"><img alt="" src="{thumbnail}"{shrunk}></div>'
+    if not thumbnail:
+        image = f'<div class="empty">{"broken" if fault else "…"}</div>'
+    tags = markup.tag(row.role, row.role) if row.role else ""
+    if row.task:
+        tags += markup.tag(row.task)
+    if row.findings:
+        tags += markup.tag(", ".join(row.findings[:2]), "error" if fault else "warning")
+    facts = robot_rows.facts_line(row) or escape(row.category)
+    query = escape(Address("robot", (row.uri,)).query)
+    return (
+        f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}">'
+        f'{image}<div class="text"><div class="name">{escape(row.name)}</div>'
+        f"{markup.dim(facts)}{tags}</div></a>{'' if fault else markup.choose_box(row.uri)}</div>"
+    )
+
+
+def shares(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> tuple[list[float], float]:
+    """Return the size of each picture, and the height that a whole card shows [m].
+
+    Args:
+        gallery: The gallery; at its own scale every size is 1, and the height NaN.
+        rows: Robots of the gallery; those of unknown size get 1.
+    """
+    heights = [row.picture_height or math.nan for row in rows]
+    known = [row.picture_height for row in gallery.rows if row.picture_height]
+    if gallery.controls["scale"].value == "own" or not known:
+        return [1.0] * len(heights), math.nan
+    tallest = max(known)
+    return [1.0 if math.isnan(height) else height / tallest for height in heights], tallest
+
+
+def draw_cards(gallery: Gallery) -> None:
+    """Draw the cards of the current page, in a column for each role if there are columns."""
+    if gallery.grid is None:
+        return
+    columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
+    sizes, height = shares(gallery, gallery.page_rows)
+    for row, share in zip(gallery.page_rows, sizes, strict=True):
+        thumbnail, fault = gallery.thumbnails.get(row.uri, ""), gallery.faults.get(row.uri, "")
+        role = row.role if gallery.columns else ""
+        columns.setdefault(role, []).append(card(row, thumbnail, fault, share))
+    html = [
+        f"<div>{f'<h3>{role} ({len(cards)})</h3>' if role else ''}"
+        f'<div class="grid">{"".join(cards)}</div></div>'
+        for role, cards in columns.items()
+    ]
+    scale = "" if math.isnan(height) else f" · a card is {height:.2g} m high"
+    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}{scale}</div>'
+    content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else gallery.empty
+    notices = [
+        f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
+        for notice in gallery.notices
+    ]
+    gallery.grid.content = markup.framed(*notices, summary, content)
+
+
+FILTERS = ("search", "category", "role", "findings", *robot_rows.NUMBERS)
+"""Keys of the filter's controls, in the address, too."""
+_ALL = "all"
+_LABELS = {"dof": "DoF", "links": "Links", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_COUNTS = ("dof", "links")
+"""Facts that are integers."""
+_SORT_KEYS = {
+    label: key
+    for name in robot_rows.SORTS
+    for label, key in ((name, name), (f"{name}, largest first", f"-{name}"))
+}
+"""Keys of ``sort_rows`` by their label in the dropdown."""
+_ROUNDING = 1e-9
+"""Browsers round the ends of a range."""
+
+
+def add_filter(gallery: Gallery) -> None:
+    """Add the controls in the state that the address gives; note values that it cannot have."""
+    gui, state = gallery.session.client.gui, gallery.session.address.state
+    gallery.controls["search"] = gui.add_text("Search", state.get("search", ""))
+    scales = (gallery.scale, *(name for name in SCALES if name != gallery.scale))
+    _add_dropdown(gallery, "scale", "Scale", dict(zip(scales, scales, strict=True)))
+    _add_dropdown(gallery, "sort", "Sort by", _SORT_KEYS)
+    is_filtered = not state.keys().isdisjoint({*FILTERS[1:], "size"})
+    with gui.add_folder("Filter", expand_by_default=is_filtered):
+        for key in ("category", "role"):
+            choices = [_ALL, *robot_rows.fact_choices(gallery.rows, key)]
+            _add_dropdown(gallery, key, key.capitalize(), dict(zip(choices, choices, strict=True)))
+        findings = (_ALL, "with", "without")
+        _add_dropdown(gallery, "findings", "Findings", dict(zip(findings, findings, strict=True)))
+        for fact in robot_rows.NUMBERS:
+            _add_range(gallery, fact)
+        sizes = list(map(str, robot_rows.PAGE_SIZES))
+        _add_dropdown(gallery, "size", "On a page", dict(zip(sizes, sizes, strict=True)))
+
+
+def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
+    """Return the robots that pass the filter, on all pages, in the order of the set."""
+    return robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
+
+
+def shown_rows(gallery: Gallery) -> list[robot_rows.Row]:
+    """Return the robots that pass the filter, on all pages, in the order that is shown."""
+    return robot_rows.sort_rows(passing_rows(gallery), control_state(gallery)["sort"] or "order")
+
+
+def control_state(gallery: Gallery) -> dict[str, str]:
+    """Return the values of the controls for the address; empty texts for the first choices."""
+    state = dict.fromkeys((*FILTERS, "scale", "sort", "size"), "")
+    for key, control in gallery.controls.items():
+        if key in robot_rows.NUMBERS:
+            state[key] = _range_text(gallery, key)
+        elif key == "search":
+            state[key] = control.value
+        else:
+            is_first = control.value == control.options[0]
+            value = _SORT_KEYS[control.value] if key == "sort" else control.value
+            state[key] = "" if is_first else value
+    return state
+
+
+def clear_filter(gallery: Gallery, key: str) -> None:
+    """Let every robot pass a condition of the filter.
+
+    Args:
+        gallery: The gallery.
+        key: One of ``FILTERS``, or empty for all of them.
+    """
+    for name, control in gallery.controls.items():
+        if name not in FILTERS or key not in ("", name):
+            continue
+        if name in robot_rows.NUMBERS:
+            control.value = (control.min, control.max)
+        else:
+            control.value = "" if name == "search" else _ALL
+
+
+def empty_text(gallery: Gallery) -> str:
+    """Return what excludes all robots, as HTML with links that clear each condition."""
+    lines = []
+    for key, value in control_state(gallery).items():
+        if key not in FILTERS or not value:
+            continue
+        alone = sum(map(_filter({key: value}).passes, gallery.rows))
+        count = "no robot" if not alone else "1 robot" if alone == 1 else f"{alone} robots"
+        name = _LABELS.get(key, key)
+        clear = f'<a data-do="clear filter" data-value="{key}">clear</a>'
+        lines.append((escape(f"{name}: {value}"), f"{count} of {len(gallery.rows)}", clear))
+    table = markup.table(("condition", "passed by", ""), lines)
+    clear = '<a data-do="clear filter" data-value="">clear all</a>'
+    return f"<h3>No robot passes the filter</h3>{table}<p>{clear}</p>"
+
+
+def show_histograms(gallery: Gallery) -> None:
+    """Show how many robots have each value of a fact; those that the slider lets pass stand out."""
+    for fact, handle in gallery.histograms.items():
+        values = [float(v) for row in gallery.rows if (v := getattr(row, fact)) is not None]
+        control = gallery.controls[fact]
+        low, high = control.value
+        svg = figures.histogram_svg(values, (control.min, control.max), (low, high))
+        handle.content = markup.framed(svg)
+
+
+def show_coordinates(gallery: Gallery) -> None:
+    """Show the facts that vary as parallel coordinates."""
+    if gallery.coordinates is None:
+        return
+    passing = {row.uri for row in passing_rows(gallery)}
+    svg = parallel_coordinates.parallel_svg(
+        gallery.rows, _axes(gallery), passing, gallery.panel_width
+    )
+    hint = (
+        f"{len(passing)} of {len(gallery.rows)} robots pass the filter. Drag along an axis to "
+        "choose a range, click it to clear the range, click a line to open its robot."
+    )
+    gallery.coordinates.content = markup.framed(markup.dim(hint), svg)
+
+
+def brush(gallery: Gallery, text: str) -> None:
+    """Set a range as the pointer has chosen it at an axis; see ``parse_brush``.
+
+    Raises:
+        AddressError: If the text is invalid.
+    """
+    fact, (low, high) = parallel_coordinates.parse_brush(text, _axes(gallery))
+    control = gallery.controls[fact]
+    low, high = (round(value / control.step) * control.step for value in (low, high))
+    control.value = (max(low, control.min), min(high, control.max))
+
+
+def parse_range(
+    fact: str, text: str, limits: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Parse ``LOW..HIGH`` of an address.
+
+    Args:
+        fact: The fact, one of ``NUMBERS``.
+        text: The text; if empty, the limits are returned.
+        limits: Smallest and largest value of the robots; None if the fact is unknown of all.
+
+    Raises:
+        AddressError: If the text is no range, or no value of a robot can be in it.
+    """
+    if not text:
+        return limits
+    first, dots, last = text.partition("..")
+    try:
+        low, high = float(first), float(last if dots else "")
+    except ValueError:
+        low, high = 1.0, 0.0
+    where = f"{fact}={text[:40]}"
+    if not low <= high:
+        raise AddressError(f"{where} is no range, so it was left out; expected LOW..HIGH")
+    if limits is None:
+        raise AddressError(f"{where} was left out: no robot here has a known {fact}")
+    if low > limits[1] + _ROUNDING or high < limits[0] - _ROUNDING:
+        ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
+        raise AddressError(
+            f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
+        )
+    return max(low, limits[0]), min(high, limits[1])
+
+
+def _axes(gallery: Gallery) -> dict[str, parallel_coordinates.Axis]:
+    """Return the axes of the facts that have a slider, with the range of the slider."""
+    return {
+        fact: parallel_coordinates.Axis(
+            _LABELS[fact],
+            (control.min, control.max),
+            fact in _COUNTS,
+            tuple(control.value) if _range_text(gallery, fact) else None,
+        )
+        for fact, control in gallery.controls.items()
+        if fact in robot_rows.NUMBERS
+    }
+
+
+def _current_filter(gallery: Gallery) -> robot_rows.Filter:
+    """Return the filter that the controls are set to."""
+    return _filter(control_state(gallery))
+
+
+def _filter(state: Mapping[str, str]) -> robot_rows.Filter:
+    """Return the filter of values of the address."""
+    ranges = {}
+    for fact in robot_rows.NUMBERS:
+        if text := state.get(fact):
+            low, _, high = text.partition("..")
+            ranges[fact] = (float(low) - _ROUNDING, float(high) + _ROUNDING)
+    search, category, role, findings = (state.get(key, "") for key in FILTERS[:4])
+    return robot_rows.Filter(search, category, role, findings, ranges)
+
+
+def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Mapping[str, str]) -> None:
+    """Add a dropdown if there is a choice.
+
+    Args:
+        gallery: The gallery.
+        key: Key of the control.
+        label: Its label.
+        keys: Values in the address by their labels.
+    """
+    value = gallery.session.address.state.get(key, "")
+    labels = {key: label for label, key in keys.items()}
+    if value and value not in labels:
+        valid = _listed(list(labels))
+        gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
+    if len(keys) > 1:
+        initial = labels.get(value, next(iter(keys)))
+        gallery.controls[key] = gallery.session.client.gui.add_dropdown(
+            label, tuple(keys), initial_value=initial
+        )
+
+
+def _listed(values: Sequence[str]) -> str:
+    return ", ".join(values[:12]) + (", ..." if len(values) > 12 else "")
+
+
+def _add_range(gallery: Gallery, fact: str) -> None:
+    """Add a slider with two ends for a fact that varies."""
+    limits = robot_rows.fact_range(gallery.rows, fact)
+    try:
+        ends = parse_range(fact, gallery.session.address.state.get(fact, ""), limits)
+    except AddressError as error:
+        gallery.notices.append(str(error))
+        ends = limits
+    if limits is None or ends is None or limits[0] == limits[1]:
+        return
+    step = 1.0 if fact in _COUNTS else 0.001
+    low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
+    initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
+    gui = gallery.session.client.gui
+    gallery.histograms[fact] = gui.add_html("")
+    gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
+
+
+def _range_text(gallery: Gallery, fact: str) -> str:
+    """Return a range slider's value for the address; empty if it lets every known value pass."""
+    low, high = gallery.controls[fact].value
+    limits = robot_rows.fact_range(gallery.rows, fact)
+    if limits is None or (low <= limits[0] and high >= limits[1]):
+        return ""
+    return f"{low:g}..{high:g}"
+
+
+REFRESH_INTERVAL = 0.6
+"""Time after which a gallery shows the thumbnails that were drawn meanwhile [s]."""
+
+
+def load_pictures(gallery: Gallery, rows: Sequence[Row]) -> None:
+    """Load or draw the pictures of rows that have none yet, and measure their scale if needed."""
+    load_bundle_pictures(gallery, rows)
+    _request_missing(gallery, rows, lambda: True)
+
+
+def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
+    """Load the pictures that bundles have, for robots whose facts are known."""
+    for row in rows:
+        if row.uri in gallery.thumbnails or ":" in row.uri:
+            continue
+        path = gallery.session.files.path(row.uri) / PICTURE
+        thumbnail = thumbnail_of_picture(path) if path.is_file() else ""
+        if thumbnail and row.dof is not None:
+            gallery.thumbnails[row.uri] = thumbnail
+
+
+def draw_missing(gallery: Gallery) -> None:
+    """Let the workers draw the page's missing thumbnails; retry once if a worker dies."""
+    rows = gallery.page_rows
+
+    def is_current() -> bool:
+        """Return whether the page still shows these robots; otherwise thumbnails can wait."""
+        return gallery.page_rows is rows
+
+    try:
+        _request_missing(gallery, rows, is_current)
+    except WorkerDied:
+        gallery.session.notify("A worker died", "another one continues with the thumbnails")
+        _request_missing(gallery, rows, is_current)
+
+
+def _request_missing(gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool]) -> None:
+    """Draw missing thumbnails in the workers, and show them as they arrive."""
+    session, workers = gallery.session, gallery.session.workers
+    pending = {}
+    for row in rows:
+        if row.uri in gallery.faults:
+            continue
+        if row.uri not in gallery.thumbnails:
+            pending[row.uri] = workers.submit(make_thumbnail, row.uri, session.files)
+        elif row.picture_height is None and gallery.controls["scale"].value == "common":
+            pending[row.uri] = workers.submit(measure_picture, row.uri, session.files)
+    total = len(pending)
+    while pending and not session.closed.is_set() and is_wanted():
+        session.set_status(f"drawing {total} robots", (total - len(pending)) / total)
+        wait(pending.values(), timeout=REFRESH_INTERVAL, return_when=FIRST_COMPLETED)
+        for uri in [uri for uri, future in pending.items() if future.done()]:
+            _store_thumbnail(gallery, uri, workers.result(pending.pop(uri)))
+        draw_cards(gallery)
+    for future in pending.values():
+        future.cancel()
+    session.set_status("")
+
+
+def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
+    if thumbnail.error:
+        gallery.faults[uri] = thumbnail.error
+    elif thumbnail.image:
+        gallery.thumbnails[uri] = thumbnail.image
+    facts: dict[str, Any] = thumbnail.facts
+    for rows in (gallery.rows, gallery.page_rows):
+        rows[:] = [replace(row, **facts) if row.uri == uri else row for row in rows]
+
+
+CONTROLS_WIDTH = 330.0
+"""Width of the controls [pixels]."""
+CANVAS_WIDTH = 120.0
+"""Width that viser keeps free for its scene between the panels [pixels]."""
+_PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
+    "first": lambda number: 1,
+    "prev": lambda number: number - 1,
+    "next": lambda number: number + 1,
+    "last": lambda number: 10**9,  # clipped to the last page
+}
+
+
+def open_panels(
+    gallery: Gallery, breadcrumbs: str, header: str, width: float = CONTROLS_WIDTH
+) -> viser.PanelHandle:
+    """Open the panel of thumbnails at the left and the panel of controls at the right.
+
+    Args:
+        gallery: The gallery.
+        breadcrumbs: HTML of the path to the page.
+        header: HTML above the controls.
+        width: Width of the controls [pixels].
+
+    Returns:
+        The panel at the left.
+    """
+    client = gallery.session.client
+    gui = client.gui
+    gallery.session.open_panel(width, breadcrumbs + (markup.framed(header) if header else ""))
+    panel = gui.add_panel()
+    with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
+        gallery.grid = gui.add_html("")
+    panel.dock_left()
+    gallery.panel_width = max(gallery.session.width - width - CANVAS_WIDTH, 400.0)
+    panel.set_width(gallery.panel_width)
+    return panel
+
+
+def add_controls(gallery: Gallery, panel: viser.PanelHandle) -> None:
+    """Add the controls, in the state that the address gives, and show the first robots.
+
+    Args:
+        gallery: The gallery.
+        panel: Panel of the thumbnails, which gets a tab for the parallel coordinates.
+    """
+    session = gallery.session
+    add_filter(gallery)
+    if len(gallery.histograms) > 1:
+        with panel.add_tab("Parallel coordinates", viser.Icon.CHART_LINE):
+            gallery.coordinates = session.client.gui.add_html("")
+    gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
+    buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
+
+    def turn_page() -> None:
+        show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
+
+    def changed() -> None:
+        gallery.notices.clear()
+        show_page(gallery, 1)
+
+    def clear(key: str) -> None:
+        clear_filter(gallery, key)
+        changed()
+
+    def choose_range(text: str) -> None:
+        brush(gallery, text)
+        changed()
+
+    for control in gallery.controls.values():
+        session.on_change(control, changed, "filter")
+    session.on_change(buttons, turn_page)
+    session.actions |= {"clear filter": clear, "brush": choose_range}
+    show_page(gallery, gallery.page_number)
+
+
+def show_page(gallery: Gallery, number: int) -> None:
+    """Show a page of the robots that pass the filter, and request missing thumbnails."""
+    session, rows, state = gallery.session, shown_rows(gallery), control_state(gallery)
+    size = int(gallery.controls["size"].value)
+    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
+    page = "" if gallery.page_number == 1 else str(gallery.page_number)
+    session.update_address(gallery.title, n=page, **state)
+    total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
+    noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
+    gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"
+    gallery.empty = "" if rows else empty_text(gallery)
+    load_bundle_pictures(gallery, gallery.page_rows)
+    show_histograms(gallery)
+    show_coordinates(gallery)
+    draw_cards(gallery)
+    session.run_in_background(lambda: draw_missing(gallery), "thumbnails")
+
+
+_CELL_WIDTH, _PICTURE_HEIGHT, _TEXT_HEIGHT = 1.5, 1.125, 0.36
+"""Size of a cell, its picture above its text [inches]."""
+_TITLE_HEIGHT, _BORDER = 0.5, 0.2
+"""Height of the line with the title and the scale, and border around the sheet [inches]."""
+_DPI = 200
+_ASPECT = 1.4
+"""Width of a sheet divided by its height, about that of a slide."""
+_BOTTOM = 0.04
+"""Height within a picture at which robots stand, as a share of the picture."""
+_GREY = "0.45"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A robot on a sheet."""
+
+    image: str
+    """Picture as a ``data:`` URL; empty if it cannot be drawn."""
+    name: str
+    facts: str
+    share: float = 1.0
+    """Size of the picture within its cell, at most 1."""
+
+
+def contact_sheet(title: str, cells: Sequence[Cell], height: float, suffix: str) -> bytes:
+    """Draw a contact sheet.
+
+    Args:
+        title: Title of the sheet.
+        cells: At least one robot.
+        height: Height that a whole picture shows [m]; NaN if the pictures have different scales.
+        suffix: ``png`` or ``pdf``.
+    """
+    columns = max(round(math.sqrt(_ASPECT * len(cells))), 1)
+    rows = math.ceil(len(cells) / columns)
+    cell_height = _PICTURE_HEIGHT + _TEXT_HEIGHT
+    width = columns * _CELL_WIDTH + 2 * _BORDER
+    total = rows * cell_height + _TITLE_HEIGHT + 2 * _BORDER
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # the same bytes whatever the user has configured
+        figure = Figure(figsize=(width, total), dpi=_DPI)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(0, total))
+        axes.set_axis_off()
+        top = total - _BORDER
+        axes.text(_BORDER, top - 0.1, title, fontsize=11, va="top", weight="bold", parse_math=False)
+        if not math.isnan(height):
+            length = bar_length(0.6 * height)
+            bar = length / height * _PICTURE_HEIGHT
+            right, y = width - _BORDER, top - 0.28
+            axes.plot((right - bar, right), (y, y), color="black", linewidth=2)
+            axes.text(right - bar / 2, y + 0.05, length_text(length), fontsize=7, ha="center")
+        for i, cell in enumerate(cells):
+            row, column = divmod(i, columns)
+            left = _BORDER + column * _CELL_WIDTH
+            bottom = top - _TITLE_HEIGHT - (row + 1) * cell_height + _TEXT_HEIGHT
+            if cell.image:
+                w, h = cell.share * _CELL_WIDTH, cell.share * _PICTURE_HEIGHT
+                x = left + (_CELL_WIDTH - w) / 2
+                y = bottom + (1 - cell.share) * _BOTTOM * _PICTURE_HEIGHT
+                pixels = np.asarray(decode_picture(cell.image))
+                axes.imshow(pixels, extent=(x, x + w, y, y + h), interpolation="lanczos")
+            middle = left + _CELL_WIDTH / 2
+            words: dict[str, Any] = {"ha": "center", "va": "top", "parse_math": False}
+            axes.text(middle, bottom - 0.02, cell.name[:28], fontsize=6.5, **words)
+            axes.text(middle, bottom - 0.15, cell.facts, fontsize=5.5, color=_GREY, **words)
+        axes.set(xlim=(0, width), ylim=(0, total), aspect="auto")
+        content = io.BytesIO()
+        when = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None}}
+        figure.savefig(content, format=suffix, dpi=_DPI, metadata=when[suffix])
+    return content.getvalue()
+
+
+def decode_picture(url: str) -> Image.Image:
+    """Return the picture of a ``data:`` URL."""
+    data = base64.b64decode(url.partition(",")[2])
+    return Image.open(io.BytesIO(data)).convert("RGB")
+
+
+MAX_ROBOTS = 240
+"""Robots of one sheet."""
+
+
+def add_sheet_buttons(gallery: Gallery) -> None:
+    """Add buttons for a PNG and a PDF of the robots that pass the filter, on all pages."""
+    gui, session = gallery.session.client.gui, gallery.session
+    with gui.add_folder("Contact sheet", expand_by_default=False):
+        for suffix in ("png", "pdf"):
+            button = gui.add_button(f"Download as {suffix.upper()}", icon=viser.Icon.DOWNLOAD)
+            send = functools.partial(_send, gallery, suffix)
+            session.on_change(button, functools.partial(session.run_in_background, send))
+
+
+def _send(gallery: Gallery, suffix: str) -> None:
+    session, rows = gallery.session, shown_rows(gallery)
+    if not 1 <= len(rows) <= MAX_ROBOTS:
+        raise MorphgenError(
+            f"{len(rows)} robots for a contact sheet; expected 1 to {MAX_ROBOTS}: use the filter"
+        )
+    load_pictures(gallery, rows)
+    rows = shown_rows(gallery)  # with the facts that were measured meanwhile
+    sizes, height = shares(gallery, rows)
+    cells = [
+        Cell(gallery.thumbnails.get(row.uri, ""), row.name, facts_line(row), share)
+        for row, share in zip(rows, sizes, strict=True)
+    ]
+    session.set_status("drawing the sheet")
+    content = session.run_in_worker(contact_sheet, gallery.title, cells, height, suffix)
+    name = f"{gallery.title.strip('/').replace('/', '-')}.{suffix}"
+    session.client.send_file_download(name, content, save_immediately=True)
+    session.set_status("")

@@ -1,0 +1,268 @@
+"""The page that compares robots side by side: joints, tokens, similarity, primitives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+import numpy as np
+import viser
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.bundle import split_colours
+from morphgen.model.robot import Robot
+from morphgen.viewer import comparison, markup
+from morphgen.viewer.app.address import MAX_COMPARED, Address
+from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
+from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
+from morphgen.viewer.scene import robot as scene_robot
+from morphgen.viewer.scene import stage as scene_stage
+from morphgen.viewer.token_picture import tokens_html
+
+PANEL_WIDTH = 520.0
+"""Width of the panel [pixels]."""
+EMPTY = (
+    "<h2>Compare two to four robots</h2>Pick them here, or tick the box of cards in a gallery and "
+    "press <i>compare</i> in the tray."
+)
+ONE_ROBOT = "Add a second robot to see how similar they are."
+PRIMITIVES = "primitives"
+"""Value of ``show`` in the address when primitives are drawn."""
+ADDRESS_DELAY = 0.5
+"""Delay of URL updates after a move [s]."""
+GAP = 0.35
+"""Distance between the bounding boxes of two robots [m]."""
+_CAMERA_DIRECTION = (0.74, 0.09, 0.28)
+"""Direction to the camera, so that robots along y stand from left to right."""
+
+
+@dataclass(eq=False)
+class ComparePage:
+    """Robots in one browser."""
+
+    session: Session
+    uris: tuple[str, ...]
+    robots: list[Robot]
+    views: list[scene_robot.RobotView]
+    sliders: dict[str, viser.GuiSliderHandle[float]] = field(default_factory=dict)
+    """Sliders by role of the joints."""
+    moved: dict[str, float] = field(default_factory=dict)
+    """Positions of the roles that the user moved; the others stay at each robot's home."""
+    texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+
+
+def show(session: Session) -> None:
+    """Build the page.
+
+    Raises:
+        UriError: If the address names more than ``MAX_COMPARED`` robots.
+        MorphgenError: If a robot cannot be read.
+    """
+    uris = tuple(filter(None, session.address.subjects))
+    if len(uris) > MAX_COMPARED:
+        raise UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_COMPARED}")
+    header = markup.breadcrumbs(("compare", None))
+    if not uris:
+        session.open_panel(PANEL_WIDTH, header)
+        session.client.gui.add_html(markup.framed(EMPTY))
+        _add_picker(session, uris)
+        session.show_address("compare")
+        return
+    session.open_panel(PANEL_WIDTH, header, f"reading {len(uris)} robots")
+    robots = [split_colours(read_robot_uri(uri, session.files)) for uri in uris]
+    page = ComparePage(session, uris, robots, _add_robots(session, robots))
+    gui = session.client.gui
+    tabs = gui.add_tab_group()
+    with tabs.add_tab("Robots", viser.Icon.ROBOT):
+        _add_robots_tab(page)
+    with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
+        _add_move_tab(page)
+    with tabs.add_tab("Tokens", viser.Icon.GRID_DOTS):
+        page.texts["tokens"] = gui.add_html("")
+    with tabs.add_tab("Primitives", viser.Icon.CUBE):
+        box = gui.add_checkbox("primitives in place of meshes, coloured by IoU", False)
+        page.texts["fits"] = gui.add_html("")
+
+    def toggle_primitives() -> None:
+        session.address = session.address.with_state(show=PRIMITIVES if box.value else "")
+        _show_in_address(page)
+        session.run_in_background(lambda: _show_fits(page, on=box.value))
+
+    session.on_change(box, toggle_primitives)
+    session.set_status("")
+    _apply_address(page, box)
+    _show_in_address(page)
+    session.run_in_background(lambda: _compare(page))
+
+
+def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.RobotView]:
+    """Draw robots in a row along y, the first at the left as the camera sees it."""
+    scene = session.client.scene
+    views, corners, edge = [], [], 0.0
+    for i, robot in enumerate(robots):
+        low, high = scene_robot.robot_bounds(robot)
+        y = edge - float(low[1])
+        edge = y + float(high[1]) + GAP
+        views.append(scene_robot.add_robot(scene, robot, f"/robot{i}", (0.0, y, 0.0)))
+        above = (0.0, y, float(high[2]) + 0.12)
+        scene.add_label(f"/label{i}", robot.name, position=above, anchor="bottom-center")
+        corners += [corner + np.array([0.0, y, 0.0]) for corner in (low, high)]
+    lowest, highest = np.min(corners, axis=0), np.max(corners, axis=0)
+    scene_stage.add_ground(scene, float(np.linalg.norm(highest - lowest)))
+    scene_stage.look_at(session.client, lowest, highest, _CAMERA_DIRECTION)
+    return views
+
+
+def _add_robots_tab(page: ComparePage) -> None:
+    """Add a table of the robots with links that remove one, and controls that add one."""
+    gui = page.session.client.gui
+    rows = [
+        (
+            markup.link(Address("robot", (uri,)), robot.name or uri_name(uri)),
+            str(len(robot.links)),
+            str(robot.dof),
+            f"{robot.mass:.3g}",
+            markup.choose_box(uri),
+            markup.link(Address("compare", _without(page.uris, i)), "remove"),
+        )
+        for i, (uri, robot) in enumerate(zip(page.uris, page.robots, strict=True))
+    ]
+    header = ("robot", "links", "DoF", "kg", "choose", "")
+    gui.add_html(markup.framed(markup.table(header, rows, (1, 2, 3))))
+    if len(page.uris) < MAX_COMPARED:
+        _add_picker(page.session, page.uris)
+    page.texts["similarity"] = gui.add_html("")
+
+
+def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
+    return (*uris[:i], *uris[i + 1 :]) or ("",)
+
+
+def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
+    """Add controls that add a robot to the compared ones."""
+    lists = robot_lists(uris[0] if uris else "", session.files, {})
+    with session.client.gui.add_folder("Add a robot"):
+        picker = add_picker(session, lists, lambda: uris[0] if uris else "")
+        button = session.client.gui.add_button("Add", icon=viser.Icon.PLUS)
+
+    def add() -> None:
+        session.open_address(Address("compare", (*uris, picked_uri(picker))))
+
+    session.on_change(picker.robot, add)
+    session.on_change(button, add)
+
+
+def _apply_address(page: ComparePage, box: viser.GuiCheckboxHandle) -> None:
+    """Restore the moved joints and the primitives from the page's address."""
+    state = page.session.address.state
+    page.moved = comparison.parse_moves(state, tuple(page.sliders), -1.0)
+    for role, value in page.moved.items():
+        set_value(page.sliders[role], value)
+    _move(page)
+    if state.get("show") == PRIMITIVES:
+        set_value(box, True)
+        page.session.run_in_background(lambda: _show_fits(page, on=True))
+
+
+def _show_in_address(page: ComparePage) -> None:
+    page.session.update_address(
+        "compare " + ", ".join(robot.name for robot in page.robots),
+        **comparison.format_moves(page.moved, tuple(page.sliders)),
+    )
+
+
+def _add_move_tab(page: ComparePage) -> None:
+    """Add a slider for each role of joints, and buttons that move all of them."""
+    gui, session = page.session.client.gui, page.session
+    buttons = gui.add_button_group("Go to", ("home", "middle"))
+
+    def go_to_target() -> None:
+        page.moved = {} if buttons.value == "home" else dict.fromkeys(page.sliders, 0.0)
+        for role, slider in page.sliders.items():
+            set_value(slider, page.moved.get(role, _home_value(page, role)))
+        _move(page)
+
+    def read_sliders() -> None:
+        for role, slider in page.sliders.items():
+            if role in page.moved or slider.value != _home_value(page, role):
+                page.moved[role] = slider.value
+        _move(page)
+
+    session.on_change(buttons, go_to_target)
+    for role in comparison.all_roles(page.robots):
+        names = ", ".join(
+            robot.name for robot in page.robots if role in comparison.joint_roles(robot)
+        )
+        value = _home_value(page, role)
+        slider = gui.add_slider(
+            role, -1.0, 1.0, 0.01, value, hint=f"-1 is the lower limit, 1 the upper; of {names}"
+        )
+        page.sliders[role] = slider
+        session.on_change(slider, read_sliders, "move")
+
+
+def _home_value(page: ComparePage, role: str) -> float:
+    """Return a role's normalized home position of the first robot that has the role."""
+    robot = next(robot for robot in page.robots if role in comparison.joint_roles(robot))
+    home = comparison.normalized_positions(robot, np.array(robot.home))
+    return float(np.clip(home[comparison.joint_roles(robot).index(role)], -1, 1))
+
+
+def _move(page: ComparePage) -> None:
+    """Move every robot: moved roles to their positions, other joints to their home."""
+    with page.session.client.atomic():
+        for robot, view in zip(page.robots, page.views, strict=True):
+            view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))
+    page.session.call_later(ADDRESS_DELAY, lambda: _show_in_address(page), "address")
+
+
+def _show_fits(page: ComparePage, *, on: bool) -> None:
+    """Show the stored primitives of the robots and their IoU, or the meshes again."""
+    folders = page.session.files.library_folders
+    qualities = [comparison.fit_quality(robot, folders) for robot in page.robots] if on else []
+    page.session.enqueue(lambda: _draw_fits(page, qualities))
+
+
+def _draw_fits(page: ComparePage, qualities: Sequence[comparison.FitQuality]) -> None:
+    """Draw the primitives of the robots; without any, draw the meshes."""
+    parts = []
+    for view in page.views:
+        view.set_visible("visual", not qualities)
+        view.remove_layer("primitives")
+    if qualities:
+        for robot, view, quality in zip(page.robots, page.views, qualities, strict=True):
+            shapes = [quality[link.name][1] if link.name in quality else () for link in robot.links]
+            view.show_shapes("primitives", shapes)
+            colours = {name: comparison.iou_colour(iou) for name, (iou, _) in quality.items()}
+            view.paint("primitives", colours)
+            table = comparison.fit_table(robot, quality)
+            parts.append(f"<h3>{escape(robot.name)}</h3>{table}")
+    page.texts["fits"].content = markup.framed(*parts)
+
+
+def _compare(page: ComparePage) -> None:
+    """Show tokens and similarity, or why the robots cannot be compared."""
+    session = page.session
+    names = [robot.name for robot in page.robots]
+    if len(names) == 1:
+        page.texts["similarity"].content = markup.framed(markup.dim(ONE_ROBOT))
+    session.set_status("comparing")
+    try:
+        folders = session.files.library_folders
+        result = session.run_in_worker(comparison.compare_robots, page.robots, folders)
+    except MorphgenError as error:
+        page.texts["similarity"].content = markup.framed(
+            markup.tag("cannot be compared", "warning"), escape(session.files.redact(error))
+        )
+        session.set_status("")
+        return
+    links = [[link.name for link in robot.links] for robot in page.robots]
+    if len(names) > 1:
+        table = comparison.similarity_table(names, result)
+        page.texts["similarity"].content = markup.framed("<h3>Similarity</h3>", table)
+    page.texts["tokens"].content = markup.framed(
+        tokens_html(names, links, result.tables, dark=session.dark)
+    )
+    session.set_status("")

@@ -1,0 +1,563 @@
+"""A grammar around one robot: distributions about its parameters, and other parts for its own."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from html import escape
+from pathlib import Path
+from typing import Literal
+
+import viser
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.rounding import format_number, round_number
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, difference, outline, parse_derivation
+from morphgen.grammar.derive import DEFAULT_PORTS, Choices, FirstChooser, RecordedChooser, derive
+from morphgen.grammar.grammar_file import (
+    SUFFIX,
+    Grammar,
+    grammar_from_text,
+    grammar_names,
+    grammar_text,
+)
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import MOUNT_YAW, Manifest, Parameter
+from morphgen.grammar.part import load_part
+from morphgen.grammar.request import default_name
+from morphgen.grammar.sampling import cross, mutate, sample_robot
+from morphgen.model.robot import Robot
+from morphgen.viewer import markup
+from morphgen.viewer.app.address import Address, AddressError, pack_text, parse_count, unpack_text
+from morphgen.viewer.app.frame import call
+from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.pages.part_choice import first_parts
+from morphgen.viewer.robot_uri import DERIVATION, FileAccess, resolve_grammar, resolve_words
+
+_SHARE_OF_RANGE, _SHARE_OF_VALUE = 0.15, 0.3
+"""Standard deviation of a parameter: the smaller of these shares; tuned by eye."""
+_REPLACED = ("arm", "ee")
+"""Kinds of parts that may be replaced by others of the same kind and ports."""
+_NO_PART = "none"
+
+
+@dataclass(eq=False)
+class _Writer:
+    """Productions of the grammar that is being written."""
+
+    library: Library
+    productions: dict[str, str] = field(default_factory=dict)
+    """Right sides by symbol."""
+
+    def add(self, name: str, right: str) -> str:
+        """Add a production; return its symbol, which is the name or, if taken, a similar one."""
+        symbol, k = name, 1
+        while self.productions.get(symbol, right) != right or symbol in self.library.names():
+            k += 1
+            symbol = f"{name}{k}"
+        self.productions[symbol] = right
+        return symbol
+
+
+def grammar_around(derivation: Derivation, library: Library) -> str:
+    """Return the text of a grammar whose typical robot is that of a derivation.
+
+    Parameters have normal distributions about their values within their limits. Arms and
+    end-effectors have those of the library with the same ports as alternatives.
+    """
+    writer = _Writer(library, {"robot": ""})
+    writer.productions["robot"] = " ".join(_sequence(writer, derivation, "", is_root=True))
+    return "".join(f"{symbol} -> {right}\n" for symbol, right in writer.productions.items())
+
+
+def _sequence(
+    writer: _Writer, node: Derivation, prefix: str, *, is_root: bool = False
+) -> list[str]:
+    """Return the items that stand for a part and everything attached to it.
+
+    Args:
+        writer: Gets the productions of the symbols.
+        node: The part.
+        prefix: Beginning of its label that the grammar adds for its port.
+        is_root: Whether it is attached to no other part.
+    """
+    manifest = writer.library.manifest(node.part)
+    alternatives = _alternatives(node, manifest, writer.library, is_root=is_root)
+    items = [writer.add(node.label.removeprefix(prefix), "\n  | ".join(alternatives))]
+    main = next((port for port in DEFAULT_PORTS if port in manifest.ports), "")
+    trunk: list[str] = []
+    for port, child in node.children:
+        if port == main:
+            trunk = _sequence(writer, child, prefix)
+            continue
+        limb = _sequence(writer, child, f"{prefix}{port}_")
+        item = limb[0] if len(limb) == 1 else writer.add(f"{port}_limb", " ".join(limb))
+        items.append(f"{port}:{item}")
+    return items + trunk
+
+
+def _alternatives(
+    node: Derivation, manifest: Manifest, library: Library, *, is_root: bool
+) -> list[str]:
+    """Return a part with distributions about its parameters, and the parts that may replace it."""
+    values = dict(node.parameters)
+    parameters = {
+        name: parameter
+        for name, parameter in manifest.parameters.items()
+        if not is_root or _has_effect(node, manifest, name, parameter)
+    }
+    arguments = {name: _distribution(values[name], p) for name, p in parameters.items()}
+    arguments |= {
+        name: format_number(value)
+        for name, value in values.items()
+        if name not in arguments and (name == MOUNT_YAW or name in manifest.parameters)
+    }
+    alternatives = [_item(node.part, arguments)]
+    if is_root or manifest.kind not in _REPLACED or node.part == _NO_PART:
+        return alternatives
+    for other in library.manifests():
+        is_fitting = other.kind == manifest.kind and {*other.ports} == {*manifest.ports}
+        if is_fitting and other.name not in (node.part, _NO_PART):
+            alternatives.append(
+                _item(
+                    other.name,
+                    {name: _distribution(p.default, p) for name, p in other.parameters.items()},
+                )
+            )
+    return alternatives
+
+
+def _has_effect(node: Derivation, manifest: Manifest, name: str, parameter: Parameter) -> bool:
+    """Return whether a parameter changes the part, or a port to which something is attached."""
+    values = dict(node.parameters)
+    low, high = (
+        load_part(manifest, {**values, name: value})
+        for value in (parameter.minimum, parameter.maximum)
+    )
+    shapes = [(part.fragment.links, part.fragment.joints) for part in (low, high)]
+    used = [port for port, _ in node.children]
+    return shapes[0] != shapes[1] or any(low.ports[port] != high.ports[port] for port in used)
+
+
+def _distribution(value: float, parameter: Parameter) -> str:
+    """Return a distribution about a value, or the value if the parameter has no other one."""
+    low, high = parameter.minimum, parameter.maximum
+    if low == high:
+        return format_number(value)
+    if parameter.integer:
+        others = [n for n in range(round(low), round(high) + 1) if abs(n - value) in (1, 2)]
+        return f"choice({', '.join(map(format_number, (value, *others)))})"
+    deviation = _SHARE_OF_RANGE * (high - low)
+    if value:
+        deviation = min(deviation, _SHARE_OF_VALUE * abs(value))
+    numbers = (value, float(f"{deviation:.3g}"), low, high)
+    return f"normal({', '.join(map(format_number, numbers))})"
+
+
+def _item(part: str, arguments: dict[str, str]) -> str:
+    texts = ", ".join(f"{name}={text}" for name, text in arguments.items())
+    return f"{part}({texts})" if texts else part
+
+
+NUM_OFFSPRING = 9
+"""Robots of a generation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Individual:
+    """A robot of a grammar with the choices that gave it."""
+
+    robot: Robot
+    derivation: Derivation
+    choices: Choices
+
+
+@dataclass(eq=False)
+class History:
+    """Individuals that were adopted one after the other; a later one may be undone."""
+
+    individuals: list[Individual] = field(default_factory=list)
+    position: int = -1
+    """Index of the current individual."""
+
+    def add(self, individual: Individual) -> None:
+        """Adopt an individual in place of those that were undone."""
+        del self.individuals[self.position + 1 :]
+        self.individuals.append(individual)
+        self.position += 1
+
+    def go_to(self, position: int) -> Individual | None:
+        """Go to an individual; return it, or None if there is no such one."""
+        if not 0 <= position < len(self.individuals):
+            return None
+        self.position = position
+        return self.individuals[position]
+
+
+def make_individual(
+    grammar: Grammar, library: Library, choices: Choices, name: str = ""
+) -> Individual:
+    """Return the robot that choices give; choices that are missing are typical ones.
+
+    Args:
+        grammar: The grammar.
+        library: Library of the grammar's parts.
+        choices: The choices.
+        name: Name of the robot; by default that of ``individual_name``.
+
+    Raises:
+        GrammarError: If the grammar cannot be derived.
+        MorphgenError: If the robot cannot be composed.
+    """
+    chooser = RecordedChooser(FirstChooser(), choices)
+    derivation = derive(grammar, library, chooser)
+    robot = compose(derivation, library, name or individual_name(grammar, derivation))
+    return Individual(robot, derivation, dict(chooser.choices))
+
+
+def individual_name(grammar: Grammar, derivation: Derivation) -> str:
+    """Return the name of an individual, the same for the same derivation."""
+    return f"{grammar.name}-{derivation.digest[:8]}"
+
+
+def offspring(
+    grammar: Grammar, folders: tuple[Path, ...], parents: Sequence[Choices], seed: int
+) -> list[Individual]:
+    """Return the mutants of one parent, or the children of two. Runs in a worker.
+
+    Raises:
+        GrammarError: If the parent has no random choices.
+        SamplingError: If no valid robot that differs from the parents is found.
+    """
+    library = Library(folders)
+    if len(parents) == 1:
+        samples = mutate(grammar, library, parents[0], NUM_OFFSPRING, seed=seed, name=grammar.name)
+    else:
+        both = (parents[0], parents[1])
+        samples = cross(grammar, library, both, NUM_OFFSPRING, seed=seed, name=grammar.name)
+    return [
+        Individual(
+            replace(sample.robot, name=individual_name(grammar, sample.derivation)),
+            sample.derivation,
+            sample.choices,
+        )
+        for sample in samples
+    ]
+
+
+def change_lines(parent: Derivation, child: Derivation) -> list[str]:
+    """Return what differs in a child, such as ``claw.size 0.0506 to 0.0393``, one line each."""
+    sides: dict[str, dict[str, str]] = {}
+    for line in difference(parent, child):
+        key, _, value = line[2:].partition(" = ")
+        sides.setdefault(key, {})[line[0]] = _short(value)
+    lines = []
+    for key, values in sides.items():
+        if values.keys() == {"-", "+"}:
+            lines.append(f"{key} {values['-']} to {values['+']}")
+        elif "." not in key:  # the parameters of a part come and go with it
+            sign, value = next(iter(values.items()))
+            lines.append(f"{sign} {key} ({value})")
+    return lines
+
+
+def _short(value: str) -> str:
+    """Return a number with three digits, and other text as it is."""
+    try:
+        return f"{float(value):.3g}"
+    except ValueError:
+        return value
+
+
+def pack_choices(choices: Choices) -> str:
+    """Return choices as text for an address.
+
+    Raises:
+        AddressError: If they are too long.
+    """
+    rounded = {key: round_number(value) for key, value in choices.items()}
+    return pack_text(json.dumps(rounded, separators=(",", ":")))
+
+
+def unpack_choices(text: str) -> Choices:
+    """Return the choices that ``pack_choices`` has packed.
+
+    Raises:
+        AddressError: If the text is invalid.
+    """
+    try:
+        choices = json.loads(unpack_text(text))
+    except (ValueError, RecursionError) as error:
+        raise AddressError(f"the address has no readable choices: {error}") from error
+    if not isinstance(choices, dict) or not all(
+        isinstance(value, int | float) and math.isfinite(value) for value in choices.values()
+    ):
+        raise AddressError("the address has no readable choices: expected a number by each key")
+    return choices
+
+
+Mode = Literal["typical", "drawn", "chosen"]
+"""The typical robot, one that is drawn by seed and number, or the one that choices give."""
+_PLACE = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
+"""Beginning of an error that names a place in a grammar."""
+ShowRobot = Callable[[Robot, Derivation, str, str], None]
+"""Shows a robot, given its derivation, the command that makes it, and its URI."""
+
+
+@dataclass(eq=False)
+class GrammarTab:
+    """Controls of the grammar tab in one browser."""
+
+    session: Session
+    show_robot: ShowRobot
+    source: str
+    """Name or file of the grammar, or the robot that it is around; see ``source_text``."""
+    name: str
+    """Name of the grammar, from which its robots get theirs."""
+    original: str
+    """Text of the grammar before it was edited."""
+    start: viser.GuiDropdownHandle[str]
+    """Grammars to start from."""
+    text: viser.GuiTextHandle
+    fault: viser.GuiHtmlHandle
+    too_long: viser.GuiHtmlHandle
+    """Message that the edited text does not fit into the address; else empty."""
+    seed: viser.GuiNumberHandle[int]
+    number: viser.GuiNumberHandle[int]
+    num_parts: viser.GuiSliderHandle[int]
+    tree: viser.GuiHtmlHandle
+    derivation: Derivation | None = None
+    """Derivation of the whole robot; fewer of its parts may be shown."""
+    choices: Choices = field(default_factory=dict)
+    """Choices that gave the robot."""
+    mode: Mode = "typical"
+    """Which robot of the grammar is shown."""
+    on_shown: Callable[[Individual], object] | None = None
+    """Called after a whole robot of the grammar was shown."""
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether the text differs from the grammar's own."""
+        return self.text.value != self.original
+
+
+def add_grammar_tab(
+    session: Session,
+    tabs: viser.GuiTabGroupHandle,
+    source: str,
+    show_robot: ShowRobot,
+) -> GrammarTab:
+    """Add the tab, with the text, seed and number that the page's address gives.
+
+    Args:
+        session: The browser.
+        tabs: Group to which the tab is added.
+        source: Source of the grammar; see ``source_text``.
+        show_robot: Shows a robot on the page.
+
+    Raises:
+        AddressError: If the text in the address is invalid.
+        MorphgenError: If there is no such grammar or robot.
+    """
+    gui, state = session.client.gui, session.address.state
+    name, original = source_text(source, session.files)
+    names = _starts(source)
+
+    def count(key: str) -> int:
+        return parse_count(state.get(key, ""), 0)
+
+    with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
+        dropdown = gui.add_dropdown("start from", names, initial_value=source)
+        text = unpack_text(state["text"]) if "text" in state else original
+        text_field = gui.add_text("grammar", text, multiline=True)
+        fault, too_long = gui.add_html(""), gui.add_html("")
+        seed = gui.add_number("seed", count("seed"), min=0, step=1)
+        number = gui.add_number("robot number", count("number"), min=0, step=1)
+        buttons = gui.add_button_group("robot", ("typical", "this", "next"))
+        num_parts = gui.add_slider(
+            "parts shown", 1, 2, 1, 1, hint="how much of the derivation is shown"
+        )
+        tree = gui.add_html("")
+    tab = GrammarTab(
+        session,
+        show_robot,
+        source,
+        name,
+        original,
+        dropdown,
+        text_field,
+        fault,
+        too_long,
+        seed,
+        number,
+        num_parts,
+        tree,
+    )
+    if "choices" in state:
+        tab.choices, tab.mode = unpack_choices(state["choices"]), "chosen"
+    elif "number" in state:
+        tab.mode = "drawn"
+    session.on_change(dropdown, lambda: load_source(tab, dropdown.value))
+    session.on_change(text_field, lambda: show_grammar(tab, tab.mode), "grammar")
+    session.on_change(buttons, lambda: _draw(tab, buttons.value))
+    session.on_change(num_parts, lambda: _show_parts(tab), "parts")
+    return tab
+
+
+def source_text(source: str, files: FileAccess) -> tuple[str, str]:
+    """Return the name and the text of a grammar.
+
+    Args:
+        source: Name or file of a grammar, or words or a URI of a robot for ``grammar_around``.
+        files: Files that the page may read.
+
+    Raises:
+        MorphgenError: If there is no such grammar or robot.
+    """
+    if not is_robot(source):
+        name = Path(source).stem if source.endswith(SUFFIX) else source
+        return name, grammar_text(resolve_grammar(source, files))
+    if source.startswith(DERIVATION):
+        derivation = parse_derivation(source.removeprefix(DERIVATION))
+        name = default_name(derivation, files.library)
+    else:
+        derivation, name = resolve_words(source, files)
+    return name, grammar_around(derivation, files.library)
+
+
+def is_robot(source: str) -> bool:
+    """Return whether the source of a grammar is a robot."""
+    return source.startswith(DERIVATION) or "=" in source.split()[0]
+
+
+def edited_grammar(tab: GrammarTab) -> Grammar:
+    """Return the grammar of the text.
+
+    Raises:
+        GrammarError: If it is invalid.
+    """
+    return grammar_from_text(tab.text.value, tab.name)
+
+
+def show_grammar(tab: GrammarTab, mode: Mode) -> None:
+    """Show a robot of the edited grammar, or what is wrong with the text; then the last stays."""
+    session = tab.session
+    tab.mode = mode
+    try:
+        grammar = edited_grammar(tab)
+        typical = make_individual(grammar, session.files.library, {}, tab.name)
+        individual, command, state = _make_robot(tab, grammar, typical)
+    except (MorphgenError, RecursionError) as error:
+        session.set_status("")
+        _update_address(tab, {})
+        _show_fault(tab, error)
+        return
+    tab.choices, tab.derivation = individual.choices, individual.derivation
+    n = sum(1 for _ in tab.derivation.walk())
+    tab.num_parts.max = max(n, 2)  # a slider needs a range
+    set_value(tab.num_parts, n)
+    _update_address(tab, state)
+    _show_tree(tab, tab.derivation, n)
+    tab.show_robot(individual.robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
+    _show_fault(tab, None)
+    if tab.on_shown is not None:
+        tab.on_shown(individual)
+
+
+def _make_robot(
+    tab: GrammarTab, grammar: Grammar, typical: Individual
+) -> tuple[Individual, str, dict[str, str]]:
+    """Return the robot of the tab's mode, the command that makes it, and its address's state.
+
+    Raises:
+        MorphgenError: If the grammar gives no such robot.
+    """
+    session, library = tab.session, tab.session.files.library
+    is_text = tab.is_edited or is_robot(tab.source)
+    name = shlex.quote(f"{tab.name}{SUFFIX}" if is_text else tab.source)
+    note = f"# with the text of the tab Grammar in {name}\n" if is_text else ""
+    if tab.mode == "drawn":
+        seed, number = tab.seed.value, tab.number.value
+        session.set_status(f"drawing robot {number} of seed {seed}")
+        sample = sample_robot(grammar, library, number, seed=seed)
+        session.set_status("")
+        command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
+        individual = Individual(sample.robot, sample.derivation, sample.choices)
+        return individual, command, {"seed": str(seed), "number": str(number)}
+    if tab.mode == "typical":
+        return typical, f"{note}morphgen compose {name}", {}
+    individual = make_individual(grammar, library, tab.choices)
+    state = {"choices": pack_choices(individual.choices)}
+    return individual, f"# {individual.derivation}", state
+
+
+def _starts(source: str) -> tuple[str, ...]:
+    """Return the grammars to start from: the present one, and all that have a name."""
+    return tuple(dict.fromkeys((source, *grammar_names())))
+
+
+def load_source(tab: GrammarTab, source: str) -> None:
+    """Replace the text by that of another grammar, and show its typical robot.
+
+    Raises:
+        MorphgenError: If there is no such grammar or robot; see ``source_text``.
+    """
+    tab.name, tab.original = source_text(source, tab.session.files)
+    tab.source = source
+    tab.start.options = _starts(source)
+    set_value(tab.start, source)
+    set_value(tab.text, tab.original)
+    show_grammar(tab, "typical")
+
+
+def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
+    """Show grammar, state and edited text in the address; say if the text is too long for it."""
+    tab.too_long.content = ""
+    if tab.is_edited:
+        try:
+            state = state | {"text": pack_text(tab.text.value)}
+        except AddressError as error:
+            tab.too_long.content = markup.framed(markup.dim(str(error)))
+            state = {}  # without the text it would name another robot
+    tab.session.address = Address("compose", (tab.source,), state)
+    tab.session.show_address(f"compose {tab.source}")
+
+
+def _show_fault(tab: GrammarTab, error: Exception | None) -> None:
+    """Show what is wrong with the grammar, below the text and at its place in the text."""
+    text = "" if error is None else tab.session.files.redact(error)
+    tab.fault.content = markup.error(text) if text else ""
+    place = _PLACE.match(text)
+    is_here = place is not None and place["origin"] == tab.name
+    line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
+    tab.session.run_script(call("mark", line, column))
+
+
+def _draw(tab: GrammarTab, action: str) -> None:
+    """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
+    if action == "next":
+        set_value(tab.number, tab.number.value + 1)
+    show_grammar(tab, "typical" if action == "typical" else "drawn")
+
+
+def _show_parts(tab: GrammarTab) -> None:
+    """Show the robot with the number of parts that the slider gives."""
+    if tab.derivation is None:
+        return
+    n = tab.num_parts.value
+    partial = first_parts(tab.derivation, n)
+    _show_tree(tab, tab.derivation, n)
+    robot = compose(partial, tab.session.files.library, tab.name)
+    tab.show_robot(robot, partial, f"# {partial}", f"{DERIVATION}{partial}")
+
+
+def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
+    """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
+    lines = [escape(line) for line in outline(derivation).splitlines()]
+    lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
+    tab.tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")

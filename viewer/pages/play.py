@@ -1,0 +1,562 @@
+"""Curves of an episode under the playback controls: distance and score of every robot over time."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from html import escape
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from morphgen.errors import MorphgenError, nearest
+from morphgen.rl.baselines import baselines_for
+from morphgen.rl.shipped_policies import is_named, policies_for
+from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
+from morphgen.viewer import markup
+from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError, parse_count
+from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
+from morphgen.viewer.robot_picker import Robots, add_picker, picked_uri, robot_lists
+from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
+from morphgen.viewer.rollout import (
+    SPEEDS,
+    EpisodeSource,
+    Player,
+    RecordedEpisode,
+    Rollout,
+    RolloutConfig,
+    list_checkpoints,
+    simulators,
+    training_robots,
+)
+from morphgen.viewer.scene.rollout import (
+    RolloutScene,
+    add_episode,
+    episode_page,
+    record_scene,
+    render_video,
+    show_step,
+)
+from morphgen.viewer.scene.stage import look_at
+
+PLOT_INTERVAL = 0.25
+"""Time between two updates of the curves [s]."""
+COLOURS = (
+    *("#1c7ed6", "#f76707", "#2f9e44", "#ae3ec9", "#e03131"),
+    *("#0ca678", "#f59f00", "#7048e8", "#868e96"),
+)
+"""Colours of the robots, in their order."""
+_HEIGHT = 150
+"""Height of a chart [pixels]."""
+_NOW = "#868e96"
+"""Colour of the line at the current time."""
+
+
+@dataclass(eq=False)
+class EpisodePlots:
+    """The charts of a page."""
+
+    session: Session
+    folder: viser.GuiFolderHandle
+    charts: list[viser.GuiUplotHandle] = field(default_factory=list)
+    """Charts of the distance and of the score; empty until an episode is shown."""
+    step: int = 0
+    """Number of control steps that the scene shows."""
+    scores: list[list[float]] = field(default_factory=list)
+    """Score after every step by robot, as far as it was computed."""
+
+
+def add_plots(session: Session) -> EpisodePlots:
+    """Add the folder of the charts."""
+    return EpisodePlots(session, session.client.gui.add_folder("Distance and score"))
+
+
+def start_plots(plots: EpisodePlots, episode: Episode) -> None:
+    """Replace the charts by those of a new episode."""
+    clear_plots(plots)
+    plots.step, plots.scores = 0, [[] for _ in episode.tracks]
+    names = [track.robot.name for track in episode.tracks]
+    target = TASKS[episode.task].target
+    dark = plots.session.dark
+    with plots.folder:
+        for label, data in zip(
+            (f"m from {target}", "score so far"), curves(episode, 0, plots.scores), strict=True
+        ):
+            plots.charts.append(
+                plots.session.client.gui.add_uplot(
+                    data,
+                    _series(names),
+                    axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
+                    scales={"x": uplot.Scale(time=False)},
+                    legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
+                    height=_HEIGHT,
+                )
+            )
+
+
+def clear_plots(plots: EpisodePlots) -> None:
+    """Remove the charts."""
+    for chart in plots.charts:
+        chart.remove()
+    plots.charts = []
+
+
+def show_plots(plots: EpisodePlots, episode: Episode, step: int) -> None:
+    """Update the charts to what is simulated and shown, at most every ``PLOT_INTERVAL``."""
+    plots.step = step
+    plots.session.call_later(PLOT_INTERVAL, lambda: _update(plots, episode), "plots")
+
+
+def _update(plots: EpisodePlots, episode: Episode) -> None:
+    if len(plots.scores) != len(episode.tracks):  # another episode has begun meanwhile
+        return
+    for chart, data in zip(plots.charts, curves(episode, plots.step, plots.scores), strict=False):
+        chart.data = data
+
+
+def curves(
+    episode: Episode, step: int, scores: list[list[float]]
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return the data of both charts: time, the robots' curves, and a line at a step.
+
+    uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
+
+    Args:
+        episode: The episode, as far as it is simulated.
+        step: Number of control steps that the scene shows.
+        scores: Scores by robot that are known; missing ones are appended.
+
+    Returns:
+        Data of distance and of score: 2 + R arrays of the length of the episode. Robots whose
+        episode ended earlier keep their last value, because uPlot draws no curve with NaN.
+    """
+    num_steps = max(episode.num_steps, 1)
+    time = np.arange(1, num_steps + 1) * episode.period
+    distances, totals = [], []
+    for track, known in zip(episode.tracks, scores, strict=True):
+        n = min(len(track.score), len(track.distance), num_steps)
+        for i in range(len(known) + 1, n + 1):
+            value = score_until(track, episode.task, i)
+            known.append(0.0 if value is None else value)
+        distances.append(_padded(track.distance[:n], num_steps))
+        totals.append(_padded(known[:n], num_steps))
+    is_now = np.arange(1, num_steps + 1) == min(step, num_steps)
+
+    def with_line(values: list[Array]) -> tuple[Array, ...]:
+        low, high = np.min(values), np.max(values)
+        return (time, *values, np.where(is_now, high, low))
+
+    return with_line(distances), with_line(totals)
+
+
+def _padded(values: list[float], length: int) -> Array:
+    """Return values, the last one repeated up to a length; zeros if there are none."""
+    last = values[-1] if values else 0.0
+    return np.array([*values, *[last] * (length - len(values))], dtype=np.float64)
+
+
+def _series(names: list[str]) -> tuple[uplot.Series, ...]:
+    """Return the curves of the robots, and the line at the current time."""
+    colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
+    lines = [
+        uplot.Series(label=name, stroke=colour, width=2, points={"show": False})
+        for name, colour in zip(names, colours, strict=True)
+    ]
+    now = uplot.Series(label="shown", stroke=_NOW, width=1, points={"show": False})
+    return (uplot.Series(label="time (s)"), *lines, now)
+
+
+def _axis(label: str, *, dark: bool) -> uplot.Axis:
+    """Return an axis whose text is readable on the page."""
+    colour, lines = ("#ced4da", "#495057") if dark else ("#495057", "#e9ecef")
+    return uplot.Axis(
+        label=label,
+        labelSize=18,
+        size=34,
+        labelFont="11px sans-serif",
+        font="11px sans-serif",
+        stroke=colour,
+        grid={"stroke": lines, "width": 1},
+        ticks={"stroke": lines, "width": 1, "size": 4},
+    )
+
+
+ACTIONS = ("replace", "add", "only")
+"""Actions on the chosen robot: replace the first, add it, or remove all others."""
+
+
+@dataclass(eq=False)
+class RolloutControls:
+    """Controls of a rollout in one browser."""
+
+    session: Session
+    config: RolloutConfig
+    """Config of the rollout that the page shows."""
+    trained_on: Robots
+    """Robots that the policy was trained on."""
+    start: Callable[[RolloutConfig], object]
+    """Starts a rollout."""
+    handles: dict[str, Any] = field(default_factory=dict)
+
+
+def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
+    """Return the rollout that an address describes.
+
+    Args:
+        address: Address of the page.
+        trained_on: Robots that the policy was trained on; the first is the default robot.
+
+    Raises:
+        MorphgenError: If the task, simulator or seed is invalid.
+    """
+    state, installed = address.state, simulators()
+    task = address.subject
+    if task not in TASKS:
+        raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
+    simulator = state.get("sim", installed[0])
+    if simulator not in installed:
+        raise MorphgenError(
+            f"simulator {simulator!r} is not installed{nearest(simulator, installed)}"
+        )
+    seed_text = state.get("seed", "0")
+    if (seed := parse_count(seed_text, -1)) < 0:
+        raise MorphgenError(f"seed {seed_text!r:.80}: expected a whole number, 0 or more")
+    robot = trained_on[0][1] if trained_on else WORDS + DEFAULT_WORDS
+    return RolloutConfig(
+        task,
+        (address.robots or (robot,))[:MAX_PLAYED],
+        state.get("policy") or baselines_for(task)[0],
+        seed,
+        bool(state.get("obstacles")),
+        simulator,
+    )
+
+
+def rollout_address(config: RolloutConfig) -> Address:
+    """Return the address of a rollout; default values are left out."""
+    return Address("play", (config.task,), robots=config.robots).with_state(
+        policy=config.policy,
+        seed=str(config.seed),
+        obstacles="yes" if config.obstacles else "",
+        sim="" if config.simulator == simulators()[0] else config.simulator,
+    )
+
+
+def complete_address(session: Session) -> Robots:
+    """Return the robots that the address's checkpoint was trained on.
+
+    An address without a task gets the task and the obstacles of the training.
+    """
+    policy = session.address.state.get("policy", "")
+    if not policy or is_named(policy):
+        return []
+    task, obstacles, robots = training_robots(policy, session.files)
+    if not session.address.subject:
+        address = replace(session.address, subjects=(task,))
+        session.address = address.with_state(obstacles="yes" if obstacles else "")
+    return robots
+
+
+def add_rollout_controls(controls: RolloutControls) -> None:
+    """Add the controls to the page."""
+    gui, session, handles = controls.session.client.gui, controls.session, controls.handles
+    config = controls.config
+    restart = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
+    with gui.add_folder("Task"):
+        handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
+        policies = _policies(session.files, config)
+        handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
+        handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
+        handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
+        names = tuple(simulators())
+        handles["simulator"] = gui.add_dropdown("simulator", names, initial_value=config.simulator)
+    with gui.add_folder("Robots"):
+        trained_on = {"trained on": lambda: controls.trained_on} if controls.trained_on else {}
+        lists = robot_lists(config.robots[0], session.files, trained_on)
+        picker = add_picker(session, lists, lambda: controls.config.robots[0])
+        action = gui.add_button_group("this robot", ACTIONS)
+    session.on_change(restart, lambda: _change(controls, seed=controls.config.seed + 1))
+    session.on_change(handles["task"], lambda: _change_task(controls))
+
+    def apply(name: str) -> None:
+        _change(controls, **{name: handles[name].value})
+
+    for name in ("policy", "obstacles", "seed", "simulator"):
+        session.on_change(handles[name], functools.partial(apply, name), name)
+    session.on_change(picker.robot, lambda: _use_robot(controls, picked_uri(picker), "replace"))
+    session.on_change(action, lambda: _use_robot(controls, picked_uri(picker), action.value))
+
+
+def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
+    """Return the task's baselines and shipped policies, and the checkpoints in this folder."""
+    names = (*policies_for(config.task), *list_checkpoints(files), config.policy)
+    return tuple(dict.fromkeys(names))
+
+
+def _use_robot(controls: RolloutControls, uri: str, action: str) -> None:
+    """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
+    robots = controls.config.robots
+    if action == "add":
+        if len(robots) >= MAX_PLAYED:
+            raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
+        _change(controls, robots=(*robots, uri))
+    else:
+        _change(controls, robots=(uri, *(robots[1:] if action == "replace" else ())))
+
+
+def _change_task(controls: RolloutControls) -> None:
+    """Start another task, with its own baseline if the current one is for the other task."""
+    config = replace(controls.config, task=controls.handles["task"].value)
+    if is_named(config.policy) and config.policy not in policies_for(config.task):
+        config = replace(config, policy=baselines_for(config.task)[0])
+    controls.handles["policy"].options = _policies(controls.session.files, config)
+    controls.handles["policy"].value = config.policy
+    _change(controls, task=config.task, policy=config.policy)
+
+
+def _change(controls: RolloutControls, **changes: Any) -> None:  # noqa: ANN401
+    """Start an episode with another config."""
+    controls.config = replace(controls.config, **changes)
+    if controls.handles["seed"].value != controls.config.seed:
+        controls.handles["seed"].value = controls.config.seed
+    controls.start(controls.config)
+
+
+PANEL_WIDTH = 400.0
+"""Width of the panel [pixels]."""
+PLANNERS = ("ik", "scripted")
+"""Policies whose first step takes seconds, because they plan a path."""
+ADDRESS_DELAY = 0.5
+"""Delay of URL updates after a move of the time slider [s]."""
+
+
+@dataclass(eq=False)
+class PlayPage:
+    """Playback in one browser; the display of its player."""
+
+    session: Session
+    time: viser.GuiSliderHandle[float]
+    fault: viser.GuiHtmlHandle
+    score: viser.GuiHtmlHandle
+    plots: EpisodePlots
+    source: EpisodeSource | None = None
+    scene: RolloutScene | None = None
+    framed: tuple[str, ...] = ()
+    """URIs of the robots that the camera was pointed at."""
+    is_planning: bool = False
+    """Whether the policy is still planning its first step."""
+    position: int | None = None
+    """Step at which the user paused; None while the episode plays."""
+
+    def show_start(self, source: EpisodeSource) -> None:
+        """Show a new episode at its start."""
+        client, self.source = self.session.client, source
+        with client.atomic():
+            if self.scene is not None:
+                self.scene.root.remove()
+            self.scene = add_episode(client.scene, source.episode)
+        if self.session.closed.is_set():  # the browser has left the page meanwhile
+            self.scene.root.remove()
+            return
+        uris = tuple(track.uri for track in source.episode.tracks)
+        if uris != self.framed:  # the next episode of the same robots keeps the user's camera
+            self.framed = uris
+            look_at(client, self.scene.low, self.scene.high)
+        start_plots(self.plots, source.episode)
+        self.time.max = max(source.max_steps, 1) * source.episode.period
+        self._show_faults(source.faults.values())
+        self.is_planning = isinstance(source, Rollout) and source.episode.policy in PLANNERS
+        self.session.set_status("the policy plans its path" if self.is_planning else "")
+
+    def show_step(self, step: int) -> None:
+        """Show the episode after a number of control steps."""
+        if self.scene is None or self.source is None:
+            return
+        episode = self.source.episode
+        with self.session.client.atomic():
+            show_step(self.scene, step)
+        if step > 0 and self.is_planning:
+            self.is_planning = False
+            self.session.set_status("")
+        set_value(self.time, step * episode.period)
+        self.score.content = markup.framed(score_table(episode, step))
+        show_plots(self.plots, episode, step)
+
+    def show_stopped(self) -> None:
+        """Show errors that ended robots' episodes early."""
+        tracks = self.source.episode.tracks if self.source else []
+        if faults := [track.fault for track in tracks if track.fault]:
+            self._show_faults(faults)
+
+    def show_position(self, step: int | None) -> None:
+        """Show in the address where the user paused."""
+        self.position = step
+        self.session.call_later(ADDRESS_DELAY, self._show_in_address, "address")
+
+    def _show_in_address(self) -> None:
+        step, source = self.position, self.source
+        text = "" if step is None or source is None else f"{step * source.episode.period:.4g}"
+        if text != self.session.address.state.get("t", ""):
+            self.session.update_address(self.session.title, t=text)
+
+    def show_failure(self, reason: str) -> None:
+        """Show why there is no episode."""
+        self.session.set_status("")
+        self._show_faults([reason])
+        self.score.content = ""
+        clear_plots(self.plots)
+        if self.scene is not None:
+            self.scene.root.remove()
+            self.scene = None
+        self.source = None
+
+    def _show_faults(self, texts: Iterable[str]) -> None:
+        redact = self.session.files.redact
+        self.fault.content = "".join(markup.error(redact(text)) for text in texts)
+
+
+def show(session: Session) -> None:
+    """Build the page.
+
+    Raises:
+        MorphgenError: If the address names an unknown task, policy or robot, or an invalid episode.
+    """
+    gui, subject = session.client.gui, session.address.subject
+    paused_at = parse_time(session.address.state.get("t", ""))
+    header = markup.breadcrumbs((uri_name(subject) or "play", None))
+    session.open_panel(PANEL_WIDTH, header, "reading")
+    if subject.endswith(EPISODE_SUFFIX):
+        episode = read_episode(session.files.path(subject), session.files)
+        page, player = _add_player(session)
+        gui.add_html(markup.framed(_description(episode)))
+        player.load(lambda: RecordedEpisode(episode), start=paused_at)
+        session.show_address(f"play {uri_name(subject)}")
+    else:
+        trained_on = complete_address(session)
+        config = parse_rollout(session.address, trained_on)
+        page, player = _add_player(session)
+
+        def start(config: RolloutConfig, paused_at: float | None = None) -> None:
+            """Show a rollout's address, and let the player simulate it."""
+            session.address = rollout_address(config)
+            session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+            player.load(lambda: Rollout(config, session.files, session.set_status), start=paused_at)
+
+        add_rollout_controls(RolloutControls(session, config, trained_on, start))
+        start(config, paused_at)
+    with gui.add_folder("Get"):
+        _add_downloads(page)
+
+
+def parse_time(text: str) -> float | None:
+    """Return the time at which an address shows an episode [s]; None if the text is empty.
+
+    Raises:
+        AddressError: If the text is no time.
+    """
+    if not text:
+        return None
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not 0 <= time < math.inf:
+        raise AddressError(f"t={text[:40]} is no time; expected seconds, 0 or more")
+    return time
+
+
+def score_table(episode: Episode, step: int) -> str:
+    """Return a table of the robots' scores after a number of control steps."""
+    rows = []
+    for track in episode.tracks:
+        i = min(step, track.num_steps)
+        score = score_until(track, episode.task, i)
+        if score is None:
+            rows.append((escape(track.robot.name), "", "", ""))
+            continue
+        tag = markup.tag("success", "train") if track.success[i - 1] else markup.tag("not yet")
+        distance = f"{track.distance[i - 1]:.3f}"
+        rows.append((escape(track.robot.name), f"{score:.2f}", distance, tag))
+    seconds, simulated = step * episode.period, episode.num_steps * episode.period
+    header = ("", "score so far", f"m from {TASKS[episode.task].target}", "now")
+    head = markup.dim(f"{seconds:.2f} s; simulated: {simulated:.2f} s")
+    return head + markup.table(header, rows, (1, 2))
+
+
+def _add_player(session: Session) -> tuple[PlayPage, Player]:
+    """Add the controls of the playback; return the page and its player."""
+    gui = session.client.gui
+    fault = gui.add_html("")
+    buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
+    speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+    speed = gui.add_dropdown("speed", speeds, initial_value="1x")
+    time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint="as far as it was simulated")
+    page = PlayPage(session, time, fault, gui.add_html(""), add_plots(session))
+    player = Player(page)
+    session.on_close(player.stop)
+    commands: dict[str, Callable[[], None]] = {
+        "play": player.play,
+        "pause": player.pause,
+        "back": lambda: player.go_by(-1),
+        "step": lambda: player.go_by(1),
+    }
+
+    def go_to_time() -> None:
+        if page.source is not None:
+            player.go_to(round(time.value / page.source.episode.period))
+
+    session.on_change(buttons, lambda: commands[buttons.value]())
+    session.on_change(speed, lambda: player.set_speed(float(speed.value.removesuffix("x"))))
+    session.on_change(time, go_to_time, "time")
+    return page, player
+
+
+def _add_downloads(page: PlayPage) -> None:
+    """Add buttons that send the episode as a file, a video or a recorded scene."""
+    gui, session = page.session.client.gui, page.session
+    downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
+        (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
+        ("Film (.mp4)", ".mp4", functools.partial(session.run_in_worker, render_video)),
+        (
+            "Web page (.html)",
+            ".html",
+            lambda episode: session.run_in_worker(episode_page, episode, session.dark),
+        ),
+        ("Scene (.viser)", ".viser", functools.partial(session.run_in_worker, record_scene)),
+    )
+    for label, suffix, make in downloads:
+        button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
+        send = functools.partial(_send, page, suffix, make)
+        session.on_change(button, functools.partial(session.run_in_background, send))
+
+
+def _send(page: PlayPage, suffix: str, make: Callable[[Episode], bytes]) -> None:
+    """Send a file of the episode as far as it has been simulated."""
+    if page.source is None:
+        raise MorphgenError("there is no episode yet")
+    episode = snapshot(page.source.episode)
+    seconds = episode.num_steps * episode.period
+    page.session.set_status(f"making the {suffix} of {seconds:.2f} s")
+    content = make(episode)
+    name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
+    page.session.client.send_file_download(name, content, save_immediately=True)
+    page.session.set_status("")
+
+
+def _description(episode: Episode) -> str:
+    """Return a table about a recorded episode, with links to its robots."""
+    rows = [
+        ("task", escape(episode.task) + (" with obstacles" if episode.obstacles else "")),
+        ("policy", escape(episode.policy)),
+        ("seed", str(episode.seed)),
+        ("simulator", escape(episode.simulator)),
+    ]
+    for track in episode.tracks:
+        rows.append(("robot", markup.link(Address("robot", (track.uri,)), track.robot.name)))
+    return markup.table(("recorded", ""), rows)

@@ -1,0 +1,215 @@
+"""The page of a split: its robots, a map of their similarity, statistics and the audit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from html import escape
+
+import viser
+
+from morphgen.benchmark.audit import Audit
+from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
+from morphgen.benchmark.split import SIDES, Member, Split, split_id
+from morphgen.viewer import markup
+from morphgen.viewer.app.address import Address
+from morphgen.viewer.app.session import Session
+from morphgen.viewer.figures import heatmap_svg, map_svg
+from morphgen.viewer.gallery import (
+    Gallery,
+    add_controls,
+    add_sheet_buttons,
+    load_pictures,
+    open_panels,
+    passing_rows,
+)
+from morphgen.viewer.pages.index import show_index
+from morphgen.viewer.robot_rows import split_rows
+from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
+from morphgen.viewer.splits import SAVED_REGIMES, SplitStudy, save_split, show_saved, study_split
+
+PANEL_WIDTH = 520.0
+"""Largest width of the controls [pixels]."""
+PANEL_SHARE = 0.36
+"""Largest share of the window that the controls take, so that names on the map are readable."""
+NUM_PLAYED = 4
+"""Test robots of the link to a rollout."""
+
+
+@dataclass(eq=False)
+class SplitPage:
+    """A split in one browser."""
+
+    session: Session
+    name: str
+    """Name or file of the split, as in the address."""
+    split: Split
+    gallery: Gallery
+    measure: viser.GuiDropdownHandle[str]
+    study: SplitStudy | None = None
+    texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+
+
+def show(session: Session) -> None:
+    """Build the page.
+
+    Raises:
+        MorphgenError: If the split does not exist or cannot be read.
+    """
+    if not session.address.subject:
+        show_index(session)
+        return
+    name = session.address.subject
+    split = resolve_split(name, session.files)
+    gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")
+    gui = session.client.gui
+    header = _description(split) + _rollout_link(name, split)
+    width = min(PANEL_WIDTH, PANEL_SHARE * session.width)
+    panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
+    tabs = gui.add_tab_group()
+    with tabs.add_tab("Robots", viser.Icon.ROBOT):
+        add_controls(gallery, panel)
+        add_sheet_buttons(gallery)
+        _add_split_form(gallery, split)
+    texts = {}
+    with panel.add_tab("Map", viser.Icon.MAP):
+        texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
+    with tabs.add_tab("Similarity", viser.Icon.GRID_DOTS):
+        measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
+        texts["heatmap"] = gui.add_html("")
+    with tabs.add_tab("Statistics", viser.Icon.TABLE):
+        texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
+    with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
+        texts["audit"] = gui.add_html("")
+    page = SplitPage(session, name, split, gallery, measure, texts=texts)
+    session.on_change(measure, lambda: _draw_map(page))
+    session.run_in_background(lambda: _study(page))
+
+
+def statistics_table(statistics: Mapping[str, object]) -> str:
+    """Return a table of the statistics of both sides; distributions as mean (min to max)."""
+    sides = [statistics.get(side) for side in SIDES]
+    train, test = (side if isinstance(side, Mapping) else {} for side in sides)
+    if not train or not test:
+        return markup.dim("no statistics yet")
+    rows = [
+        (escape(str(key).replace("_", " ")), _format(train.get(key)), _format(test.get(key)))
+        for key in train
+    ]
+    text = markup.table(("", *SIDES), rows, (1, 2))
+    if "cosine" in statistics:
+        text += f"<h3>Cosine of test to train</h3>{_format(statistics['cosine'])}"
+    return text
+
+
+def audit_text(audit: Audit) -> str:
+    """Return the audit's findings, the accepted ones with reasons, and the nearest robots."""
+    text = "<h3>Findings</h3>" + markup.findings_table(audit.findings)
+    if audit.accepted:
+        rows = [
+            (f"<code>{escape(finding.code)}</code>", escape(finding.where), escape(reason))
+            for finding, reason in audit.accepted
+        ]
+        text += "<h3>Accepted</h3>" + markup.table(("code", "where", "why"), rows)
+    neighbours = [
+        (escape(pair.test), pair.measure, escape(pair.train), f"{pair.value:.3f}")
+        for pair in audit.neighbours
+    ]
+    table = markup.table(("test", "measure", "train", ""), neighbours, (3,))
+    return f"{text}<h3>Nearest train robots</h3>{table}"
+
+
+def _description(split: Split) -> str:
+    reference = f"<br>{escape(split.reference)}" if split.reference else ""
+    details = f"{split.regime} · id {split_id(split)}{reference}"
+    return escape(split.summary) + markup.dim(details)
+
+
+def _rollout_link(name: str, split: Split) -> str:
+    """Return a link to a rollout of the first test robots."""
+    first = split.test[0]
+    robots = tuple(
+        member_uri(name, "test", member)
+        for member in split.test[:NUM_PLAYED]
+        if member.task == first.task
+    )
+    state = {"obstacles": "yes"} if first.obstacles else {}
+    address = Address("play", (first.task,), state, robots)
+    population = markup.link(Address("population", (name,)), "see all on one ground")
+    return markup.dim(f"{markup.link(address, 'see robots to test on at work')} · {population}")
+
+
+def _format(value: object) -> str:
+    if isinstance(value, Mapping):
+        mean, low, high = (value.get(key) for key in ("mean", "min", "max"))
+        if all(isinstance(number, (int, float)) for number in (mean, low, high)):
+            return f"{mean:.3g} ({low:.3g} to {high:.3g})"
+    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+
+
+def _study(page: SplitPage) -> None:
+    """Study the split in the worker processes, once for all browsers, and show the results."""
+    session = page.session
+
+    def progress(done: int, total: int) -> None:
+        session.set_status(f"comparing {total} robots", done / total)
+
+    folders = session.files.library_folders
+    page.study = session.cached(
+        f"study {split_id(page.split)}",
+        lambda: study_split(page.split, folders, session.workers, progress),
+    )
+    if page.study.statistics:
+        table = statistics_table(page.study.statistics)
+        page.texts["statistics"].content = markup.framed(table)
+    page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
+    _draw_map(page)
+    uris = {member_uri(page.name, side, member) for side, member in page.study.members}
+    load_pictures(page.gallery, [row for row in page.gallery.rows if row.uri in uris])
+    _draw_map(page)
+
+
+def _draw_map(page: SplitPage) -> None:
+    """Draw the map and the heatmap of the chosen measure."""
+    study = page.study
+    if study is None or not study.members:
+        return
+    measure = MEASURES[page.measure.value]
+    values = study.matrices[measure.name]
+    names = [member.name for _, member in study.members]
+    sides = [side for side, _ in study.members]
+    uris = [member_uri(page.name, side, member) for side, member in study.members]
+    plane = classical_mds(to_distances(values, measure.name))
+    page.texts["map"].content = markup.framed(
+        markup.dim(
+            f"{measure.meaning}; {plane.kept:.0%} of the variation shown; "
+            f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a robot"
+        ),
+        map_svg(plane.points, names, sides, uris, page.gallery.thumbnails),
+    )
+    larger = measure.larger_is_more_alike
+    direction = "larger" if larger else "smaller"
+    page.texts["heatmap"].content = markup.framed(
+        markup.dim(f"dark is more similar; {direction} is more similar"),
+        heatmap_svg(values, names, sides, larger=larger),
+    )
+
+
+def _add_split_form(gallery: Gallery, split: Split) -> None:
+    """Add controls that save the shown members as a new split."""
+    gui, session = gallery.session.client.gui, gallery.session
+    with gui.add_folder("New split of what is shown", expand_by_default=False):
+        name = gui.add_text("split name", "")
+        shown = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
+        regime = gui.add_dropdown("regime", SAVED_REGIMES, initial_value=shown)
+        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+        text = gui.add_html("")
+
+    def save() -> None:
+        sides: dict[str, list[Member]] = {side: [] for side in SIDES}
+        for row in passing_rows(gallery):
+            sides[row.role].append(resolve_member(row.uri, session.files))
+        path = save_split(name.value, regime.value, sides["train"], sides["test"], session.files)
+        show_saved(session, path, text)
+
+    session.on_change(button, save)

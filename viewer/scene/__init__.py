@@ -1,0 +1,1 @@
+"""What the viewer draws in three dimensions."""

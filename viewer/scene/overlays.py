@@ -1,0 +1,323 @@
+"""The workspace of a tool: its outer shell, and a slice through it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, gaussian_filter
+
+from morphgen.model.findings import Finding
+from morphgen.model.geometry import Box
+from morphgen.model.kinematics import frame_positions, random_configurations
+from morphgen.model.robot import Robot
+from morphgen.typing import Array
+from morphgen.viewer.scene.robot import RobotView, robot_extent
+from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, triangles
+
+NUM_POINTS = 200_000
+"""Configurations that are sampled for a workspace."""
+_AZIMUTHS, _HEIGHTS = 48, 24
+"""Directions of the shell: steps around the vertical, and steps of the vertical component."""
+_CELLS = 48
+"""Cells of a slice along the longest side of the workspace."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """Cells of a vertical plane y = constant that the tool reaches."""
+
+    centres: Array
+    """Shape (n, 3) [m]."""
+    side: float
+    """Side of a cell [m]."""
+    density: Array
+    """Share of the configurations near the cell, relative to the most frequent cell, shape (n,)."""
+
+
+def sample_workspace(robot: Robot) -> Array:
+    """Return tool positions at uniformly random configurations, shape (n, 3) [m]."""
+    q = random_configurations(robot, NUM_POINTS, np.random.default_rng(0))
+    return frame_positions(robot, q.T).T
+
+
+def shell(points: Array, y_max: float) -> Triangles:
+    """Return the outermost positions by direction from the middle, as far as y is above a limit.
+
+    Args:
+        points: Tool positions, shape (n, 3) [m].
+        y_max: Faces in front of this plane are left out, so that the inside is visible [m].
+
+    Returns:
+        Triangles in the frame of the points; directions without points have none.
+    """
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    offset = points - middle
+    length = np.linalg.norm(offset, axis=1)
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) % 1
+    height = (offset[:, 2] / np.maximum(length, 1e-9) + 1) / 2
+    column = np.minimum((azimuth * _AZIMUTHS).astype(int), _AZIMUTHS - 1)
+    row = np.minimum((height * _HEIGHTS).astype(int), _HEIGHTS - 1)
+    farthest = np.zeros((_HEIGHTS, _AZIMUTHS))
+    np.maximum.at(farthest, (row, column), length)
+    z = (np.arange(_HEIGHTS) + 0.5) / _HEIGHTS * 2 - 1
+    angle = (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS * 2 * np.pi
+    across = np.sqrt(1 - z**2)[:, None]
+    directions = np.stack(
+        [across * np.cos(angle), across * np.sin(angle), np.tile(z[:, None], _AZIMUTHS)], axis=-1
+    )
+    vertices = np.concatenate(
+        [
+            (middle + farthest[..., None] * directions).reshape(-1, 3),
+            middle + np.array([[0, 0, -1], [0, 0, 1]]) * farthest[[0, -1]].mean(axis=1)[:, None],
+        ]
+    )
+    faces = _grid_faces()
+    known = np.append(farthest.ravel() > 0, farthest[[0, -1]].max(axis=1) > 0)
+    behind = vertices[:, 1] >= y_max
+    faces = faces[(known & behind)[faces].all(axis=1)]
+    return vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def cut(points: Array, y: float) -> Slice:
+    """Return the cells of a plane that the tool reaches.
+
+    Args:
+        points: Tool positions, shape (n, 3) [m].
+        y: Position of the plane [m].
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = max(float((high - low).max()), 1e-3) / _CELLS
+    near = points[np.abs(points[:, 1] - y) < side]
+    shape = np.maximum(np.ceil((high - low) / side).astype(int), 1)[[0, 2]]
+    index = np.minimum(((near - low) / side).astype(int)[:, [0, 2]], shape - 1)
+    count = np.zeros(shape)
+    np.add.at(count, tuple(index.T), 1.0)
+    filled = gaussian_filter(count, 0.8)
+    i, k = np.nonzero(binary_closing(count > 0) | (count > 0))
+    centres = np.stack(
+        [low[0] + (i + 0.5) * side, np.full(len(i), y), low[2] + (k + 0.5) * side], axis=1
+    )
+    return Slice(centres, side, filled[i, k] / max(float(filled.max()), 1e-9))
+
+
+def _grid_faces() -> NDArray[np.intp]:
+    """Return the triangles between neighbouring directions, and those at both poles."""
+    index = np.arange(_HEIGHTS * _AZIMUTHS).reshape(_HEIGHTS, _AZIMUTHS)
+    right = np.roll(index, -1, axis=1)
+    quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], axis=-1).reshape(-1, 4)
+    south, north = index.size, index.size + 1
+    poles = [
+        np.stack([right[0], index[0], np.full(_AZIMUTHS, south)], axis=1),
+        np.stack([index[-1], right[-1], np.full(_AZIMUTHS, north)], axis=1),
+    ]
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], *poles])
+
+
+TRAIL_LENGTH = 400
+"""Tool positions that a trail keeps."""
+_ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
+_AMBER: Rgb = (232, 89, 12)
+"""Colour of the inertia of links with findings about it."""
+_SHELL: Rgb = (76, 110, 245)
+SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
+"""Colours of a slice of the workspace where few and where most configurations lead."""
+_INERTIA_CODES = ("inertia", "mass", "com-", "density")
+"""Beginnings of the codes of findings about mass and inertia."""
+_NAME_DISTANCE = 0.045
+"""Distance below which links share a label, in extents of the robot."""
+
+
+@dataclass(eq=False)
+class Overlays:
+    """The overlays of a robot."""
+
+    view: RobotView
+    nodes: dict[str, list[Any]] = field(default_factory=dict)
+    """viser's scene nodes by overlay."""
+    trail: deque[Array] = field(default_factory=lambda: deque(maxlen=TRAIL_LENGTH))
+    """Recent tool positions [m]."""
+
+
+def remove_overlay(overlays: Overlays, name: str) -> None:
+    """Remove an overlay."""
+    for node in overlays.nodes.pop(name, []):
+        node.remove()
+    if name == "trail":
+        overlays.trail.clear()
+
+
+def show_joint_axes(overlays: Overlays) -> None:
+    """Draw an arrow along every movable joint's axis: orange rotates, blue slides."""
+    view = overlays.view
+    length = 0.14 * robot_extent(view.robot)
+    overlays.nodes["joint axes"] = [
+        view.scene.add_arrows(
+            f"{view.name}/{k + 1}/axis",  # joint k attaches link k + 1
+            np.array([[np.zeros(3), length * np.array(view.robot.joints[k].unit_axis)]]),
+            _BLUE if view.robot.joints[k].kind == "prismatic" else _ORANGE,
+            shaft_radius=0.02 * length,
+            head_radius=0.06 * length,
+            head_length=0.2 * length,
+        )
+        for k in view.robot.movable_joints
+    ]
+
+
+def show_mass_centres(overlays: Overlays) -> None:
+    """Draw a ball at every link's centre of mass; its volume is proportional to the mass."""
+    view = overlays.view
+    inertials = {i: link.inertial for i, link in enumerate(view.robot.links) if link.inertial}
+    heaviest = max((inertial.mass for inertial in inertials.values()), default=0.0)
+    overlays.nodes["centres of mass"] = [
+        view.scene.add_icosphere(
+            f"{view.name}/{i}/com",
+            radius=0.022 * robot_extent(view.robot) * (inertial.mass / heaviest) ** (1 / 3),
+            color=_BLACK,
+            position=inertial.com,
+        )
+        for i, inertial in inertials.items()
+        if inertial.mass > 0
+    ]
+
+
+def show_ignored_pairs(overlays: Overlays) -> None:
+    """Draw a line between the links of every pair whose contacts are ignored.
+
+    A line ends at the links' centres of mass, or at their origins for links without inertia.
+    """
+    remove_overlay(overlays, "ignored pairs")
+    view = overlays.view
+    centres = np.array(
+        [link.inertial.com if link.inertial else (0, 0, 0) for link in view.robot.links]
+    )
+    rotations, origins = view.T_root_link[:, :3, :3], view.T_root_link[:, :3, 3]
+    points = np.einsum("nij,nj->ni", rotations, centres) + origins
+    index = view.robot.link_index
+    lines = [
+        (points[index[a]], points[index[b]])
+        for a, b in view.robot.ignore_pairs
+        if a in index and b in index
+    ]
+    if lines:
+        node = view.scene.add_line_segments(
+            f"{view.name}/ignored", np.array(lines), _GREY, thickness=2.0, thickness_units="screen"
+        )
+        overlays.nodes["ignored pairs"] = [node]
+
+
+def show_names(overlays: Overlays) -> None:
+    """Write the name of every link at its centre of mass, or its origin if it has no mass.
+
+    Links that are close to each other share a label.
+    """
+    view = overlays.view
+    near = _NAME_DISTANCE * robot_extent(view.robot)
+    groups: list[tuple[int, Array, list[str]]] = []
+    for i, link in enumerate(view.robot.links):
+        T_root_link = view.T_root_link[i]
+        position = T_root_link[:3, :3] @ (link.inertial.com if link.inertial else np.zeros(3))
+        position = position + T_root_link[:3, 3]
+        group = next((g for g in groups if np.linalg.norm(g[1] - position) < near), None)
+        if group is None:
+            groups.append((i, position, [link.name]))
+        else:
+            group[2].append(link.name)
+    overlays.nodes["names"] = [
+        view.scene.add_label(
+            f"{view.name}/{i}/name",
+            names[0] if len(names) == 1 else f"{names[0]} + {len(names) - 1}",
+            font_screen_scale=0.75,
+            position=inertial.com if (inertial := view.robot.links[i].inertial) else (0, 0, 0),
+            anchor="center-left",
+        )
+        for i, _, names in groups
+    ]
+
+
+def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> None:
+    """Write findings about mass and inertia beside the links' boxes, and colour these boxes."""
+    remove_overlay(overlays, "inertia findings")
+    view, nodes, colours = overlays.view, [], {}
+    for i, link in enumerate(view.robot.links):
+        about = [
+            finding
+            for finding in findings
+            if finding.where == f"link {link.name}" and finding.code.startswith(_INERTIA_CODES)
+        ]
+        if not about:
+            continue
+        colours[link.name] = _AMBER
+        nodes.append(
+            view.scene.add_label(
+                f"{view.name}/{i}/inertia_finding",
+                f"{link.name}: {', '.join(finding.code for finding in about)}",
+                font_screen_scale=0.75,
+                position=link.inertial.com if link.inertial else (0, 0, 0),
+                anchor="center-left",
+            )
+        )
+    view.paint("inertia", colours)
+    overlays.nodes["inertia findings"] = nodes
+
+
+def show_workspace(overlays: Overlays, points: Array, y: float) -> None:
+    """Draw the shell of the tool's positions behind a vertical plane, and the slice in it.
+
+    Args:
+        overlays: The overlays.
+        points: Tool positions, shape (n, 3) [m].
+        y: Position of the plane [m].
+    """
+    remove_overlay(overlays, "workspace")
+    view, section = overlays.view, cut(points, y)
+    nodes: list[Any] = [
+        view.scene.add_mesh_simple(
+            f"{view.name}/workspace",
+            *shell(points, y),
+            color=_SHELL,
+            opacity=0.22,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+    ]
+    if len(section.centres):
+        cell = (section.side, 0.02 * section.side, section.side)
+        share = np.sqrt(section.density)[:, None]  # most cells are reached seldom
+        nodes.append(
+            view.scene.add_batched_meshes_simple(
+                f"{view.name}/workspace_slice",
+                *triangles(Box(cell)),
+                batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (len(section.centres), 1)),
+                batched_positions=section.centres,
+                batched_colors=batch_colours((1 - share) * SELDOM + share * OFTEN),
+                opacity=0.65,
+                lod="off",
+                cast_shadow=False,
+            )
+        )
+    overlays.nodes["workspace"] = nodes
+
+
+def extend_trail(overlays: Overlays, position: Array) -> None:
+    """Extend the trail of the tool to a position, unless it has not moved (10 um)."""
+    if overlays.trail and np.linalg.norm(overlays.trail[-1] - position) < 1e-5:
+        return
+    overlays.trail.append(position)
+    for node in overlays.nodes.pop("trail", []):
+        node.remove()
+    if len(overlays.trail) > 1:
+        positions = np.array(overlays.trail)
+        node = overlays.view.scene.add_line_segments(
+            f"{overlays.view.name}/trail",
+            np.stack([positions[:-1], positions[1:]], axis=1),
+            _ORANGE,
+            thickness=3.0,
+            thickness_units="screen",
+        )
+        overlays.nodes["trail"] = [node]

@@ -1,0 +1,361 @@
+"""A robot in viser's scene: its links in several layers, at any configuration."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike
+
+from morphgen.formats.bundle import split_colours
+from morphgen.model.geometry import Box, Pose, Shape
+from morphgen.model.inertia import bounding_box, box_corners
+from morphgen.model.kinematics import forward_kinematics
+from morphgen.model.robot import Robot
+from morphgen.tasks.render.renderer import Frame, Renderer, RenderState, write_video
+from morphgen.tasks.sim.base import Scene
+from morphgen.typing import Array
+from morphgen.viewer.scene.stage import (
+    MIN_EXTENT,
+    Rgb,
+    Triangles,
+    add_ground,
+    grown_triangles,
+    inertia_box,
+    look_at,
+    shape_colour,
+    triangles,
+)
+
+Layer = Literal["visual", "collision", "primitives", "inertia"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+
+RED: Rgb = (224, 49, 49)
+"""Colour of colliding or selected links."""
+_COLOURS: Mapping[Layer, Rgb] = {
+    "collision": (64, 192, 87),
+    "primitives": (253, 126, 20),
+    "inertia": (151, 117, 250),
+}
+_OPACITY: Mapping[Layer, float] = {"collision": 0.45, "primitives": 0.6, "inertia": 0.5}
+
+
+@dataclass(eq=False)
+class DrawnShape:
+    """A mesh in the scene and its own colour."""
+
+    handle: viser.MeshHandle
+    colour: Rgb
+
+
+@dataclass(eq=False)
+class RobotView:
+    """A robot in a scene."""
+
+    scene: viser.SceneApi
+    robot: Robot
+    name: str
+    """Name of the robot's node in the scene, such as ``/robot``."""
+    base: viser.FrameHandle
+    links: list[viser.FrameHandle]
+    """Frames of the links, in the order of ``robot.links``."""
+    layers: dict[Layer, list[list[DrawnShape]]] = field(default_factory=dict)
+    """Shapes by link of the layers drawn so far."""
+    red: frozenset[str] = frozenset()
+    """Names of the links that are painted red."""
+    T_root_link: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """Current pose of every link in the root frame, shape (n_links, 4, 4)."""
+
+    def set_configuration(self, q: ArrayLike) -> None:
+        """Move the robot to independent joint positions, shape (dof,) [rad or m]."""
+        before, self.T_root_link = self.T_root_link, forward_kinematics(self.robot, q)
+        for i, (handle, T) in enumerate(zip(self.links, self.T_root_link, strict=True)):
+            if i < len(before) and np.array_equal(before[i], T):
+                continue  # each message to a browser takes time
+            pose = Pose.from_matrix(T)
+            handle.position, handle.wxyz = pose.position, pose.quaternion
+
+    def show_shapes(
+        self, layer: Layer, shapes: Sequence[Sequence[Shape]], growth: float = 0.0
+    ) -> None:
+        """Draw shapes, given by link, in a layer; they replace the layer's previous shapes.
+
+        Args:
+            layer: The layer.
+            shapes: Shapes of each link.
+            growth: Distance by which surfaces are moved outwards [m], so that they do not coincide
+                with those of another layer.
+        """
+        self.remove_layer(layer)
+        self.layers[layer] = [
+            [
+                _add_mesh(
+                    self,
+                    f"{self.name}/{i}/{layer}{j}",
+                    grown_triangles(shape.geometry, growth)
+                    if growth
+                    else triangles(shape.geometry),
+                    shape.T_link_shape,
+                    layer,
+                    _COLOURS.get(layer) or shape_colour(shape),
+                )
+                for j, shape in enumerate(link_shapes)
+            ]
+            for i, link_shapes in enumerate(shapes)
+        ]
+
+    def show_inertia(self) -> None:
+        """Draw for every link the solid box that has its mass and inertia."""
+        self.remove_layer("inertia")
+        shapes = self.layers["inertia"] = []
+        for i, link in enumerate(self.robot.links):
+            box = inertia_box(link.inertial) if link.inertial else None
+            shapes.append([])
+            if link.inertial is None or box is None:
+                continue
+            sides, axes = box
+            T_link_box = np.eye(4)
+            T_link_box[:3, :3], T_link_box[:3, 3] = axes, link.inertial.com
+            x, y, z = sides.tolist()
+            surface, pose = triangles(Box((x, y, z))), Pose.from_matrix(T_link_box)
+            name = f"{self.name}/{i}/inertia"
+            shapes[i].append(_add_mesh(self, name, surface, pose, "inertia", _COLOURS["inertia"]))
+
+    def remove_layer(self, layer: Layer) -> None:
+        """Remove a layer's shapes."""
+        for shape in self._shapes(layer):
+            shape.handle.remove()
+        self.layers.pop(layer, None)
+
+    def set_visible(self, layer: Layer, visible: bool) -> None:
+        """Show or hide a layer that was drawn."""
+        for shape in self._shapes(layer):
+            shape.handle.visible = visible
+
+    def set_opacity(self, opacity: float) -> None:
+        """Set the opacity of the visual shapes, from 0 (invisible) to 1."""
+        for shape in self._shapes("visual"):
+            shape.handle.opacity = None if opacity >= 1 else opacity
+
+    def paint_red(self, names: Collection[str]) -> None:
+        """Paint the named links red, and the other links in their own colours."""
+        if (names := frozenset(names)) == self.red:
+            return
+        for layer in ("visual", "collision"):
+            for link, shapes in zip(self.robot.links, self.layers.get(layer, []), strict=False):
+                if (link.name in names) != (link.name in self.red):
+                    for shape in shapes:
+                        shape.handle.color = RED if link.name in names else shape.colour
+        self.red = names
+
+    def paint(self, layer: Layer, colours: Mapping[str, Rgb]) -> None:
+        """Set the colours of a layer's shapes, by link."""
+        for link, shapes in zip(self.robot.links, self.layers.get(layer, []), strict=False):
+            for shape in shapes if link.name in colours else ():
+                shape.handle.color = shape.colour = colours[link.name]
+
+    def show_axes(self, visible: bool) -> None:
+        """Show or hide the frame of every link."""
+        for handle in self.links:
+            handle.show_axes = visible
+
+    def _shapes(self, layer: Layer) -> list[DrawnShape]:
+        return [shape for shapes in self.layers.get(layer, []) for shape in shapes]
+
+
+def add_robot(
+    scene: viser.SceneApi,
+    robot: Robot,
+    name: str,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> RobotView:
+    """Draw a robot's visual shapes at its home configuration.
+
+    Args:
+        scene: Scene of a browser or of a server.
+        robot: The robot.
+        name: Name of its node in the scene, such as ``/robot``.
+        position: Position of its root [m].
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    base = scene.add_frame(name, show_axes=False, position=position)
+    length = 0.12 * robot_extent(robot)
+    links = [
+        scene.add_frame(
+            f"{name}/{i}",
+            show_axes=False,
+            axes_length=length,
+            axes_radius=0.04 * length,
+            origin_radius=0.08 * length,
+        )
+        for i in range(len(robot.links))
+    ]
+    view = RobotView(scene, robot, name, base, links)
+    view.set_configuration(robot.home)
+    view.show_shapes("visual", [link.visuals or link.collisions for link in robot.links])
+    return view
+
+
+def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
+    """Return the lowest and highest corner of a robot in its root frame [m].
+
+    Args:
+        robot: The robot; the origin of its root counts too.
+        q: Configuration, shape (dof,); the home configuration by default.
+    """
+    T_root_link = forward_kinematics(robot, robot.home if q is None else q)
+    points = [np.zeros((1, 3))]
+    for T, link in zip(T_root_link, robot.links, strict=True):
+        if shapes := link.visuals or link.collisions:
+            corners = box_corners(*bounding_box(shapes))
+            points.append(corners @ T[:3, :3].T + T[:3, 3])
+    stacked = np.concatenate(points)
+    return stacked.min(axis=0), stacked.max(axis=0)
+
+
+def robot_extent(robot: Robot) -> float:
+    """Return the longest side of a robot's bounding box at home, at least 5 cm [m]."""
+    low, high = robot_bounds(robot)
+    return max(float((high - low).max()), MIN_EXTENT)
+
+
+def _add_mesh(
+    view: RobotView, name: str, surface: Triangles, pose: Pose, layer: Layer, colour: Rgb
+) -> DrawnShape:
+    """Add a mesh to a robot's node, in the opacity of its layer."""
+    opacity = _OPACITY.get(layer)
+    handle = view.scene.add_mesh_simple(
+        name,
+        *surface,
+        color=colour,
+        opacity=opacity,
+        side="double",  # some meshes have their faces inside out
+        position=pose.position,
+        wxyz=pose.quaternion,
+        cast_shadow=opacity is None,
+    )
+    return DrawnShape(handle, colour)
+
+
+COLUMNS = 3
+CAMERA_DIRECTION = (0.08, -0.8, 0.62)
+"""Direction to the camera: columns run from left to right, and the first row is the farthest."""
+_GAP = 1.25
+"""Distance of two columns in widths of the widest robot."""
+_ROW = 0.8
+"""Smallest distance of two rows in the longest sides of the largest robot: rows are seen from
+above at an angle."""
+
+
+@dataclass(eq=False)
+class OffspringScene:
+    """The offspring in a scene."""
+
+    views: list[RobotView]
+    labels: list[viser.LabelHandle]
+    boxes: Array
+    """Lowest and highest corner of each robot in the world, shape (n, 2, 3) [m]."""
+
+
+def add_offspring(
+    client: viser.ClientHandle, parent: Robot, robots: Sequence[Robot]
+) -> OffspringScene:
+    """Draw the offspring beside the parent, which stands at the origin, and look at all."""
+    bounds = np.array([robot_bounds(robot) for robot in (parent, *robots)])
+    sizes = (bounds[:, 1] - bounds[:, 0]).max(axis=0)
+    step_x = _GAP * float(sizes[0])
+    step_y = max(_GAP * float(sizes[1]), _ROW * float(sizes.max()))
+    views, labels = [], []
+    boxes = np.empty((len(robots), 2, 3))
+    with client.atomic():
+        for i, robot in enumerate(robots):
+            row, column = divmod(i, COLUMNS)
+            position = ((column + 1.3) * step_x, (1 - row) * step_y, 0.0)
+            boxes[i] = bounds[i + 1] + position
+            views.append(add_robot(client.scene, split_colours(robot), f"/offspring{i}", position))
+            above = (0.0, 0.0, float(bounds[i + 1, 1, 2]) + 0.04 * step_x)
+            labels.append(
+                client.scene.add_label(
+                    f"/offspring{i}/label", str(i + 1), position=above, anchor="bottom-center"
+                )
+            )
+        low = np.minimum(boxes[:, 0].min(axis=0), bounds[0, 0])
+        high = np.maximum(boxes[:, 1].max(axis=0), bounds[0, 1])
+        add_ground(client.scene, float(np.linalg.norm(high - low)))
+        look_at(client, low, high, CAMERA_DIRECTION)
+    return OffspringScene(views, labels, boxes)
+
+
+def remove_offspring(scene: OffspringScene) -> None:
+    """Remove the offspring from the scene."""
+    for view in scene.views:
+        view.base.remove()
+
+
+def hit_robot(boxes: Array, origin: Array, direction: Array) -> int | None:
+    """Return the index of the nearest box that a ray meets; None if it meets none.
+
+    Args:
+        boxes: Lowest and highest corners, shape (n, 2, 3) [m].
+        origin: Start of the ray, shape (3,) [m].
+        direction: Direction of the ray, shape (3,).
+    """
+    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    distances = (boxes - origin) / safe
+    near = distances.min(axis=1).max(axis=1)
+    far = distances.max(axis=1).min(axis=1)
+    hits = np.flatnonzero((near <= far) & (far > 0))
+    return int(hits[np.argmin(near[hits])]) if len(hits) else None
+
+
+SIZE = (640, 480)
+"""Width and height of a frame [pixels]."""
+NUM_FRAMES, FPS = 72, 18
+"""Frames of a turn, and frames per second: a turn takes four seconds."""
+_RING_POINTS = 24
+
+
+def turntable(robot: Robot, suffix: str) -> bytes:
+    """Return a video of a robot at home that turns once around the vertical.
+
+    Args:
+        robot: The robot.
+        suffix: ``.mp4`` or ``.gif``.
+
+    Raises:
+        FormatError: If ffmpeg is missing or fails.
+        MeshError: If a mesh cannot be read.
+        MissingDependencyError: If there is no offscreen OpenGL.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"turntable{suffix}"
+        write_video(_frames(robot), path, FPS)
+        return path.read_bytes()
+
+
+def _frames(robot: Robot) -> Iterator[Frame]:
+    """Yield the frames of a turn; the camera sees the robot from every side."""
+    home = np.array([robot.home], dtype=np.float64)
+    renderer = Renderer(Scene(robot), (), home, _ring(robot), SIZE)
+    try:
+        state = RenderState(home[0].astype(np.float32))
+        for i in range(NUM_FRAMES):
+            yield renderer.frame(state, 360 * i / NUM_FRAMES)
+    finally:
+        renderer.close()
+
+
+def _ring(robot: Robot) -> Array:
+    """Return points on the cylinder that a robot's bounding box fills as it turns, (n, 3) [m]."""
+    low, high = robot_bounds(robot)
+    middle, radius = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) / 2
+    angles = np.linspace(0, 2 * np.pi, _RING_POINTS, endpoint=False)
+    circle = middle[:2] + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([np.insert(circle, 2, z, axis=1) for z in (max(low[2], 0.0), high[2])])

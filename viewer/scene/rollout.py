@@ -1,0 +1,247 @@
+"""An episode in viser's scene: its robots side by side, with goals, obstacles and blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import viser
+from viser.infra import StateSerializer
+
+from morphgen.model.geometry import Pose
+from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, write_video
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.task import Marker
+from morphgen.typing import Array
+from morphgen.viewer.app.web_page import scene_server, web_page
+from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.scene.robot import RobotView, add_robot, robot_bounds
+from morphgen.viewer.scene.stage import Rgb, add_ground, place_camera, set_stage
+
+Position = tuple[float, float, float]
+
+NODE = "/play"
+"""Name of the scene node above everything of an episode."""
+GAP = 0.3
+"""Distance between the areas of two robots [m]."""
+_GOAL: Rgb = (26, 166, 64)
+_BLOCK: Rgb = (230, 140, 38)
+_OBSTACLE: Rgb = (140, 64, 64)
+
+
+@dataclass(eq=False)
+class DrawnTrack:
+    """A robot of an episode in the scene."""
+
+    track: Track
+    view: RobotView
+    block: viser.BoxHandle | None
+    markers: dict[str, viser.FrameHandle | viser.BoxHandle]
+
+
+@dataclass(eq=False)
+class RolloutScene:
+    """An episode in a scene."""
+
+    root: viser.FrameHandle
+    tracks: list[DrawnTrack]
+    low: Array
+    """Lowest corner of the episode's bounding box, shape (3,) [m]."""
+    high: Array
+    """Highest corner of the episode's bounding box, shape (3,) [m]."""
+
+
+def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
+    """Draw an episode's robots and their surroundings at its start.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    areas = [track_area(track) for track in episode.tracks]
+    positions = grid_positions(areas)
+    root = scene.add_frame(NODE, show_axes=False)
+    tracks = [
+        _add_track(scene, f"{NODE}/{i}", track, position, labelled=len(positions) > 1)
+        for i, (track, position) in enumerate(zip(episode.tracks, positions, strict=True))
+    ]
+    corners = np.array(areas) + np.array(positions)[:, None]
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    heights = [track.ground for track in episode.tracks if track.ground is not None]
+    ground = min(heights, default=0.0)
+    add_ground(scene, float(np.linalg.norm(high - low)), ground)
+    rollout_scene = RolloutScene(root, tracks, low, high)
+    show_step(rollout_scene, 0)
+    return rollout_scene
+
+
+def show_step(scene: RolloutScene, step: int) -> None:
+    """Move everything to its pose after a number of control steps, or after its last one."""
+    for drawn in scene.tracks:
+        track = drawn.track
+        i = min(step, track.num_steps)
+        drawn.view.set_configuration(track.q[i])
+        moving = [(handle, track.marker_poses[name]) for name, handle in drawn.markers.items()]
+        if drawn.block is not None:
+            moving.append((drawn.block, track.block))
+        for handle, poses in moving:
+            pose = poses[i].tolist()
+            handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
+
+
+def track_area(track: Track) -> tuple[Array, Array]:
+    """Return the lowest and highest corner of a robot with its surroundings at the start [m]."""
+    points = [np.zeros(3)]
+    for q in (track.robot.home, track.q[0]):
+        points += robot_bounds(track.robot, q)
+    moving = [*([track.block] if track.block else []), *track.marker_poses.values()]
+    points += [poses[0][:3].astype(np.float64) for poses in moving]
+    points += [np.array(block.pose.position) for block in track.obstacles]
+    return np.min(points, axis=0), np.max(points, axis=0)
+
+
+def grid_positions(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
+    """Return positions of roots in a square grid, so that no area overlaps another."""
+    columns = math.ceil(math.sqrt(len(areas)))
+    reach = np.max([np.maximum(np.abs(low), np.abs(high))[:2] for low, high in areas], axis=0)
+    dx, dy = (2 * reach + GAP).tolist()
+    centre_column = (columns - 1) / 2
+    cells = (divmod(i, columns) for i in range(len(areas)))
+    return [(-row * dx, (centre_column - column) * dy, 0.0) for row, column in cells]
+
+
+def _add_track(
+    scene: viser.SceneApi, name: str, track: Track, position: Position, *, labelled: bool
+) -> DrawnTrack:
+    """Draw a robot of an episode with its obstacles, markers and block."""
+    scene.add_frame(name, show_axes=False, position=position)
+    view = add_robot(scene, track.robot, f"{name}/robot")
+    for i, obstacle in enumerate(track.obstacles):
+        _add_box(scene, f"{name}/obstacle{i}", obstacle, _OBSTACLE)
+    markers = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
+    block = None
+    if track.block and track.block_size is not None:
+        block = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
+    if labelled:
+        top = float(robot_bounds(track.robot)[1][2])
+        scene.add_label(f"{name}/label", track.robot.name, position=(0.0, 0.0, top + 0.1))
+    return DrawnTrack(track, view, block, markers)
+
+
+def _add_marker(
+    scene: viser.SceneApi, name: str, marker: Marker
+) -> viser.FrameHandle | viser.BoxHandle:
+    """Add a marker of a goal: a box, or axes inside a translucent ball."""
+    if marker.shape == "box":
+        return scene.add_box(name, _GOAL, marker.size, cast_shadow=False)
+    radius = marker.size[0] / 2
+    frame = scene.add_frame(
+        name, axes_length=2 * radius, axes_radius=0.1 * radius, origin_radius=0.15 * radius
+    )
+    scene.add_icosphere(f"{name}/near", radius, _GOAL, opacity=0.45, cast_shadow=False)
+    return frame
+
+
+def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> viser.BoxHandle:
+    return scene.add_box(
+        name, colour, block.size, position=block.pose.position, wxyz=block.pose.quaternion
+    )
+
+
+STRIDE = 2
+"""Control steps between two frames."""
+_FRAMED_STEPS = 32
+"""Steps, evenly spread over the episode, by which the camera is framed."""
+
+
+def render_video(episode: Episode) -> bytes:
+    """Return an ``.mp4`` of an episode in real time; several robots are tiled.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+        MissingDependencyError: If there is no offscreen OpenGL.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "episode.mp4"
+        write_video(_render_frames(episode), path, 1 / (STRIDE * episode.period))
+        return path.read_bytes()
+
+
+def record_scene(episode: Episode) -> bytes:
+    """Return a ``.viser`` file for viser's own player: the scene with all its motions.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    with scene_server() as server:
+        return _record(server, episode).serialize()
+
+
+def episode_page(episode: Episode, dark: bool) -> bytes:
+    """Return a web page that plays an episode without a server or a network.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    with scene_server() as server:
+        set_stage(server.scene, dark=dark)
+        recording = _record(server, episode)
+        return web_page(recording, f"{episode.task}: {episode.tracks[0].robot.name}", dark=dark)
+
+
+def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
+    """Return a renderer whose camera sees a robot's whole episode."""
+    steps = np.linspace(0, track.num_steps, min(_FRAMED_STEPS, track.num_steps + 1)).astype(int)
+    configurations = np.array([track.robot.home, *(track.q[i] for i in steps)], dtype=np.float64)
+    block = None if track.block_size is None else Block(track.block_size)
+    scene = Scene(track.robot, block=block, obstacles=track.obstacles, ground=track.ground)
+    moving = [*([track.block] if track.block else []), *track.marker_poses.values()]
+    positions = [poses[i][:3] for poses in moving for i in steps]
+    points = np.array(positions, dtype=np.float64).reshape(-1, 3)
+    margin = 0.0 if track.block_size is None else max(track.block_size) / 2
+    points = np.concatenate([points - margin, points + margin])
+    return Renderer(scene, track.markers, configurations, points, size)
+
+
+def _record(server: viser.ViserServer, episode: Episode) -> StateSerializer:
+    """Draw an episode in a server's scene and return its recording."""
+    scene = add_episode(server.scene, episode)
+    place_camera(server.initial_camera, scene.low, scene.high)
+    recording = server.get_scene_serializer()
+    for step in _frame_steps(episode):
+        show_step(scene, step)
+        recording.insert_sleep(STRIDE * episode.period)
+    return recording
+
+
+def _render_frames(episode: Episode) -> Iterator[Frame]:
+    """Yield the frames of a video: the robots of a step, tiled."""
+    columns = int(np.ceil(np.sqrt(len(episode.tracks))))
+    width, height = (2 * round(edge / columns / 2) for edge in SIZE)  # video codecs want even sizes
+    with contextlib.ExitStack() as stack:
+        renderers = []
+        for track in episode.tracks:
+            renderers.append(make_renderer(track, (width, height)))
+            stack.callback(renderers[-1].close)
+        for step in _frame_steps(episode):
+            tiles = [
+                renderer.frame(_render_state(track, min(step, track.num_steps)))
+                for renderer, track in zip(renderers, episode.tracks, strict=True)
+            ]
+            tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+            rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+            yield np.vstack(rows)
+
+
+def _render_state(track: Track, i: int) -> RenderState:
+    markers = {name: poses[i] for name, poses in track.marker_poses.items()}
+    return RenderState(track.q[i], track.block[i] if track.block else None, markers)
+
+
+def _frame_steps(episode: Episode) -> list[int]:
+    """Return the steps that are shown: the start, every ``STRIDE`` steps, and the end."""
+    return [*range(0, episode.num_steps, STRIDE), episode.num_steps]

@@ -1,0 +1,345 @@
+"""Surfaces and colours of shapes, as the browser gets them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import ArrayLike, NDArray
+
+from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Shape, Sphere
+from morphgen.model.inertia import box_corners, solid_mesh
+from morphgen.model.mesh import load_mesh
+from morphgen.model.robot import Inertial
+from morphgen.typing import Array
+from morphgen.viewer.app.viser_internals import remove_camera_callbacks
+
+Rgb = tuple[int, int, int]
+Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]
+"""Vertices (n, 3) [m] and faces (m, 3)."""
+
+GREY: Rgb = (176, 182, 190)
+"""Colour of shapes without their own."""
+SHARP_ANGLE = np.radians(35.0)
+"""Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
+_MAX_SMOOTHED_FACES = 150_000
+"""Largest mesh whose sharp edges are searched; larger ones would take seconds [faces]."""
+
+
+def shape_colour(shape: Shape) -> Rgb:
+    """Return the colour of a shape, grey if it has none."""
+    if shape.rgba is None:
+        return GREY
+    red, green, blue = (round(255 * channel) for channel in shape.rgba[:3])
+    return (red, green, blue)
+
+
+def batch_colours(colours: ArrayLike) -> NDArray[np.uint8]:
+    """Return colours (n, 3) for batched meshes, which viser takes as linear, not as sRGB.
+
+    The transfer function is that of IEC 61966-2-1.
+    """
+    share = np.asarray(colours, dtype=np.float64) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.round(255 * linear), dtype=np.uint8)
+
+
+def triangles(geometry: Geometry) -> Triangles:
+    """Return the surface of a geometry in its own frame.
+
+    Vertices at sharp edges are doubled, so that the browser shades them as edges.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    if isinstance(geometry, Mesh):
+        return _mesh_triangles(geometry, load_mesh(geometry))
+    return _primitive_triangles(geometry)
+
+
+def grown_triangles(geometry: Geometry, thickness: float) -> Triangles:
+    """Return the surface of a geometry, moved outwards by a thickness [m]; its edges are closed.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    if mesh.volume < 0:  # its faces are inside out
+        mesh.invert()
+    return _triangles(mesh.vertices + thickness * mesh.vertex_normals, mesh.faces)
+
+
+def inertia_box(inertial: Inertial) -> tuple[Array, Array] | None:
+    """Return the solid box with a link's mass and inertia.
+
+    A box with sides a, b, c has I_a = m (b^2 + c^2) / 12, and likewise I_b and I_c; the sum of all
+    three gives a^2 = 6 / m (I_a + I_b + I_c - 2 I_a).
+
+    Returns:
+        Sides (3,) [m], and their directions in the link frame as columns (3, 3). None for a
+        massless link, or if no rigid body has such an inertia.
+    """
+    if inertial.mass <= 0:
+        return None
+    moments, axes = np.linalg.eigh(inertial.matrix)
+    squares = 6 / inertial.mass * (moments.sum() - 2 * moments)
+    if (squares < -1e-9).any() or not (squares > 0).any():
+        return None
+    if np.linalg.det(axes) < 0:  # a reflection is not a rotation
+        axes[:, 0] *= -1
+    return np.sqrt(np.maximum(squares, 1e-8)), axes
+
+
+@lru_cache(maxsize=512)
+def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
+    """Cached by the loaded mesh, too, which is another object once the file has changed."""
+    del mesh
+    if len(loaded.faces) <= _MAX_SMOOTHED_FACES:
+        loaded = trimesh.graph.smooth_shade(loaded, angle=SHARP_ANGLE)
+    return _triangles(loaded.vertices, loaded.faces)
+
+
+@lru_cache(maxsize=1024)
+def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangles:
+    """Return the surface of a primitive; cached by its kind and size."""
+    mesh = solid_mesh(geometry)
+    if isinstance(geometry, Box | Cylinder):
+        mesh = trimesh.graph.smooth_shade(mesh, angle=SHARP_ANGLE)
+    return _triangles(mesh.vertices, mesh.faces)
+
+
+def _triangles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Triangles:
+    return np.asarray(vertices, dtype=np.float32), np.asarray(faces, dtype=np.uint32)
+
+
+BRAND: Rgb = (24, 100, 171)
+"""Colour of links, buttons and sliders."""
+CAMERA_DIRECTION = (0.72, -0.60, 0.34)
+"""Direction from a robot to the camera, that of the thumbnails (``formats.picture``)."""
+MIN_EXTENT = 0.05
+"""Smallest extent of a robot by which axes, markers and the scale bar are drawn [m]."""
+_BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
+    False: ((246, 248, 250), (206, 212, 219)),
+    True: ((52, 57, 64), (24, 26, 30)),
+}
+"""Colours at the top and bottom of the background, for light and dark pages. The light one is grey
+enough for white robots."""
+_GRADIENT_ROWS = 128
+_LIGHT: Literal["studio"] = "studio"
+"""Environment map that is installed with viser: soft boxes in a grey room."""
+_LIGHT_INTENSITY, _KEY_INTENSITY = 0.35, 0.75
+"""Factor on the environment map, and intensity of the light that casts shadows; tuned by eye, so
+that white robots keep their edges."""
+_KEY_POSITION = (0.9, -1.0, 2.4)
+"""Direction to the light that casts shadows: above the camera's shoulder."""
+_GRID: Rgb = (150, 157, 166)
+"""Colour of the lines on the ground, visible on light and on dark backgrounds."""
+_SHADOW_OPACITY = 0.3
+_FADE = 5.0
+"""Distance at which the ground has faded, in sizes of what stands on it."""
+_FOV = math.radians(35.0)
+"""Vertical field of view [rad], that of the thumbnails."""
+_MARGIN = 0.92
+"""Share of the picture that what the camera looks at may fill."""
+_MAX_ASPECT = 1.2
+"""Largest aspect of the picture that is used: panels may still open beside it."""
+_STRIP_ASPECT, _PAGE_ASPECT = 0.3, 1.0
+"""Aspect below which the picture is still the strip beside the panel of a gallery that the browser
+is leaving, and the aspect that is used instead."""
+_BAR_COLOURS: tuple[Rgb, Rgb] = ((33, 37, 41), (248, 249, 250))
+_BAR_PARTS = 10
+
+
+def set_stage(scene: viser.SceneApi, *, dark: bool) -> None:
+    """Set the light and the background."""
+    scene.configure_environment_map(_LIGHT, environment_intensity=_LIGHT_INTENSITY)
+    scene.configure_default_lights(enabled=False)
+    scene.add_light_directional(
+        "/light", intensity=_KEY_INTENSITY, cast_shadow=True, position=_KEY_POSITION
+    )
+    top, bottom = np.array(_BACKGROUNDS[dark], dtype=np.float64)
+    share = np.linspace(0, 1, _GRADIENT_ROWS)[:, None, None]
+    image = (1 - share) * top + share * bottom
+    scene.set_background_image(np.repeat(image, 2, axis=1).astype(np.uint8), format="png")
+
+
+def background_colour(*, dark: bool) -> Rgb:
+    """Return the colour behind the middle of the scene."""
+    top, bottom = _BACKGROUNDS[dark]
+    red, green, blue = ((a + b) // 2 for a, b in zip(top, bottom, strict=True))
+    return (red, green, blue)
+
+
+def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
+    """Draw an endless grid that fades with the distance, cells of 10 cm or, if large, of 1 m.
+
+    Args:
+        scene: The scene.
+        size: Size of what stands on it [m].
+        height: Height of the ground [m].
+    """
+    cell = 0.1 if size < 8 else 1.0
+    scene.add_grid(
+        "/ground",
+        cell_size=cell,
+        section_size=10 * cell,
+        cell_color=_GRID,
+        section_color=_GRID,
+        cell_thickness=0.6,
+        section_thickness=1.1,
+        infinite_grid=True,
+        fade_distance=_FADE * max(size, 1.0),
+        fade_strength=2.0,
+        shadow_opacity=_SHADOW_OPACITY,
+        position=(0.0, 0.0, height),
+    )
+
+
+def add_scale_bar(
+    scene: viser.SceneApi, low: Array, high: Array, direction: tuple[float, float, float]
+) -> None:
+    """Draw a bar on the ground in front of a box, of a length that fits: 0.1, 0.2, 0.5, 1, ... m.
+
+    Args:
+        scene: The scene.
+        low: Lowest corner of the box, shape (3,) [m].
+        high: Highest corner of the box, shape (3,) [m].
+        direction: From the box to the camera; decides which side is the front.
+    """
+    extent = max(float((high - low).max()), MIN_EXTENT)  # a robot without shapes is a point
+    length = bar_length(0.3 * extent)
+    width, gap = 0.04 * length + 0.006 * extent, 0.08 * extent
+    y = float(low[1]) - gap if direction[1] < 0 else float(high[1]) + gap
+    x = float(low[0] + high[0] - length) / 2
+    part = length / _BAR_PARTS
+    centres = np.empty((_BAR_PARTS, 3))
+    centres[:, 0] = x + (np.arange(_BAR_PARTS) + 0.5) * part
+    centres[:, 1:] = y, width / 8
+    scene.add_batched_meshes_simple(
+        "/scale",
+        *triangles(Box((part, width, width / 4))),
+        batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (_BAR_PARTS, 1)),
+        batched_positions=centres,
+        batched_colors=batch_colours([_BAR_COLOURS[i % 2] for i in range(_BAR_PARTS)]),
+        lod="off",
+        cast_shadow=False,
+    )
+    scene.add_label("/scale/label", length_text(length), position=(x + length + 0.4 * part, y, 0.0))
+
+
+def bar_length(longest: float) -> float:
+    """Return the largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ... m that is not above a length [m]."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return power * max(factor for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9))
+
+
+def length_text(length: float) -> str:
+    """Return a length [m] in metres or, below one, in centimetres."""
+    return f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+
+
+def look_at(
+    client: viser.ClientHandle,
+    low: Array,
+    high: Array,
+    direction: tuple[float, float, float] = CAMERA_DIRECTION,
+) -> None:
+    """Point a browser's camera at a box, from a direction and so near that it just is in view.
+
+    If panels open or close beside the scene, the camera is placed again, unless the user has moved
+    it.
+    """
+    placement = _Placement(low, high, direction)
+    placement.place(client.camera)
+    remove_camera_callbacks(client.camera, _Placement)
+    client.camera.on_update(placement)
+
+
+@dataclass(eq=False)
+class _Placement:
+    """Callback of a camera that points it at a box again when the aspect of the scene changes."""
+
+    low: Array
+    """Lower corner of the box, shape (3,) [m]."""
+    high: Array
+    """Upper corner of the box, shape (3,) [m]."""
+    direction: tuple[float, float, float]
+    """Direction from the box to the camera."""
+    aspect: float = 0.0
+    """Aspect for which the camera was placed last."""
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    """Position of the camera when it was placed last, shape (3,) [m]."""
+
+    def place(self, camera: viser.CameraHandle) -> None:
+        """Point a camera at the box."""
+        self.aspect = _used_aspect(camera)
+        place_camera(camera, self.low, self.high, self.direction, self.aspect)
+        self.position = camera.position
+
+    def __call__(self, camera: viser.CameraHandle) -> None:
+        """Place a camera again for another aspect, unless the user has moved it."""
+        has_moved = not np.allclose(camera.position, self.position, atol=1e-3)
+        if _used_aspect(camera) != self.aspect and not has_moved:
+            self.place(camera)
+
+
+def _used_aspect(camera: viser.CameraHandle) -> float:
+    """Return the aspect for which the camera is placed."""
+    return min(camera.aspect, _MAX_ASPECT) if camera.aspect > _STRIP_ASPECT else _PAGE_ASPECT
+
+
+def place_camera(
+    camera: viser.CameraHandle | viser.InitialCameraConfig,
+    low: Array,
+    high: Array,
+    direction: tuple[float, float, float] = CAMERA_DIRECTION,
+    aspect: float = _MAX_ASPECT,
+) -> None:
+    """Point a camera at a box; see ``look_at``.
+
+    Args:
+        camera: Camera of a browser, or the initial one of a recorded scene.
+        low: Lowest corner of the box, shape (3,) [m].
+        high: Highest corner of the box, shape (3,) [m].
+        direction: From the box to the camera.
+        aspect: Width of the picture divided by its height.
+    """
+    forward = -np.array(direction) / np.linalg.norm(direction)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, forward), forward])
+    corners = box_corners(low, high) @ axes.T
+    tangent = _MARGIN * math.tan(_FOV / 2)
+    offset = fit_camera(corners, np.array([tangent * aspect, tangent]))
+    distance = max(float(corners[:, 2].mean() - offset[2]), 0.15)
+    position = offset @ axes
+    camera.fov = _FOV
+    camera.position, camera.look_at = position, position + distance * forward
+    camera.near = min(0.01, distance / 50)
+
+
+def fit_camera(points: Array, tangents: Array) -> Array:
+    """Return the foremost camera, centred on points, that has all of them in its picture.
+
+    A point is in the picture if its offset from the camera across and up is at most its distance
+    times a tangent. Each axis of the picture gives two such bounds, on the farthest points to both
+    sides; the camera's offset is between them, and the stricter axis decides its distance.
+
+    Args:
+        points: Points in the camera's axes: right, up, forward, shape (n, 3) [m].
+        tangents: Largest offset per distance to the right and up, shape (2,).
+
+    Returns:
+        Position of the camera in its axes, shape (3,) [m].
+    """
+    after = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    forward = float((-(after + before) / (2 * tangents)).min())
+    return np.array([*((after - before) / 2), forward])
