@@ -1,4 +1,9 @@
-"""The metrics of an update."""
+"""Training by several processes of one machine, each with a GPU and its share of environments.
+
+``torchrun`` starts the processes. Each collects rollouts in its own environments. Gradients are
+averaged before every step of the optimiser, so that all processes keep the same weights; process 0
+alone writes files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distributions over the actions of a robot's links; only movable links count."""
+"""The layout of observations that networks are built for: sizes, channels, and rows of links."""
 
 from __future__ import annotations
 

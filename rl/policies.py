@@ -1,4 +1,4 @@
-"""Running normalisation of the kinematic channels of observations."""
+"""Actor and critic: an agent's networks with distributions of actions, and with values."""
 
 from __future__ import annotations
 

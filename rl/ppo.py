@@ -1,4 +1,10 @@
-"""Advantages of a rollout: generalised estimation, and normalisation."""
+"""Proximal policy optimisation over a batch of robots: the whole algorithm, top to bottom.
+
+An update (``Learner.iterate``) collects a rollout into preallocated buffers, estimates advantages
+and returns (GAE), and then takes gradient steps on minibatches of the rollout.
+
+Shapes: T control steps of n environments with R robots; m transitions in a minibatch.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point clouds of the blocks and obstacles in a batch's environments."""
+"""Observations of a batch: entries that never change, fields of tasks, and optional entries."""
 
 from __future__ import annotations
 

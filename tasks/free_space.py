@@ -1,10 +1,4 @@
-"""Connected components of free configuration space that one or two joints divide.
-
-Two links that touch in the middle of joints' ranges divide the free configurations into components
-that no path leaves. Whether two links touch depends on the joints between them. If these are one or
-two joints that move the tool, a grid over their plane is tested and labelled. Components due to the
-ground, to obstacles or to links with more joints between them are not detected.
-"""
+"""Collision tests of configurations in a scene, and sampling of free configurations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Target points and orientations of a robot's tool, for observations and baselines."""
+"""Observation channels of a robot's kinematics: a vector for each link.
+
+All positions and directions are in the root frame. Joint frames are canonical: their z axis is the
+joint's axis, so that equal joints look equal whatever convention the robot's file has. Numbers are
+scaled to about one by the constants below.
+"""
 
 from __future__ import annotations
 

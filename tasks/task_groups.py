@@ -1,7 +1,4 @@
-"""Check what tasks, also those of other packages, return: types and shapes, not values.
-
-A check reads no tensor, so that a step on a GPU never waits for it.
-"""
+"""The environments of a batch grouped by task, so that each task evaluates only its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cards of a gallery: pictures and facts of robots, at a common scale or each at its own."""
+"""A gallery of robots: cards with pictures, search, filters and order, and the contact sheet."""
 
 from __future__ import annotations
 

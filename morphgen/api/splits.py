@@ -1,4 +1,4 @@
-"""A split with the library of its parts: its robots, statistics, audit and files."""
+"""Load splits of train and test robots, and choose the robots of new ones."""
 
 from __future__ import annotations
 

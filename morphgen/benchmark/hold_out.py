@@ -1,9 +1,7 @@
-"""Rules that say which robots a split keeps for its test side.
+"""Generate splits from what they hold out: test robots have it, train robots do not.
 
-A rule holds out parts, a manufacturer, a range of a parameter, or a combination. It is written as
-on the command line: ``arm=kinova*`` holds out parts, ``manufacturer=Kinova``
-the parts of a manufacturer, ``arm3.length=0.3..0.4`` a range of a parameter, and
-``arm=ur5+ee=plane`` a combination. A robot is held out if one rule holds for it.
+The draws are stratified: each arm, then each end-effector, appears before one appears twice. Apart
+from what is held out, a test robot has only parts of train robots.
 """
 
 from __future__ import annotations

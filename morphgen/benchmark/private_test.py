@@ -1,4 +1,14 @@
-"""The grammars and rules that the private test robots of a split are drawn with."""
+"""A private test side: robots drawn with a secret, committed to now and revealed later.
+
+The release has a commitment, which is the SHA-256 of this JSON text without spaces, keys sorted::
+
+    {"description": {...}, "hashes": [...], "secret": "..."}
+
+``secret`` is the 64 hexadecimal digits of the secret file, ``description`` what the release says
+about its private robots (see ``_description``), and ``hashes`` the hashes of the robots in order.
+The secret has 256 random bits, so that nobody can find it by trying; whoever publishes the
+commitment cannot choose other robots later.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Expand patterns such as ``arm={ur5,panda} ee=*`` to the robots that they stand for."""
+"""The rules of the regimes, tested on the parts and parameters of train and test robots.
+
+Derivations suffice: no robot is composed.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The Croissant description of a release, for dataset tools: JSON-LD, format 1.0.
-
-See https://docs.mlcommons.org/croissant. It describes the files of the release's folder, to which
-its paths are relative.
-"""
+"""The files of a release for readers: the dataset card ``README.md`` and ``LICENCES.md``."""
 
 from __future__ import annotations
 

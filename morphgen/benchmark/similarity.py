@@ -1,4 +1,4 @@
-"""Edit distance of kinematic trees: the cost to edit one robot into another."""
+"""Three measures of the similarity of two robots, and maps of robots from their distances."""
 
 from __future__ import annotations
 

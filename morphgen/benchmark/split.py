@@ -34,7 +34,7 @@ COMPOSED = "composed"
 MAX_LINKS_KEY = "max_links"
 """Key in ``provenance`` of the largest number of links, if it is not the paper's."""
 HOLD_OUT_KEY = "hold_out"
-"""Key in ``provenance`` of the rules that say what is held out, see ``hold_out_rules``."""
+"""Key in ``provenance`` of the rules that say what is held out, see ``hold_out``."""
 
 
 @dataclass(frozen=True)

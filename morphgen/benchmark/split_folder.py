@@ -259,6 +259,7 @@ test on. `{split}` says how they were chosen; its id is `{id}`.
   robots are those of `{split}`
 
 ```python
+from morphgen.benchmark.split_folder import load_split_folder
 
 split = load_split_folder(".")
 for robot in split.train:

@@ -1,8 +1,4 @@
-"""Fields of the 48-number token of a link: encoding and decoding.
-
-Order and sizes follow the robot state table in AnyBody (arXiv 2505.14986, appendix on the state
-space). ``LAYOUT`` documents the choices that the paper leaves open.
-"""
+"""Tokens: encode a robot as 48 numbers per link, and decode it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compare description, licences and difficulty of a release with what its split gives today."""
+"""Verify that a split file or split folder matches the robots that its derivations give today."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joints as loaders read them, and how they differ from a robot's."""
+"""Read a bundle with other libraries: joints, total mass and poses of a frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reasons why collisions of two links need no test, as MoveIt's setup assistant finds them."""
+"""The SRDF of a robot: its groups, home and end-effectors, and the pairs that need no test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``morphgen eval --submission``: rules, recording and file of a submission."""
+"""``morphgen eval``: score a policy or a baseline on each robot."""
 
 from __future__ import annotations
 

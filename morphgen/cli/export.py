@@ -1,4 +1,4 @@
-"""The formats of ``morphgen export``, one row each."""
+"""``morphgen export``: robots as files and folders of other tools, web pages and videos."""
 
 from __future__ import annotations
 

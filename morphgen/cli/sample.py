@@ -1,4 +1,4 @@
-"""``morphgen grammar``: list, check, count, enumerate and print grammars."""
+"""``morphgen sample``, ``derive`` and ``mutate``: robots from grammars, and their derivations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``morphgen goals``: goal sets of robots and splits."""
+"""``morphgen split``: list, print and release splits of train and test robots."""
 
 from __future__ import annotations
 

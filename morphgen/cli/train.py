@@ -1,4 +1,4 @@
-"""Options of the agent that ``morphgen train`` trains: its switches and observations."""
+"""``morphgen train``: train an agent on the robots of a split, on one, or on drawn ones."""
 
 from __future__ import annotations
 

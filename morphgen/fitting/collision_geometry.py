@@ -1,4 +1,4 @@
-"""Robots with spheres as their collision shapes; fits are kept in the user's cache."""
+"""The geometries that a robot's collision shapes can be replaced by, by name."""
 
 from __future__ import annotations
 

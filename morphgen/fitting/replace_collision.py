@@ -1,4 +1,4 @@
-"""Fits of collision meshes in the user's cache, so that a robot is fitted once."""
+"""Replace the collision meshes of a robot by fitted primitives."""
 
 from __future__ import annotations
 

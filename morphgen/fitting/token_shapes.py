@@ -1,12 +1,4 @@
-"""Fit one primitive to a link of several primitives, with the same result on every machine.
-
-The gradient search for meshes depends on the last bits of floating-point numbers. On links that no
-primitive resembles, such as two rails, these bits decide which of many poor fits wins. This search
-is reproducible instead: it is a coordinate descent in which each parameter of a candidate takes its
-values from a short list, volumes are sums of integers, and sums have a fixed order. The faces of
-the link's primitives are among the values: between two faces the IoU of boxes along the same axes
-is a quotient of linear functions of the position of a side, so it is largest at a face.
-"""
+"""The single primitive that represents each link in its token."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""SRDF, the semantic description of a robot that MoveIt reads beside its URDF: content and writer.
-
-``morphgen.formats.srdf`` reads it.
-"""
+"""SRDF, the description that MoveIt reads beside a URDF: its content, its writer and reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Count and enumerate the structures of a grammar: its derivations without their values."""
+"""Check a grammar for faults, and list the values that it draws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choosers make the choices that a grammar leaves open: first, random, or recorded ones."""
+"""Derive robots from a grammar: rewrite its start symbol until only parts are left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters of parts: units, defaults and ranges, and parsing their values."""
+"""Manifests: the YAML files that describe templates and real parts."""
 
 from __future__ import annotations
 

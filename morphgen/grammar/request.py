@@ -1,4 +1,4 @@
-"""Pin choices that a grammar leaves open: ``beads=5 bead.radius=20mm arm=ur5``."""
+"""Parse requests: ``arm=ur5 ee=plane left.ee.size=0.1`` to a derivation."""
 
 from __future__ import annotations
 

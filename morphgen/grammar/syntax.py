@@ -1,4 +1,4 @@
-"""Limits of grammars, so that no text from a stranger runs for hours or fills the memory."""
+"""Parse grammar texts to syntax trees; errors name the line and column."""
 
 from __future__ import annotations
 

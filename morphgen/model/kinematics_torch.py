@@ -1,4 +1,16 @@
-"""Rotations as batches of torch tensors: quaternions (w, x, y, z), matrices, rotation vectors."""
+"""Kinematics of many robots in one batch of torch tensors, differentiable, on any device.
+
+The functions have the names and results of ``morphgen.model.kinematics``. Robots are compiled once:
+``compile_tree`` for the poses of all links, ``compile_chain`` for the pose and the Jacobian of one
+frame, which is several times as fast because only joints between the root and the frame count.
+Loops run over levels of the tree, never over environments.
+
+Arguments that the functions share:
+
+* ``robot_index``, shape (n,), int64: index of the compiled robot in each row of the batch.
+* ``q``, shape (n, J): independent joint positions [rad or m], padded to the largest number J of
+  independent joints; entries beyond a robot's joints are ignored.
+"""
 
 from __future__ import annotations
 

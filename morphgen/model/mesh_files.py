@@ -1,9 +1,7 @@
-"""Read meshes in MuJoCo's binary format ``.msh`` from untrusted sources.
+"""Read mesh files from untrusted sources: STL, OBJ and PLY here, other formats by other modules.
 
-The format, little-endian: four 32-bit integers, which count the vertices, the normals, the texture
-coordinates and the triangles; then the vertices and normals as 3, the texture coordinates as 2
-32-bit floats each; then the triangles as 3 32-bit integers each. The format is documented at
-https://mujoco.readthedocs.io/en/stable/XMLreference.html#asset-mesh.
+Every count in a file is compared with the file's bytes before anything is allocated. What trimesh
+would lose or misread is rewritten before it reads the file, left out with a note, or refused.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Goals of reach as the baselines read them from a batch."""
+"""The baseline ``ik`` of reach: inverse kinematics, and a collision-free path to its solution."""
 
 from __future__ import annotations
 

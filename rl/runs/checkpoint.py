@@ -1,4 +1,4 @@
-"""Check the content of a checkpoint before anything is built from it."""
+"""The folder of a run: its config and its last checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Save the state of a learner, resume it, and begin with the networks of another."""
+"""Train runs: create the run's folder, learn, and write the checkpoints to resume from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Tables and curves of a study; missing scores are shown as missing."""
+"""Tables of results computed from episodes: the submissions that studies and evaluations write.
+
+Scores of several seeds of a method stand in one row: interquartile means with a bootstrap over the
+seeds, success rates with Wilson intervals, and paired differences to a reference controller.
+"""
 
 from __future__ import annotations
 

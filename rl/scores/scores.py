@@ -1,7 +1,4 @@
-"""Averages with their intervals: bootstrap for scores, Wilson for successes.
-
-After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
-"""
+"""Scores of robots in an evaluation, and their JSON form."""
 
 from __future__ import annotations
 

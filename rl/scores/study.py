@@ -1,4 +1,4 @@
-"""Read the scores that the cells of studies stored, whatever configuration they are of."""
+"""Studies: every agent with every seed on every split, and baselines to compare with."""
 
 from __future__ import annotations
 

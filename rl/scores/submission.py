@@ -226,7 +226,7 @@ def is_submission(data: object) -> bool:
 
 
 def read_submission(path: Path) -> Submission:
-    """Read a submission and check its form; ``submission_checks`` checks what it claims.
+    """Read a submission and check its form, not what it claims.
 
     Raises:
         BenchmarkError: If it is missing or malformed; the message names robot and field.

@@ -1,7 +1,6 @@
-"""Goal sets of the benchmark's scenarios that come with the package, verified by hash when read.
+"""Goal sets of robots: packaged, or sampled once and cached, and stored as files of a split.
 
-They are the sets that would be sampled, number by number, in double precision: a set of lower
-precision would give other episodes than the same set sampled anew. ``package_sets`` makes them.
+A file has an array for each field; the same set gives the same bytes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Build the folder of a split together with its goal sets."""
+"""Make a release of a split: its folder with goal sets, licences, scores and descriptions, zipped.
+
+See ``morphgen.benchmark.release_file`` for the files. The same inputs give the same bytes.
+"""
 
 from __future__ import annotations
 

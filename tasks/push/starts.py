@@ -1,4 +1,4 @@
-"""Region where a robot's block starts, the block's size, and the line that it must cross."""
+"""Push sets: poses of a block from which a robot can push it, with feasibility certificates."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def sample_goals(
     """Sample a robot's goal set; see ``Task.sample``.
 
     Configurations are uniform within the joint limits. Those that collide, also with the ground,
-    and those outside of the main component of free C-space (``cspace_components``) are drawn again.
+    and those outside of the main component of free C-space (``free_space``) are drawn again.
     Obstacles do not matter: each of their layouts leaves some of the configurations free.
 
     Raises:

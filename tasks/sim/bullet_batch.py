@@ -1,4 +1,4 @@
-"""A scene that PyBullet simulates in a client of its own."""
+"""Scenes in PyBullet that step one after the other and write into shared buffers."""
 
 from __future__ import annotations
 

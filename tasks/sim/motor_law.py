@@ -1,4 +1,4 @@
-"""Functions on arrays of few numbers, on which most calls of NumPy take longer than their work."""
+"""The law of joint motors in all simulators: lag, speed limits and force limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""State of MuJoCo environments as tensors: joints and blocks."""
+"""MuJoCo as a simulator: one ``MjData`` for every environment, stepped by threads."""
 
 from __future__ import annotations
 

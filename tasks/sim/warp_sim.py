@@ -1,4 +1,4 @@
-"""Scenes as models of MuJoCo Warp: scenes of one structure share a model with rows of numbers."""
+"""MuJoCo Warp as a simulator: all environments of one structure step in the same kernels."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from helpers.learners import equal, learner, stored, untimed, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.runs.checkpoint import packed
-from morphgen.rl.runs.training import load_networks, resume, state_of
+from morphgen.rl.runs.training import load_networks, resume_learner, state_of
 
 
 @pytest.mark.slow
@@ -32,7 +32,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
     kind = "discrete" if discrete else "continuous"
     again = learner(OnALine(8, kind=kind, seed=99), seed=77, **options)
     again.iterate()
-    resume(again, checkpoint)
+    resume_learner(again, checkpoint)
     assert not again.done
     same = [again.iterate(), again.iterate()]
     assert again.done
@@ -53,7 +53,7 @@ def test_a_run_on_a_gpu_is_written_and_resumed():
     report = went_on.iterate()
 
     again = learner(OnALine(8, seed=99), seed=77, **options)
-    resume(again, checkpoint)
+    resume_learner(again, checkpoint)
     assert again.iterate().value_loss == pytest.approx(report.value_loss, rel=1e-4)
 
 
@@ -70,7 +70,7 @@ def test_a_run_resumed_without_a_part_of_the_state_differs(part):
     went_on.iterate()
     again = learner(OnALine(8, seed=99), seed=77, **options)
     again.iterate()
-    resume(again, {**checkpoint, part: state_of(again)[part]})
+    resume_learner(again, {**checkpoint, part: state_of(again)[part]})
     again.iterate()
     assert not equal(weights(went_on), weights(again))
 
@@ -82,7 +82,7 @@ def test_later_updates_do_not_change_a_saved_state():
     before = copy.deepcopy(checkpoint)
     made.iterate()
     again = learner()
-    resume(again, checkpoint)
+    resume_learner(again, checkpoint)
     assert all(checkpoint["actor"][k].equal(before["actor"][k]) for k in before["actor"])
     steps = [each["step"] for each in checkpoint["optimiser"]["state"].values()]
     assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
@@ -111,9 +111,9 @@ def test_resume_rejects_checkpoints_of_other_runs_and_changes_nothing():
     made = learner()
     before = weights(made)
     with pytest.raises(TaskError, match=r"another run: gamma 0\.9, here 0\.99$"):
-        resume(made, state_of(learner(gamma=0.9)))
+        resume_learner(made, state_of(learner(gamma=0.9)))
     with pytest.raises(TaskError, match="another run: agent me-tf, here me-mlp"):
-        resume(made, state_of(learner(agent="me-tf")))
+        resume_learner(made, state_of(learner(agent="me-tf")))
     wider = state_of(learner())
     wider["layout"]["links"] = 30
     for take in (resume, load_networks):
@@ -126,7 +126,7 @@ def test_a_constant_missing_in_an_old_checkpoint_has_its_default():
     made, again = learner(seed=1), learner()
     checkpoint = stored(state_of(made))
     del checkpoint["policy"]["network"]["mlp_width"], checkpoint["config"]["desired_kl"]
-    resume(again, checkpoint)
+    resume_learner(again, checkpoint)
     assert equal(weights(made), weights(again))
 
 

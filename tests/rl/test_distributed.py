@@ -24,7 +24,7 @@ def train_by_two(folder, updates, *options):
     script.write_text(
         "import os, sys, torch\n"
         "from morphgen.cli import main\n"
-        "from morphgen.rl import training\n"
+        "from morphgen.rl.runs import training\n"
         "inner = training._learn\n"
         "def learn(learner, *rest):\n"
         "    inner(learner, *rest)\n"

@@ -8,7 +8,7 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import MAX_NORMALIZED, RunningNormalizer
 from morphgen.rl.ppo import Learner
-from morphgen.rl.runs.training import resume, state_of
+from morphgen.rl.runs.training import resume_learner, state_of
 
 LAYOUT = Layout(5, 48, 0, 0, (), vectors=(("lag", 1), ("dls", 3)))
 
@@ -61,7 +61,7 @@ def test_learners_update_all_networks_and_resume_with_the_statistics():
     networks = (one.actor, one.critic, one.target_critic)
     assert len({float(network.normalizer.mean) for network in networks}) == 1
     assert abs(float(one.actor.normalizer.mean) - 4.0) < 1.5
-    resume(other, stored(state_of(one)))
+    resume_learner(other, stored(state_of(one)))
     one.restart_episodes()
     for _ in range(2):
         one.iterate(), other.iterate()

@@ -172,7 +172,7 @@ def test_verify_accepts_another_nearest_robot_that_is_as_near_up_to_rounding(fol
     pattern = r"(planar-plane,push,.*)planar-cube,[\d.]+$"
     change_difficulty(folder, lambda text: re.sub(pattern, r"\1gantry-cylinder,0.75", text))
     assert len(verify(folder, LIBRARY).differences) == 2
-    monkeypatch.setattr(release_checks, "TOLERANCE", 1.0)
+    monkeypatch.setattr(release_checks, "TABLE_TOLERANCE", 1.0)
     assert verify(folder, LIBRARY).differences == ()
 
 

@@ -1,4 +1,4 @@
-"""The table of pages. To add a page, write a module with ``show(session)`` and add a row."""
+"""Addresses of pages: the query of a URL, such as ``?gallery=robots/arm3&sort=reach``."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""Access policy: the viewer answers a request by its ``Host`` and ``Origin`` headers.
-
-Threat: the viewer has no password and listens on this machine, but any web page that the user has
-open in the same browser can send requests to ``localhost`` too, and can point a host name of its
-own to this machine (DNS rebinding). Browsers send the name by which a server was addressed as
-``Host``, and the site that sends a request as ``Origin``; a page cannot forge either. So a request
-is answered only if it was addressed to a name of this viewer, by a page of this viewer.
-"""
+"""viser's web server behind the viewer's access policy and message validation."""
 
 from __future__ import annotations
 

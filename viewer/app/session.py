@@ -1,4 +1,4 @@
-"""Read the URL, the theme and the width of the window from a browser that connects."""
+"""A session: a page in a browser, its URL, and the threads that work for it."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ No other module of the viewer uses a private name of viser. ``pyproject.toml`` r
 - ``RunJavascriptMessage``: viser has no public way to read or change a browser's URL.
 - Callbacks of the camera: viser can add them, but not remove them.
 - Message classes and handlers: viser applies what browsers send without validating it, so
-  ``messages`` has to see it first. Public callbacks run only after the value has been applied.
+  ``app.server`` has to see it first. Public callbacks run only after the value has been applied.
 - Identities of controls: a page has to know which element of the browser is a control, to mark a
   slider and to notice the pointer over it; viser has no event for that.
 - Share links: a browser may ask viser to publish the page on the internet through another server,

@@ -1,4 +1,4 @@
-"""Write a composed robot to a bundle below ``robots/``, or send it to the browser as a zip."""
+"""The tab of the compose page that evolves a robot of a grammar: mutants, children, undo."""
 
 from __future__ import annotations
 

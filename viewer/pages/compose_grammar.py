@@ -1,4 +1,4 @@
-"""A grammar around one robot: distributions about its parameters, and other parts for its own."""
+"""The tab of the compose page on which a grammar is edited and robots are sampled from it."""
 
 from __future__ import annotations
 

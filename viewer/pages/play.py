@@ -1,4 +1,4 @@
-"""Curves of an episode under the playback controls: distance and score of every robot over time."""
+"""The page of a rollout: robots at a task, simulated now or played back from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of a population's page in its address, and the cards of its robots."""
+"""The page of a population: many robots on one ground, arranged, moved and selected together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The controls of the workspace on the robot page: the position of the slice, and the legend."""
+"""The robot of a page in one browser: its state, its configuration, and its address."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The workspace of a tool: its outer shell, and a slice through it."""
+"""Drawings over a robot: axes, centres of mass, names, findings, workspace and tool trail."""
 
 from __future__ import annotations
 

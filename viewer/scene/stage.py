@@ -1,4 +1,4 @@
-"""Surfaces and colours of shapes, as the browser gets them."""
+"""The stage on which robots stand: light, background, ground, a scale bar, and the camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Compile MJCF documents from untrusted sources by MuJoCo."""
+"""Mesh files for shapes of an MJCF that have none: vertices in the document, and ellipsoids.
+
+The files are kept in the user's cache under a hash of their content, because a robot names its
+meshes by their files.
+"""
 
 from __future__ import annotations
 

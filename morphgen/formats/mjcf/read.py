@@ -744,7 +744,7 @@ def read_mjcf(
     a body. A link's frame is its body's; if the body's last hinge has a ``pos``, the frame is there
     instead, as URDF requires. A joint's position is MuJoCo's, also with a ``ref``.
 
-    Meshes without a file and ellipsoids get one in the user's cache; see ``mjcf_meshes``.
+    Meshes without a file and ellipsoids get one in the user's cache; see ``mjcf.compile``.
 
     ``robot_bodies`` says which bodies are the robot, ``body_shapes`` which geoms are visual and
     collision shapes, ``read_couplings`` what becomes a mimic joint, ``read_efforts`` how joints get
