@@ -116,7 +116,7 @@ def test_resume_rejects_checkpoints_of_other_runs_and_changes_nothing():
         resume_learner(made, state_of(learner(agent="me-tf")))
     wider = state_of(learner())
     wider["layout"]["links"] = 30
-    for take in (resume, load_networks):
+    for take in (resume_learner, load_networks):
         with pytest.raises(TaskError, match="the checkpoint is for other observations: links 30, "):
             take(made, wider)
     assert equal(before, weights(made))
