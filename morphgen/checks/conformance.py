@@ -208,6 +208,12 @@ def compare_file(
 
 
 def _configurations(robot: Robot, samples: int, seed: int) -> Array:
+    # A file as it is may have limits in the wrong order.
+    joints = tuple(
+        replace(joint, limits=(min(joint.limits), max(joint.limits))) if joint.limits else joint
+        for joint in robot.joints
+    )
+    robot = replace(robot, joints=joints)
     q = random_configurations(robot, samples, np.random.default_rng(seed))
     return np.clip(q, -MAX_POSITION, MAX_POSITION)
 

@@ -427,3 +427,14 @@ def test_a_xacro_is_expanded_for_the_loaders(tmp_path):
     text = path.read_text().replace('value="2"', 'value="${1 + 1}"')
     path.write_text(text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/xacro" ', 1))
     assert file_rows(path)["mujoco (urdf)"].passed
+
+
+def test_limits_in_the_wrong_order_are_compared(tmp_path):
+    file = tmp_path / "slide.urdf"
+    file.write_text(
+        '<robot name="slide"><link name="a"/><link name="b"/><joint name="j" type="prismatic">'
+        '<parent link="a"/><child link="b"/><limit lower="1" upper="-1" effort="1" velocity="1"/>'
+        "</joint></robot>"
+    )
+    (row,) = [row for row in compare_file(file, default_finder()) if row.loader == "yourdfpy"]
+    assert (row.passed, row.message) == (True, "")
