@@ -123,10 +123,19 @@ def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
             write_bundle(robot, bundle, picture=False)
             return hold(robot, bundle)
 
-    return tuple(
-        with_causes(hold(robot, folder), robot, partial(in_new_bundle, hold))
-        for hold in (_hold_mjcf, _hold_urdf)
-    )
+    rows = []
+    for hold in (_hold_mjcf, _hold_urdf):
+        row, hold_anew = hold(robot, folder), partial(in_new_bundle, hold)
+        # A robot that passes with new files has its fault in the old ones.
+        if _is_unknown(row) and hold_anew(robot).passed is False:
+            row = with_causes(row, robot, hold_anew)
+        rows.append(row)
+    return tuple(rows)
+
+
+def _is_unknown(row: HoldRow) -> bool:
+    """Return whether a robot fails without a known cause."""
+    return row.passed is False and not row.causes
 
 
 def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) -> HoldRow:
@@ -140,8 +149,8 @@ def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) ->
         robot: The robot.
         hold: Returns the row of a robot in the same simulator.
     """
-    if row.passed is not False or row.causes or hold(robot).passed is not False:
-        return row  # if the robot passes, the fault is in the files
+    if not _is_unknown(row):
+        return row
     causes: list[str] = []
     for cause, change in CHANGES.items():
         changed = replace(robot, joints=tuple(change(joint) for joint in robot.joints))
@@ -162,7 +171,7 @@ def _hold_urdf(robot: Robot, folder: Path) -> HoldRow:
         return hold_row("pybullet (urdf)", "pybullet", robot, urdf, None)
 
     row = hold(SOLVER_ITERATIONS)
-    if row.passed is not False or row.causes:
+    if not _is_unknown(row):
         return row
     more, causes = hold(MORE_ITERATIONS), []
     if more.passed or (row.step_error is None and more.step_error is not None):

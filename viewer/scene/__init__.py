@@ -1,1 +1,1 @@
-"""What the viewer draws in three dimensions."""
+"""Drawings in the three-dimensional scene of the viewer."""

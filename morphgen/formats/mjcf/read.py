@@ -425,7 +425,7 @@ _WRAPPED_GEOMS = (_WRAP.mjWRAP_SPHERE, _WRAP.mjWRAP_CYLINDER)
 
 @dataclass(frozen=True)
 class Couplings:
-    """What equality constraints require of joints, by the index of the joint."""
+    """Requirements of equality constraints on joints, by the index of the joint."""
 
     mimics: dict[int, tuple[int, float, float]] = field(default_factory=dict)
     """Leader, multiplier and offset [rad or m] of each coupled joint."""

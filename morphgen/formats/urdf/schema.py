@@ -1,4 +1,4 @@
-"""What a URDF may contain: elements, attributes and the tree of its links."""
+"""Rules of URDF: its elements and attributes, and the tree of its links."""
 
 from __future__ import annotations
 
