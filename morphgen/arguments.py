@@ -37,16 +37,7 @@ def checked_signature(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:
-    """Return the path that a text or another path names.
-
-    Args:
-        name: Name of the argument, for the message.
-        value: Its value.
-        error: Class of the error.
-
-    Raises:
-        MorphgenError: Of that class, if it is something else, or no path can have this name.
-    """
+    """Return the path that a text or another path names."""
     if isinstance(value, str | PathLike):
         path = Path(value)
         if "\0" not in str(path):
@@ -55,16 +46,7 @@ def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:
 
 
 def text_argument(name: str, value: object, error: type[MorphgenError]) -> str:
-    """Return a text.
-
-    Args:
-        name: Name of the argument, for the message.
-        value: Its value.
-        error: Class of the error.
-
-    Raises:
-        MorphgenError: Of that class, if it is something else.
-    """
+    """Return a text."""
     if isinstance(value, str):
         return value
     raise error(f"{name} {value!r}: expected a text")
@@ -73,17 +55,7 @@ def text_argument(name: str, value: object, error: type[MorphgenError]) -> str:
 def whole_number(
     name: str, value: object, error: type[MorphgenError], least: int | None = None
 ) -> int:
-    """Return a whole number, such as one of NumPy's, as an ``int``.
-
-    Args:
-        name: Name of the argument, for the message.
-        value: Its value.
-        error: Class of the error.
-        least: Smallest valid value.
-
-    Raises:
-        MorphgenError: Of that class, if it is no whole number, or smaller.
-    """
+    """Return a whole number, such as one of NumPy's, as an ``int``."""
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not is_whole or (least is not None and int(value) < least):  # type: ignore[call-overload]
         valid = "a whole number" if least is None else f"a whole number, {least} or more"
@@ -92,16 +64,7 @@ def whole_number(
 
 
 def truth(name: str, value: object, error: type[MorphgenError]) -> bool:
-    """Return a ``bool``, also for one of NumPy's.
-
-    Args:
-        name: Name of the argument, for the message.
-        value: Its value.
-        error: Class of the error.
-
-    Raises:
-        MorphgenError: Of that class, if it is anything else, such as the text ``no``.
-    """
+    """Return a ``bool``, also for one of NumPy's."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise error(f"{name} {value!r}: expected True or False")

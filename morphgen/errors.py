@@ -75,10 +75,6 @@ def one_line(text: str) -> str:
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a hint for an unknown name: the closest valid one and the list, if not too long.
 
-    Args:
-        name: The unknown name.
-        valid: All valid names.
-
     Returns:
         Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
     """

@@ -24,12 +24,7 @@ first."""
 
 
 def missing_extra(error: Exception, wanted: str = "") -> str | None:
-    """Return how to install the optional package that an import lacks; None for other errors.
-
-    Args:
-        error: The error of the import.
-        wanted: The extra to name if it installs the package; else the smallest that does is named.
-    """
+    """Return how to install the optional package that an import lacks; None for other errors."""
     if not (isinstance(error, ModuleNotFoundError) and error.name in EXTRAS):
         return None
     extras = EXTRAS[error.name]
@@ -41,12 +36,7 @@ def missing_extra(error: Exception, wanted: str = "") -> str | None:
 
 @contextmanager
 def explain_missing_extras() -> Iterator[None]:
-    """Convert the failed import of an optional package to an error that says how to install it.
-
-    Raises:
-        MissingDependencyError: If the block or the decorated function imports an optional package
-            that is not installed.
-    """
+    """Convert the failed import of an optional package to an error that says how to install it."""
     try:
         yield
     except ModuleNotFoundError as error:

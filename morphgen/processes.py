@@ -53,18 +53,7 @@ def parallel_map(
     progress: Progress = no_progress,
     chunk: int = CHUNK_SIZE,
 ) -> Iterator[R]:
-    """Return an iterator over ``work(item)`` for every item, in the order of the items.
-
-    Args:
-        work: A function that can be pickled; each process receives it once.
-        items: Its arguments.
-        jobs: Largest number of processes.
-        progress: Called after each result.
-        chunk: Items that a process handles before it reports; use fewer for slow work.
-
-    Raises:
-        MorphgenError: If ``jobs`` is below 1 or a process died. Errors of ``work`` are passed on.
-    """
+    """Return an iterator over ``work(item)`` for every item, in the order of the items."""
     jobs = whole_number("jobs", jobs, MorphgenError, 1)
     chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
@@ -148,11 +137,7 @@ def init_worker(stopped: c_byte) -> None:
 
 
 def call_in_worker(work: Callable[..., R], *arguments: object) -> R:
-    """Call a function in a worker process.
-
-    Raises:
-        CancelledError: If the parent has stopped, or stops before the call has ended.
-    """
+    """Call a function in a worker process."""
     try:
         with _working() as is_needed:
             if is_needed():
@@ -234,11 +219,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def require_ray() -> ModuleType:
-    """Import and return the package ray.
-
-    Raises:
-        MissingDependencyError: If it is not installed.
-    """
+    """Import and return the package ray."""
     try:
         import ray
     except ImportError as error:
@@ -251,11 +232,7 @@ def require_ray() -> ModuleType:
 
 @contextmanager
 def ray_cluster(address: str | None) -> Iterator[None]:
-    """Connect to the Ray cluster at an address, by default to a local one, in this block.
-
-    Raises:
-        MorphgenError: If the cluster cannot be reached.
-    """
+    """Connect to the Ray cluster at an address, by default to a local one, in this block."""
     ray = require_ray()
     was_connected = ray.is_initialized()
     host, _, port = (address or "").rpartition(":")

@@ -44,11 +44,7 @@ class PolicyConfig:
     """Sizes of the agent's networks; by default those of the agent's module."""
 
     def __post_init__(self) -> None:
-        """Check, and fill in the sizes of the networks.
-
-        Raises:
-            TaskError: If the agent is unknown, or the sizes are those of another agent.
-        """
+        """Check, and fill in the sizes of the networks."""
         config = AGENTS[self.agent].config
         observation_config(self.observe)  # raises if a channel is unknown
         if self.fixed_std and self.discrete:
@@ -88,17 +84,7 @@ class PolicyConfig:
 def read_fields(
     data: object, kind: type, where: str, given: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return stored values of a dataclass's fields, converted to the types that these declare.
-
-    Args:
-        data: Plain data of JSON or of a checkpoint.
-        kind: The dataclass.
-        where: Place of the data, for messages.
-        given: Fields that are read elsewhere.
-
-    Raises:
-        TaskError: If a field is unknown or missing, or its value of another type.
-    """
+    """Return stored values of a dataclass's fields, converted to the types that these declare."""
     if not isinstance(data, Mapping):
         raise TaskError(f"{where}: invalid value {shown(data)}; expected keys and values")
     hints, values = get_type_hints(kind), {}
@@ -124,15 +110,7 @@ def shown(value: object) -> str:
 
 
 def policy_from(stored: object, where: str = "policy") -> PolicyConfig:
-    """Return the policy config that ``dataclasses.asdict`` made a dictionary of.
-
-    Args:
-        stored: The dictionary.
-        where: Its place, for messages.
-
-    Raises:
-        TaskError: If the agent is unknown, or an entry is unknown, of another type or out of range.
-    """
+    """Return the policy config that ``dataclasses.asdict`` made a dictionary of."""
     data = dict(stored) if isinstance(stored, Mapping) else stored
     sizes = data.pop("network", None) if isinstance(data, dict) else None
     values = read_fields(data, PolicyConfig, where)
@@ -205,11 +183,7 @@ class PPOConfig:
     """Run networks and losses by ``torch.compile``; on a GPU as CUDA graphs."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            TaskError: If a number is out of its range.
-        """
+        """Check the numbers."""
         for name in ("total_timesteps", "num_steps", "epochs", "minibatches"):
             if getattr(self, name) < 1:
                 raise TaskError(f"{name} {getattr(self, name)}: expected 1 or more")
@@ -230,11 +204,7 @@ class PPOConfig:
         return -(-self.total_timesteps // (self.num_steps * num_envs))
 
     def minibatch_size(self, num_envs: int) -> int:
-        """Return the transitions per minibatch.
-
-        Raises:
-            TaskError: If the minibatches would differ in size.
-        """
+        """Return the transitions per minibatch."""
         size, rest = divmod(self.num_steps * num_envs, self.minibatches)
         if rest or not size:
             raise TaskError(

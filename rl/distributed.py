@@ -97,15 +97,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def share(self, count: int, what: str) -> range:
-        """Return the part of ``count`` things that belongs to this process.
-
-        Args:
-            count: Number of things of all processes.
-            what: Their name in the message.
-
-        Raises:
-            TaskError: If they cannot be divided equally.
-        """
+        """Return the part of ``count`` things that belongs to this process."""
         if count % self.size:
             raise TaskError(f"{what} {count}: expected a multiple of the {self.size} processes")
         part = count // self.size
@@ -162,14 +154,8 @@ ALONE = ProcessGroup()
 def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
     """Join the processes that ``torchrun`` started, and leave them at the end.
 
-    Args:
-        device: Device of the run, such as ``cuda``.
-
     Yields:
         The group, and the device of this process: ``cuda:1`` for the second one on a machine.
-
-    Raises:
-        TaskError: If there are more processes than GPUs, or a device has a number.
     """
     size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     if size == 1:
@@ -195,12 +181,7 @@ def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
 
 
 def merged_metrics(metrics: Sequence[Metrics]) -> Metrics:
-    """Return the metrics of a rollout from those of the processes, which have equal sizes.
-
-    Args:
-        metrics: Of each process; ``robot_sums`` and ``robot_envs`` become ``scores``, the mean
-            score of each robot, nan for one without an environment.
-    """
+    """Return the metrics of a rollout from those of the processes, which have equal sizes."""
     sums = np.sum([each["robot_sums"] for each in metrics], axis=0)
     envs = np.sum([each["robot_envs"] for each in metrics], axis=0)
     with np.errstate(invalid="ignore"):

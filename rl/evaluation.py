@@ -75,11 +75,7 @@ class EvalConfig:
         return data | GoalConfig(tasks=self.tasks).as_data()
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            TaskError: If the number of episodes or the seed is out of its range.
-        """
+        """Check the numbers."""
         if self.episodes < 1 or not 0 <= self.seed < 2**63:
             raise TaskError(
                 f"{self.episodes} episodes, seed {self.seed}: expected at least one episode, and a "
@@ -88,15 +84,7 @@ class EvalConfig:
 
 
 def episodes_for(steps: int, longest: int) -> int:
-    """Return the number of episodes of full length that contain a number of control steps.
-
-    Args:
-        steps: Number of control steps.
-        longest: Length of a full episode [control steps].
-
-    Raises:
-        TaskError: If ``steps`` is below 1.
-    """
+    """Return the number of episodes of full length that contain a number of control steps."""
     if steps < 1:
         raise TaskError(f"--steps {steps}: expected 1 or more")
     return -(-steps // longest)
@@ -112,20 +100,7 @@ def evaluate_run(
     progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
-    """Evaluate a run on the robots of a side of its split, or on its one robot.
-
-    Args:
-        path: A checkpoint, or a run's folder.
-        side: Side of the split.
-        config: Configuration of the evaluation.
-        mode: Whether policies act by the mean of their actions, or sample them.
-        device: Device of the networks.
-        progress: Callback for the progress; for agents of single robots it starts again per robot.
-        record: Callback for the episodes of every robot.
-
-    Raises:
-        TaskError: If there is no checkpoint, or no such side.
-    """
+    """Evaluate a run on the robots of a side of its split, or on its one robot."""
     files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
     return evaluate_checkpoints(
@@ -148,11 +123,6 @@ def evaluate_checkpoints(
     Policies of single robots (``se``) are evaluated on their own robot each if ``source`` has the
     robots that they were trained on. On other robots all of them are evaluated, and the scores are
     means over the episodes of all policies.
-
-    Raises:
-        TaskError: If a file is not a checkpoint, or its observations or actions differ from
-            those of the first.
-        MorphgenError: If a robot or simulator cannot be built.
     """
     trained = [read_checkpoint(path) for path in paths]
     sources = [run.source for run, _ in trained]
@@ -167,16 +137,7 @@ def evaluate_checkpoints(
 
 
 def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: str) -> None:
-    """Require that a policy was trained on all tasks of robots.
-
-    Args:
-        run: Config of its training.
-        sources: The robots.
-        name: Name of the policy, for the message.
-
-    Raises:
-        TaskError: If it was not.
-    """
+    """Require that a policy was trained on all tasks of robots."""
     trained = tasks_of(run.source)
     for task in (task for source in sources for task in tasks_of(source)):
         if task not in trained:
@@ -184,11 +145,7 @@ def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: 
 
 
 def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:
-    """Require that all policies take the same observations and actions.
-
-    Raises:
-        TaskError: If one does not; the message lists the differences.
-    """
+    """Require that all policies take the same observations and actions."""
     interfaces = [asdict(run.interface) for run in runs]
     first, *others = [{**entries.pop("channels"), **entries} for entries in interfaces]
     for path, other in zip(paths[1:], others, strict=True):
@@ -236,11 +193,7 @@ def evaluate_baseline(
     progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
-    """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out.
-
-    Raises:
-        TaskError: If the baseline is unknown, or can do none of the robots' tasks.
-    """
+    """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out."""
     baseline = BASELINES[name]
     make = partial(baseline.make, config.seed)
     return evaluate(
@@ -267,19 +220,6 @@ def evaluate(
     """Return the scores of the robots of a source, in order.
 
     Scores may be relative to the random policy; its episodes have the same starts and goals.
-
-    Args:
-        controllers: Controllers; each runs all episodes, and a score is the mean over all of them.
-        source: The robots.
-        config: Configuration of the evaluation.
-        interface: Actions and observations of the controllers.
-        tasks: Tasks to evaluate; robots with other tasks are left out. None for all tasks.
-        progress: Callback for the progress of the controllers, without the random policy.
-        record: Callback for the episodes of every robot.
-
-    Raises:
-        TaskError: If no robot has one of the tasks.
-        MorphgenError: If a robot or simulator cannot be built.
     """
     tasks = None if tasks is None else tuple(tasks)
     specs = _specs(source, config, tasks)

@@ -161,11 +161,7 @@ class Layout:
 
 
 def layout_of(observation: Observation) -> Layout:
-    """Return the layout of an observation.
-
-    Raises:
-        TaskError: If an entry is no field of a registered task, or has another size than declared.
-    """
+    """Return the layout of an observation."""
     return Layout(
         links=observation["tokens"].shape[1],
         token=observation["tokens"].shape[2],
@@ -216,16 +212,7 @@ def layout_from(stored: Mapping[str, Any]) -> Layout:
 
 
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:
-    """Require that weights fit observations.
-
-    Args:
-        stored: Layout that the weights were made for.
-        observed: Layout of the observations.
-        what: Origin of the weights, for the message.
-
-    Raises:
-        TaskError: If the layouts differ; the message lists the differences.
-    """
+    """Require that weights fit observations."""
     theirs, ours = asdict(stored), asdict(observed)
     wrong = [
         f"{name} {theirs[name]}, here {ours[name]}" for name in ours if theirs[name] != ours[name]
@@ -250,11 +237,7 @@ def truncate_links(observation: Observation, rows: int) -> Observation:
 
 
 def absent_entries(tasks: Collection[str]) -> frozenset[str]:
-    """Return the standard entries of observations, and their masks, that no task fills.
-
-    Args:
-        tasks: Names of tasks.
-    """
+    """Return the standard entries of observations, and their masks, that no task fills."""
     filled = {field for task in tasks for field in TASKS[task].fields}
     present = {name for field in filled for name in (field.name, field.mask)}
     standard = {name for field in STANDARD_FIELDS for name in (field.name, field.mask)}

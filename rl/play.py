@@ -46,16 +46,7 @@ class ControllerSpec:
 
 
 def read_controller(name: str, task: str) -> ControllerSpec:
-    """Return the controller of a name; ``make_env_and_controller`` makes it.
-
-    Args:
-        name: Name of a baseline or a shipped policy; or the path of a checkpoint or of a run's
-            folder, whose policy acts by the mean of its actions.
-        task: Name of the task.
-
-    Raises:
-        TaskError: If it is unknown, or for another task; or if the file is not a checkpoint.
-    """
+    """Return the controller of a name; ``make_env_and_controller`` makes it."""
     valid = policies_for(task)
     if name not in valid and (tasks := tasks_of(name)):
         raise TaskError(
@@ -83,17 +74,6 @@ def make_env_and_controller(
     """Make an environment that suits a controller, and the controller.
 
     Unless ``config`` is given, the task has the constants that the controller is evaluated with.
-
-    Args:
-        spec: The controller.
-        robot: The robot, as ``TaskEnv`` accepts it.
-        seed: Seed of the controller's random numbers.
-        kind: Kind of actions; by default that of the checkpoint, else continuous.
-        **options: Further arguments of ``TaskEnv``.
-
-    Raises:
-        TaskError: If the checkpoint is for other observations or actions.
-        MorphgenError: As ``TaskEnv``.
     """
     interface, policy = spec.interface, None
     if spec.learner is not None:
@@ -130,20 +110,8 @@ def play(
 ) -> Iterator[Frame]:
     """Run episodes, and yield their frames if the environment renders.
 
-    Args:
-        env: The environment, not wrapped.
-        controller: The controller.
-        episodes: Number of episodes.
-        seed: Seed of the episodes.
-        report: Called with the result of each episode.
-        max_successes: Control steps with success in a row after which an episode ends early; None
-            to run it to its end.
-
     Yields:
         Frames, ``FPS`` per second of simulated time, with the first and last frame of each episode.
-
-    Raises:
-        SimulationError: If the simulator fails.
     """
     links = list(env.action_links)
     for number in range(episodes):

@@ -69,10 +69,6 @@ class RunningNormalizer(nn.Module):
 
         Chan, Golub and LeVeque, Algorithms for computing the sample variance, 1983: means and
         variances of two sets are merged without their elements.
-
-        Args:
-            observation: Observations of this process.
-            processes: Processes whose observations are all included.
         """
         if not self.vectors:
             return
@@ -151,11 +147,7 @@ class Critic(nn.Module):
 
 
 def make_networks(config: PolicyConfig, layout: Layout, seed: int) -> tuple[Actor, Critic]:
-    """Build an actor and a critic on the CPU; the same seed gives the same weights.
-
-    Raises:
-        TaskError: If the config asks for other observation channels than the layout has.
-    """
+    """Build an actor and a critic on the CPU; the same seed gives the same weights."""
     if config.tool_position != layout.tool:
         shown = "show" if layout.tool else "do not show"
         raise TaskError(f"tool_position {config.tool_position}: the environments {shown} it")

@@ -54,15 +54,6 @@ def gae(
     After a termination the return is zero. After a truncation it is the value of the episode's last
     observation (Pardo et al. 2018), and the sum stops there. The critic learns advantages plus
     values. All tensors have the shape (T, n).
-
-    Args:
-        rewards: Rewards of T control steps in n environments.
-        values: Values of the observations that were acted upon.
-        next_values: Values of the observations that the actions led to, before any new episode.
-        terminated: Where the task ended the episode, bool.
-        truncated: Where the time limit ended the episode, bool.
-        gamma: Discount factor.
-        gae_lambda: Weight of longer estimates.
     """
     delta = rewards + gamma * torch.where(terminated, 0.0, next_values) - values
     carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
@@ -79,9 +70,8 @@ def normalized_advantages(
 ) -> torch.Tensor:
     """Return advantages with mean 0 and standard deviation 1, over all or robot by robot.
 
-    Args:
-        advantages: Advantages, shape (T, n).
-        robots: Robot of each advantage, shape (T, n), int64; None to normalize over all of them.
+    advantages: Advantages, shape (T, n).
+    robots: Robot of each advantage, shape (T, n), int64; None to normalize over all of them.
     """
     if robots is None:
         return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -137,10 +127,7 @@ FINETUNING_ACTOR_LR_SCALE = 0.1
 def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
     """Return the factor on the actor's learning rate in the next update.
 
-    Args:
-        config: The algorithm; without a ``desired_kl`` the factor is 1.
-        scale: Factor in the last update.
-        kl: Mean divergence of the last update's gradient steps [nats].
+    kl: Mean divergence of the last update's gradient steps [nats].
     """
     if not config.desired_kl:
         return 1.0
@@ -163,9 +150,8 @@ class FinalObservations:
     def add(self, observation: Observation, truncated: torch.Tensor) -> None:
         """Add a step.
 
-        Args:
-            observation: Observation after the action, tensors (n, ...), which are copied.
-            truncated: Whether the episode was truncated, shape (n,), bool.
+        observation: Observation after the action, tensors (n, ...), which are copied.
+        truncated: Whether the episode was truncated, shape (n,), bool.
         """
         reads = is_host(truncated.device)
         self._observations.append(
@@ -202,12 +188,6 @@ def prepared(
     On a GPU the compiled function is a CUDA graph: a gradient step of a small network is hundreds
     of kernels, and to launch them one by one takes longer than they run. The next call of any graph
     overwrites what a graph returned; copy results that you keep.
-
-    Args:
-        function: A network, or a function that calls networks.
-        device: Device of the function's tensors.
-        bf16: Compute matrix products in bfloat16, by autocast.
-        compiled: Compile the function by ``torch.compile``.
     """
     graphs = compiled and device.type == "cuda"
     inner = _compiled(function, graphs) if compiled else function
@@ -264,21 +244,7 @@ class Learner:
         tasks: Collection[str] = (),
         processes: ProcessGroup = ALONE,
     ) -> None:
-        """Build networks, optimiser and buffers, and begin episodes in the batch.
-
-        Args:
-            batch: Environments; their actions are of the policy's kind.
-            policy: Agent and networks.
-            config: Hyperparameters.
-            seed: Seed of weights, actions, minibatches and random weights of robots.
-            device: Device of networks and rollouts; the batch may be on another.
-            least_links: Links of the largest robot of later batches; see ``use_batch``.
-            tasks: Tasks of later batches.
-            processes: Processes that train together; each has its own environments.
-
-        Raises:
-            TaskError: If the batch takes other actions, or minibatches would differ in size.
-        """
+        """Build networks, optimiser and buffers, and begin episodes in the batch."""
         if batch.action_kind != policy.kind:
             raise TaskError(
                 f"the policy's actions are {policy.kind}, the batch's {batch.action_kind}"
@@ -341,12 +307,7 @@ class Learner:
         return self.update >= self.num_updates
 
     def iterate(self) -> UpdateMetrics:
-        """Collect a rollout and learn from it.
-
-        Raises:
-            TaskError: If a metric is not finite.
-            SimulationError: If the simulator fails.
-        """
+        """Collect a rollout and learn from it."""
         started = time.perf_counter()
         rollout_metrics = self._collect_rollout()
         collected = time.perf_counter()
@@ -442,8 +403,7 @@ class Learner:
         Of each robot they are the sum of its environments' mean scores, and their number: see
         ``merged_metrics``.
 
-        Args:
-            terms: Mean of each reward term, shape ().
+        terms: Mean of each reward term, shape ().
         """
         ended = self.terminated | self.truncated
         num_ended = ended.sum()
@@ -561,10 +521,9 @@ class Learner:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the loss of a minibatch, shape (), and its ``LOSS_METRICS``, shape (5,).
 
-        Args:
-            observations: Observations, tensors (m, ...).
-            minibatch: Actions, log-probabilities, advantages, returns and robots, tensors (m, ...).
-            robot_weights: Weight of each robot's transitions, shape (R,).
+        observations: Observations, tensors (m, ...).
+        minibatch: Actions, log-probabilities, advantages, returns and robots, tensors (m, ...).
+        robot_weights: Weight of each robot's transitions, shape (R,).
         """
         head = self.actor.distribution(observations)
         log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]

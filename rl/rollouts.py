@@ -64,18 +64,8 @@ def run_episodes(
 ) -> list[Episode]:
     """Return the first episodes of every environment, the same number of each.
 
-    Args:
-        batch: Environments; they are reset first.
-        controller: The controller.
-        count: Episodes per environment.
-        progress: Called with the number of episodes done, where running ones count as fractions:
-            after every step, or every ``STEPS_UNREAD`` steps on a GPU.
-
     Returns:
         Episodes, ordered by environment and then by time.
-
-    Raises:
-        SimulationError: If the simulator fails.
     """
     batch.reset()
     n = batch.num_envs

@@ -63,16 +63,7 @@ _ZERO_SHOT = {
 
 
 def zero_shot_policy(task: str, goal: str, *, obstacles: bool) -> ShippedPolicy:
-    """Return the shipped policy that does a task with any robot.
-
-    Args:
-        task: Name of the task.
-        goal: Goal of reach, ``position`` or ``pose``; ``position`` for other tasks.
-        obstacles: Whether the robot is among obstacles.
-
-    Raises:
-        TaskError: If none comes with morphgen.
-    """
+    """Return the shipped policy that does a task with any robot."""
     try:
         return _ZERO_SHOT[task, goal, obstacles]
     except KeyError as error:

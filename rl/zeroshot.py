@@ -50,16 +50,6 @@ def zero_shot(
     """Run a policy on a robot, and the controllers that do not learn.
 
     All of them have the same starts and goals.
-
-    Args:
-        source: One robot and its task.
-        policy: Checkpoint of the policy, or folder of its run.
-        config: Episodes, simulator, seed, and the constants of the task.
-        progress: Callback for the progress.
-
-    Raises:
-        TaskError: If the checkpoint is invalid or was trained on other tasks.
-        MorphgenError: If the robot or simulator cannot be built.
     """
     task, name = str(source.task), name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)

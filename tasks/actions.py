@@ -26,18 +26,10 @@ def decode_actions(
 ) -> torch.Tensor:
     """Return actions as fractions of the largest joint steps, in [-1, 1], shape (n, L).
 
-    Args:
-        actions: Continuous: numbers, clipped to [-1, 1]. Discrete: indices into ``BINS``.
-        kind: Kind of the actions.
-        shape: Expected shape, (n, L).
-        device: Device of the result.
+    shape: Expected shape, (n, L).
 
     On a GPU, which is not read here, actions that are not finite or out of range become nan: their
     environments diverge.
-
-    Raises:
-        TaskError: If the shape or the type differs or, on the CPU, a number is not finite or an
-            index is out of range.
     """
     if tuple(actions.shape) != shape:
         raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {shape}")
@@ -86,10 +78,8 @@ class JointTargets:
     ) -> None:
         """Gather the tables of every environment.
 
-        Args:
-            tables: The robots.
-            env_robot_index: Robot of each environment, shape (n,), int64.
-            action_mask: Links whose joint obeys actions, shape (n, L), bool.
+        env_robot_index: Robot of each environment, shape (n,), int64.
+        action_mask: Links whose joint obeys actions, shape (n, L), bool.
         """
         self._link = tables.link_of_joint[env_robot_index]
         self._max_step = tables.max_step[env_robot_index] * torch.gather(action_mask, 1, self._link)
@@ -100,9 +90,8 @@ class JointTargets:
 
         They start from the previous targets, not from the measured positions.
 
-        Args:
-            targets: Previous targets of the independent joints, shape (n, J) [rad or m].
-            normalized: Normalized actions, shape (n, L).
+        targets: Previous targets of the independent joints, shape (n, J) [rad or m].
+        normalized: Normalized actions, shape (n, L).
         """
         change = torch.gather(normalized, 1, self._link) * self._max_step
         return torch.clamp(targets + change, self._lower, self._upper)

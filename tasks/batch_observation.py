@@ -44,13 +44,7 @@ class PointClouds:
     """
 
     def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
-        """Prepare; ``begin`` draws the points.
-
-        Args:
-            scenes: Scene of each environment.
-            num_points: Number of points of each environment, P.
-            device: Device of the tensors.
-        """
+        """Prepare; ``begin`` draws the points."""
         n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
         self._num_points = num_points
         self._local = torch.zeros(n, num_points, 3, device=device)
@@ -75,10 +69,8 @@ class PointClouds:
     ) -> None:
         """Draw the points of new episodes.
 
-        Args:
-            mask: Environments whose episodes begin, shape (n,), bool.
-            random: Random numbers of the episodes.
-            obstacle_poses: Poses of the obstacles in the world, shape (n, O, 7).
+        mask: Environments whose episodes begin, shape (n,), bool.
+        obstacle_poses: Poses of the obstacles in the world, shape (n, O, 7).
         """
         n, P = self._on_block.shape
         numbers = random.uniform(Stream.POINTS, P * _NUMBERS).view(n, P, _NUMBERS)
@@ -101,8 +93,7 @@ class PointClouds:
     def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
         """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes.
 
-        Args:
-            block_pose: Poses of the blocks, shape (n, 7).
+        block_pose: Poses of the blocks, shape (n, 7).
         """
         R = matrix_from_quaternion(block_pose[:, 3:])
         moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
@@ -132,9 +123,7 @@ class StraightPaths:
     def __init__(self, layouts: EpisodeLayouts, env_robot_index: torch.Tensor) -> None:
         """Prepare tests in all environments; a robot's scene is compiled when it is first used.
 
-        Args:
-            layouts: Scenes of the environments.
-            env_robot_index: Robot of each environment, shape (n,), int64.
+        env_robot_index: Robot of each environment, shape (n,), int64.
         """
         self._layouts, self._robots = layouts, env_robot_index.tolist()
         self._spaces: dict[int, FreeSpace] = {}
@@ -142,10 +131,8 @@ class StraightPaths:
     def __call__(self, env: int, start: Array, ends: Array) -> int | None:
         """Return the index of the first end with a free path, or None.
 
-        Args:
-            env: The environment.
-            start: Configuration, shape (J,) [rad or m], with padding.
-            ends: Configurations in the order of preference, shape (k, J).
+        start: Configuration, shape (J,) [rad or m], with padding.
+        ends: Configurations in the order of preference, shape (k, J).
         """
         space = self.space(env)
         dof = space.scene.robot.dof
@@ -207,15 +194,8 @@ class BatchObservation:
     ) -> None:
         """Gather the tables of all environments.
 
-        Args:
-            robot_tables: The robots.
-            specs: Specification of the environments of each robot.
-            env_robot_index: Index of each environment's robot and specification, (n,), int64.
-            groups: The environments grouped by task.
-            layouts: Layouts of the obstacles in the running episodes.
-            action_mask: Links whose joint obeys actions, shape (n, L), bool.
-            config: Optional entries.
-            paths: Tests of straight paths.
+        env_robot_index: Index of each environment's robot and specification, (n,), int64.
+        action_mask: Links whose joint obeys actions, shape (n, L), bool.
         """
         self._tables, self._index, self._config = robot_tables, env_robot_index, config
         self._groups, self._layouts = groups, layouts
@@ -247,9 +227,7 @@ class BatchObservation:
     def begin(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
         """Begin episodes, whose layouts are drawn.
 
-        Args:
-            mask: Environments whose episodes begin, shape (n,), bool.
-            random: Random numbers of the episodes.
+        mask: Environments whose episodes begin, shape (n,), bool.
         """
         if self._points is not None:
             self._points.begin(mask, random, self._layouts.poses)
@@ -261,10 +239,8 @@ class BatchObservation:
     ) -> Observation:
         """Return the observation in a state, in tensors that the caller owns.
 
-        Args:
-            state: The state.
-            targets: Targets of the independent joints, shape (n, J) [rad or m].
-            previous_action: Normalized actions of the last step, shape (n, L).
+        targets: Targets of the independent joints, shape (n, J) [rad or m].
+        previous_action: Normalized actions of the last step, shape (n, L).
         """
         return {
             "tokens": self._tokens(state.q),

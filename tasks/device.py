@@ -9,11 +9,7 @@ from morphgen.tasks.registry import SIMULATORS, installed_simulators
 
 
 def require_device(name: str) -> None:
-    """Require a device that torch can use: ``cpu``, ``cuda``, or such as ``cuda:1``.
-
-    Raises:
-        TaskError: If the name is invalid, or this machine has no such device.
-    """
+    """Require a device that torch can use: ``cpu``, ``cuda``, or such as ``cuda:1``."""
     kind, _, number = name.partition(":")
     if name != "cpu" and (kind != "cuda" or not (number or "0").isdecimal()):
         raise TaskError(f"unknown device {name!r}; valid: cpu, cuda, or such as cuda:1")
@@ -30,11 +26,7 @@ def batch_device(sim: str, learner_device: str) -> str:
 
 
 def require_simulator_device(sim: str, device: str) -> None:
-    """Require a device that this machine has and on which a simulator's tensors can be.
-
-    Raises:
-        TaskError: If there is no such device, or the simulator cannot use it.
-    """
+    """Require a device that this machine has and on which a simulator's tensors can be."""
     require_device(device)
     kind, _, _ = device.partition(":")
     valid = SIMULATORS[sim].devices

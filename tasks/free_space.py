@@ -60,14 +60,8 @@ class JointPlane:
 def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
     """Find the joint planes in which a robot's free configurations form several components.
 
-    Args:
-        robot: The robot, with a tool.
-
     Returns:
         A plane for each set of joints; none for most robots.
-
-    Raises:
-        MeshError: If a collision mesh cannot be read.
     """
     checker = SelfCollisionChecker(robot, untested_pairs(robot))
     q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
@@ -88,9 +82,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
 def in_other_component(planes: Sequence[JointPlane], q: Array) -> NDArray[np.bool_]:
     """Return in which planes a free configuration is outside of the largest component.
 
-    Args:
-        planes: Joint planes of the robot.
-        q: Joint positions, shape (dof,) [rad or m].
+    q: Joint positions, shape (dof,) [rad or m].
 
     Returns:
         Shape (number of planes,).
@@ -185,15 +177,7 @@ class FreeSpace:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compile the scene into a collision checker.
-
-        Args:
-            scene: Robot with the pose of its root, ground, obstacles and block.
-
-        Raises:
-            MeshError: If a collision mesh cannot be read.
-            RobotError: If MuJoCo refuses a shape.
-        """
+        """Compile the scene into a collision checker."""
         self.scene = scene
         link_names = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
@@ -205,17 +189,12 @@ class FreeSpace:
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return which configurations are free.
 
-        Args:
-            q: Independent joint positions, shape (n, dof) [rad or m].
-            blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7); where
-                it penetrates an obstacle or the root link, no configuration is free.
+        q: Independent joint positions, shape (n, dof) [rad or m].
+        blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7); where
+            it penetrates an obstacle or the root link, no configuration is free.
 
         Returns:
             Shape (n,).
-
-        Raises:
-            ValueError: If ``q`` or ``blocks`` has another shape or is not finite, or the scene has
-                no block.
         """
         return self._checker.free(self._positions(q, blocks))
 
@@ -224,10 +203,9 @@ class FreeSpace:
 
         The path is tested at points that no joint moves more than ``RESOLUTION`` between.
 
-        Args:
-            start: Configuration, shape (dof,) [rad or m].
-            end: Configuration, shape (dof,) [rad or m].
-            block: Pose of the block, shape (7,); None to leave it out.
+        start: Configuration, shape (dof,) [rad or m].
+        end: Configuration, shape (dof,) [rad or m].
+        block: Pose of the block, shape (7,); None to leave it out.
 
         Returns:
             1 if the whole path is free, else the fraction before the last free point.
@@ -238,11 +216,7 @@ class FreeSpace:
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
     def place_obstacles(self, poses: Sequence[Pose]) -> None:
-        """Move the obstacles of the scene to other poses in the world.
-
-        Args:
-            poses: A pose for each obstacle.
-        """
+        """Move the obstacles of the scene to other poses in the world."""
         moved = zip(self.scene.obstacles, poses, strict=True)
         obstacles = tuple(replace(obstacle, pose=pose) for obstacle, pose in moved)
         self.scene = replace(self.scene, obstacles=obstacles)
@@ -252,14 +226,10 @@ class FreeSpace:
     def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
         """Return at which poses the block penetrates neither an obstacle nor the robot's base.
 
-        Args:
-            blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
+        blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
 
         Returns:
             Shape (n,).
-
-        Raises:
-            ValueError: If ``blocks`` has another shape or is not finite, or the scene has no block.
         """
         robot, poses = self.scene.robot, np.asarray(blocks, dtype=np.float64)
         fixed_names = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
@@ -275,14 +245,10 @@ class FreeSpace:
     def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Return which obstacles the robot penetrates, whatever else collides.
 
-        Args:
-            q: Independent joint positions, shape (n, dof) [rad or m].
+        q: Independent joint positions, shape (n, dof) [rad or m].
 
         Returns:
             Shape (n, number of obstacles).
-
-        Raises:
-            ValueError: If ``q`` has another shape or is not finite.
         """
         rows = [{name for pair in contacts for name in pair} for contacts in self._penetrations(q)]
         hits = [[name in row for name in self._obstacles] for row in rows]
@@ -298,17 +264,10 @@ class FreeSpace:
 
         A smaller sample is the beginning of a larger one. ``rng`` advances by whole chunks.
 
-        Args:
-            n: Number of configurations.
-            rng: Source of random numbers.
-            accept: Further condition on a free configuration, shape (dof,).
+        accept: Further condition on a free configuration, shape (dof,).
 
         Returns:
             The accepted configurations, shape (n, dof), and the number of tested ones.
-
-        Raises:
-            BenchmarkError: If ``TRIES`` times n configurations do not suffice.
-            ValueError: If the limits of a joint are not a range.
         """
         accepted: list[Array] = []
         collisions: Counter[Pair] = Counter()
@@ -397,9 +356,7 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
 def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
     """Return where the block's sphere meets a box around the robot's base or an obstacle.
 
-    Args:
-        scene: The scene, with a block.
-        blocks: Poses of the block in the world, shape (n, 7).
+    blocks: Poses of the block in the world, shape (n, 7).
 
     Returns:
         Shape (n,); False only where the block touches neither.

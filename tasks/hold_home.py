@@ -26,12 +26,7 @@ away [m]."""
 
 
 def hold_in_environment(robot: Robot, simulator: str) -> HoldRow:
-    """Hold a robot at home and step its joints in an environment without ground; see ``hold_row``.
-
-    Args:
-        robot: The robot.
-        simulator: Name of a simulator of ``SIMULATORS``, also that of its library.
-    """
+    """Hold a robot at home and step its joints in an environment; see ``hold_row``."""
     name = f"{simulator} (environment)"
     margin = BULLET_MARGIN if simulator == "pybullet" else 0.0
 

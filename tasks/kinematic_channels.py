@@ -78,10 +78,7 @@ class IkSolutions:
     ) -> None:
         """Gather the tables of every environment.
 
-        Args:
-            tables: The robots.
-            env_robot_index: Robot of each environment, shape (n,), int64.
-            first_free: Test of straight paths.
+        env_robot_index: Robot of each environment, shape (n,), int64.
         """
         index, self._first_free = env_robot_index, first_free
         self._tables, self._index = tables, index
@@ -103,18 +100,15 @@ class IkSolutions:
     def forget(self, mask: torch.Tensor) -> None:
         """Forget the solutions of environments whose episode begins.
 
-        Args:
-            mask: The environments, shape (n,), bool.
+        mask: The environments, shape (n,), bool.
         """
         self._solved_for.masked_fill_(mask[:, None], math.inf)
 
     def update(self, targets: torch.Tensor, goals: ToolTargets, metres_per_radian: float) -> None:
         """Solve where an episode has begun or the tool's target has moved.
 
-        Args:
-            targets: Targets of the independent joints, shape (n, J) [rad or m].
-            goals: Points and orientations that the tasks want the tool at.
-            metres_per_radian: Length by which errors of orientation are multiplied [m/rad].
+        targets: Targets of the independent joints, shape (n, J) [rad or m].
+        metres_per_radian: Length by which errors of orientation are multiplied [m/rad].
         """
         points = goals.points[:, 0]
         moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
@@ -271,12 +265,8 @@ class KinematicChannels:
     ) -> None:
         """Gather the tables of every environment.
 
-        Args:
-            tables: The robots.
-            env_robot_index: Robot of each environment, shape (n,), int64.
-            names: Channels to compute, of ``channels.KINEMATIC_CHANNELS``.
-            has_block: Environments with a block, shape (n,), bool.
-            first_free: Test of straight paths, for ``ik``.
+        env_robot_index: Robot of each environment, shape (n,), int64.
+        has_block: Environments with a block, shape (n,), bool.
         """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
@@ -313,11 +303,9 @@ class KinematicChannels:
     ) -> dict[str, torch.Tensor]:
         """Return the channels by name.
 
-        Args:
-            q: Positions of the independent joints, shape (n, J) [rad or m].
-            targets: Their targets, shape (n, J) [rad or m].
-            goals: Points and orientations that the tasks want the tool at.
-            block_pose: Poses of the blocks, shape (n, 7).
+        q: Positions of the independent joints, shape (n, J) [rad or m].
+        targets: Their targets, shape (n, J) [rad or m].
+        block_pose: Poses of the blocks, shape (n, 7).
         """
         index, tree = self._index, self._tree
         state = _State(
@@ -441,9 +429,8 @@ class KinematicChannels:
         They are the steps that would reduce the error by each joint alone, at the gains; the cosine
         of the angle between column and error; and the logarithm of the error's length.
 
-        Args:
-            J: Jacobians of three coordinates, shape (n, 3, J).
-            error: Errors in these coordinates, shape (n, 3).
+        J: Jacobians of three coordinates, shape (n, 3, J).
+        error: Errors in these coordinates, shape (n, 3).
         """
         along = (J * error[..., None]).sum(dim=1)
         squares = J.square().sum(dim=1)
@@ -511,8 +498,7 @@ def _rotation_error(goals: ToolTargets, T_root_tool: torch.Tensor) -> torch.Tens
 def _half_extents(geometry: torch.Tensor) -> torch.Tensor:
     """Return half the edges of the boxes around primitives, shape (..., 3) [m].
 
-    Args:
-        geometry: Columns ``GEOMETRY`` of tokens, shape (..., 6).
+    geometry: Columns ``GEOMETRY`` of tokens, shape (..., 6).
     """
     sphere, cylinder, box, a, b, c = geometry.unbind(-1)
     half = torch.stack([a, b, c * sphere + c / 2 * (cylinder + box)], dim=-1)

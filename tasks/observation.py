@@ -80,15 +80,7 @@ class ObservationConfig:
 
 
 def observation_config(names: Collection[str], *, obstacles: int = 0) -> ObservationConfig:
-    """Return the config of observations with some entries of ``CHANNELS``.
-
-    Args:
-        names: The entries; ``points`` are ``NUM_POINTS``, and ``no_state`` hides the state.
-        obstacles: Minimum number of obstacle rows.
-
-    Raises:
-        TaskError: If a name is unknown, or the state is hidden without points.
-    """
+    """Return the config of observations with some entries of ``CHANNELS``."""
     config = ObservationConfig(obstacles=obstacles)
     for name in names:
         if name not in CHANNELS:
@@ -108,9 +100,7 @@ class LinkTokens:
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
         """Gather the tables of every environment.
 
-        Args:
-            tables: The robots.
-            env_robot_index: Robot of each environment, shape (n,), int64.
+        env_robot_index: Robot of each environment, shape (n,), int64.
         """
         device = env_robot_index.device
         movable = tables.movable_links[env_robot_index]
@@ -154,13 +144,7 @@ def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
 
 
 def obstacle_tokens(scenes: Sequence[Scene], min_rows: int, device: torch.device) -> Observation:
-    """Return tokens of the obstacles in scenes, (n, O, 13), and the mask of real ones, (n, O).
-
-    Args:
-        scenes: Scene of each environment.
-        min_rows: Minimum number of rows, O.
-        device: Device of the tensors.
-    """
+    """Return tokens of the obstacles in scenes, (n, O, 13), and the mask of real ones, (n, O)."""
     num_rows = max(min_rows, *(len(scene.obstacles) for scene in scenes))
     pose, size = torch.zeros(len(scenes), num_rows, 7), torch.zeros(len(scenes), num_rows, 3)
     mask = torch.zeros(len(scenes), num_rows, dtype=torch.bool)
@@ -187,11 +171,8 @@ def tree_entries(
 ) -> Observation:
     """Return how the joints that actions move are connected, for K joints with padding.
 
-    Args:
-        tables: The robots.
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        action_mask: Links whose joint obeys actions, shape (n, L), bool.
-        least_joints: Minimum of K.
+    env_robot_index: Robot of each environment, shape (n,), int64.
+    action_mask: Links whose joint obeys actions, shape (n, L), bool.
 
     Returns:
         ``joints`` (n, K): the link of each joint, root first, -1 for padding. ``joint_parents``

@@ -127,22 +127,14 @@ class EpisodeSequence:
     seed: int | tuple[int, ...]
 
     def __init__(self, seed: int, env_number: torch.Tensor, next_episode: torch.Tensor) -> None:
-        """Set up; for the arguments see the attributes.
-
-        Raises:
-            TaskError: If the seed is out of range.
-        """
+        """Set up; for the arguments see the attributes."""
         self._numbers, self.next_episode = env_number, next_episode.clone()
         self.restart(seed, next_episode)
         # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
         self._first_row = AHEAD * torch.arange(len(env_number), device=env_number.device)
 
     def restart(self, seed: int | Sequence[int], next_episode: torch.Tensor) -> None:
-        """Go on with another seed and other episodes; see the attributes.
-
-        Raises:
-            TaskError: If a seed is out of range, or there are too few or too many.
-        """
+        """Go on with another seed and other episodes; see the attributes."""
         self._key: int | torch.Tensor
         if isinstance(seed, int):
             require_seed(seed)
@@ -161,8 +153,7 @@ class EpisodeSequence:
     def begin(self, mask: torch.Tensor) -> EpisodeRandom:
         """Begin episodes in some environments.
 
-        Args:
-            mask: The environments, shape (n,), bool.
+        mask: The environments, shape (n,), bool.
 
         Returns:
             Random numbers of the next episode of every environment, of those outside of the mask,
@@ -197,11 +188,7 @@ class EpisodeSequence:
 
 
 def require_seed(seed: int) -> None:
-    """Require a seed of episodes.
-
-    Raises:
-        TaskError: If it is out of range.
-    """
+    """Require a seed of episodes."""
     if not 0 <= seed <= MAX_SEED:
         raise TaskError(f"seed {seed}: expected 0 to 2^64 - 1")
 
@@ -209,9 +196,8 @@ def require_seed(seed: int) -> None:
 def philox(counter: torch.Tensor, seed: int | torch.Tensor) -> torch.Tensor:
     """Return the random words of counters by Philox4x32-10.
 
-    Args:
-        counter: Words of m counters, the lowest first, shape (4, m), int64.
-        seed: The key, 0 to ``MAX_SEED``, or low and high words of each counter's key, shape (m, 2).
+    counter: Words of m counters, the lowest first, shape (4, m), int64.
+    seed: The key, 0 to ``MAX_SEED``, or low and high words of each counter's key, shape (m, 2).
 
     Returns:
         Random words, shape (4, m), int64.

@@ -134,11 +134,7 @@ class Registry(Generic[T]):
 
 
 def _require_task(task: Task[Any, Any]) -> None:
-    """Require a task's name, constants and fields, and methods that take their arguments.
-
-    Raises:
-        TaskError: If something is missing or differs, or a field has a name that is taken.
-    """
+    """Require a task's name, constants and fields, and methods that take their arguments."""
     from morphgen.tasks.task import STANDARD_FIELDS  # imports numpy, which names alone do not need
 
     where = f"task {task.name!r}"

@@ -30,10 +30,7 @@ class EpisodePlacer:
     ) -> None:
         """Keep what describes the environments.
 
-        Args:
-            specs: Specifications of environments.
-            env_robot_index: Index of each environment's specification, shape (n,), int64.
-            spaces: Scenes of the environments for tests of collisions.
+        env_robot_index: Index of each environment's specification, shape (n,), int64.
         """
         self._specs = [specs[i] for i in env_robot_index.tolist()]
         self._spaces = spaces
@@ -47,15 +44,8 @@ class EpisodePlacer:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return where episodes begin that were drawn, after the options.
 
-        Args:
-            options: A vector for all environments, or one for each, by name: ``q``, and those of
-                the tasks' ``reset_options``.
-            groups: The environments by task, whose goals may change.
-            q: Drawn joint positions, shape (n, J) [rad or m].
-            block_pose: Drawn poses of the blocks, shape (n, 7).
-
-        Raises:
-            TaskError: If an option is unknown, malformed, out of limits or reach, or collides.
+        q: Drawn joint positions, shape (n, J) [rad or m].
+        block_pose: Drawn poses of the blocks, shape (n, 7).
         """
         rows = self._rows(options, groups)
         q, block_pose = q.clone(), block_pose.clone()
@@ -132,11 +122,7 @@ class EpisodePlacer:
 
 
 def unit_quaternion(values: Array, name: str) -> Array:
-    """Return the quaternion of an option with unit length and w >= 0.
-
-    Raises:
-        TaskError: If it is far from unit length.
-    """
+    """Return the quaternion of an option with unit length and w >= 0."""
     norm = float(np.linalg.norm(values))
     if abs(norm - 1) > 1e-2:
         raise TaskError(

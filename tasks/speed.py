@@ -59,14 +59,9 @@ def measure_speed(
     began, and a faster simulator would otherwise get further into them. The seed gives all
     simulators the same episodes, since some cost a tenth more than others.
 
-    Args:
-        batch: Environments; they are reset first.
-        seconds: Least duration of the measurement [s].
-        seed: Seed of actions and episodes.
-        own: The simulator's native step functions, as modules and names; their time is reported
-            apart from the time around them. Only if they run in this thread alone.
-        clock: Function that returns the time [s]; by default one that first waits for the device
-            of the batch, which otherwise runs behind the calls.
+    seconds: Least duration of the measurement [s].
+    clock: Function that returns the time [s]; by default one that first waits for the device
+        of the batch, which otherwise runs behind the calls.
     """
     if clock is None:
         clock = time.perf_counter if is_host(batch.device) else _time_on_gpu

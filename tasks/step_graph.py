@@ -19,11 +19,7 @@ class StepGraph:
     """
 
     def __init__(self, batch: TaskBatch) -> None:
-        """Record the graphs; ``reset`` of the batch must follow.
-
-        Args:
-            batch: Environments on a GPU, without channels that read the GPU's memory.
-        """
+        """Record the graphs; ``reset`` of the batch must follow."""
         self._batch = batch
         shape = (batch.num_envs, batch.robot_tables.max_links)
         kind = torch.int64 if batch.action_kind == "discrete" else torch.float32
@@ -34,8 +30,7 @@ class StepGraph:
     def __call__(self, actions: torch.Tensor) -> Step:
         """Act for one control step; see ``TaskBatch.step``. The next call overwrites the result.
 
-        Args:
-            actions: Shape (n, L).
+        actions: Shape (n, L).
         """
         if self._seed != self._batch.seed:
             self._record()

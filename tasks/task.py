@@ -440,11 +440,7 @@ class Task(ABC, Generic[C, G]):
 
 
 def require_task_config(config: TaskConfig) -> None:
-    """Require valid values of the constants that every task has, and only finite numbers or text.
-
-    Raises:
-        TaskError: If a constant is out of its range.
-    """
+    """Require valid values of the constants of every task, and only finite numbers or text."""
     name = type(config).__name__
     for field in fields(config):
         value = getattr(config, field.name)

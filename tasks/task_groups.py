@@ -21,11 +21,7 @@ from morphgen.typing import Array
 
 
 def require_envs(task: Task[Any, Any], envs: object) -> None:
-    """Require what ``Task.make_envs`` returns.
-
-    Raises:
-        TaskError: If it is something else.
-    """
+    """Require what ``Task.make_envs`` returns."""
     if not isinstance(envs, TaskEnvs):
         raise TaskError(
             f"task {task.name!r}: make_envs returned {type(envs).__name__}; expected TaskEnvs"
@@ -33,11 +29,7 @@ def require_envs(task: Task[Any, Any], envs: object) -> None:
 
 
 def require_start(task: str, start: object, k: int, num_joints: int) -> None:
-    """Require what ``TaskEnvs.begin`` returns.
-
-    Raises:
-        TaskError: If it is something else.
-    """
+    """Require what ``TaskEnvs.begin`` returns."""
     if not isinstance(start, tuple) or len(start) != 2:
         raise TaskError(
             f"task {task!r}: begin returned {type(start).__name__}; expected two tensors: joint "
@@ -48,11 +40,7 @@ def require_start(task: str, start: object, k: int, num_joints: int) -> None:
 
 
 def require_result(task: str, result: object, k: int) -> None:
-    """Require what ``TaskEnvs.evaluate`` returns.
-
-    Raises:
-        TaskError: If it is something else; the message names the part.
-    """
+    """Require what ``TaskEnvs.evaluate`` returns."""
     if not isinstance(result, StepResult):
         raise TaskError(
             f"task {task!r}: evaluate returned {type(result).__name__}; expected a StepResult"
@@ -73,11 +61,7 @@ def require_result(task: str, result: object, k: int) -> None:
 
 
 def require_fields(task: Task[Any, Any], values: Mapping[str, torch.Tensor], k: int) -> None:
-    """Require what ``TaskEnvs.observe`` returns: every field that the task declares.
-
-    Raises:
-        TaskError: If a field is missing, is not declared, or has another shape.
-    """
+    """Require what ``TaskEnvs.observe`` returns: every field that the task declares."""
     declared = {field.name: field for field in task.fields}
     for name in declared.keys() ^ values.keys():
         if name in declared:
@@ -130,13 +114,7 @@ class TaskGroups:
     ) -> None:
         """Group environments.
 
-        Args:
-            specs: Specifications of environments.
-            env_robot_index: Index of each environment's specification, shape (n,), int64.
-            num_joints: Independent joints of a row, padding included.
-
-        Raises:
-            TaskError: If a task is unknown or has different constants in the batch.
+        env_robot_index: Index of each environment's specification, shape (n,), int64.
         """
         n, device = len(env_robot_index), env_robot_index.device
         env_specs = [specs[i] for i in env_robot_index.tolist()]
@@ -267,8 +245,7 @@ class TaskGroups:
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the observation fields of all tasks, shape (n, size) each, as copies.
 
-        Args:
-            block_pose: Pose of the block, shape (n, 7); zeros if there is none.
+        block_pose: Pose of the block, shape (n, 7); zeros if there is none.
         """
         n = len(self._row)
         values = {
@@ -289,8 +266,7 @@ class TaskGroups:
     def tool_targets(self, block_pose: torch.Tensor) -> ToolTargets:
         """Return the points and orientations that the tasks want the tool at.
 
-        Args:
-            block_pose: Pose of the block, shape (n, 7); zeros if there is none.
+        block_pose: Pose of the block, shape (n, 7); zeros if there is none.
         """
         n, device = len(self._row), self._row.device
         groups = list(self._groups.values())

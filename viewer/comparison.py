@@ -67,13 +67,7 @@ def all_roles(robots: Sequence[Robot]) -> list[str]:
 
 
 def parse_moves(state: Mapping[str, str], roles: Sequence[str], low: float) -> dict[str, float]:
-    """Return the positions of roles that an address's state gives, by role.
-
-    Args:
-        state: State of the address; values that are no numbers are ignored.
-        roles: Roles of the page, such as ``joint 1``, whose key is ``joint1``.
-        low: Smallest position; the largest is 1.
-    """
+    """Return the positions of roles that an address's state gives, by role."""
     moves = {}
     for role in roles:
         try:
@@ -104,10 +98,7 @@ def normalized_positions(robot: Robot, q: Array) -> Array:
 def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
     """Return a configuration with the joints of some roles moved.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (dof,) [rad or m].
-        values: Normalized position in [-1, 1] by role.
+    q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
         The configuration clipped to the limits, shape (dof,).
@@ -121,12 +112,7 @@ def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
 
 
 def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparison:
-    """Compute tokens and similarity of robots; takes seconds if primitives have to be fitted.
-
-    Raises:
-        BenchmarkError: If a robot has no tool, or no joint that moves it.
-        MorphgenError: If a mesh cannot be read.
-    """
+    """Compute tokens and similarity of robots; takes seconds if primitives have to be fitted."""
     library = Library(folders)
     shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
     # Splits fix the number of links; here the largest robot does.

@@ -141,11 +141,7 @@ def snapshot(episode: Episode) -> Episode:
 
 
 def episode_bytes(episode: Episode) -> bytes:
-    """Return an episode's file; the same episode gives the same bytes.
-
-    Raises:
-        MeshError: If a mesh of a robot cannot be read.
-    """
+    """Return an episode's file; the same episode gives the same bytes."""
     about = {
         "format": FORMAT,
         "morphgen": version("morphgen"),
@@ -166,16 +162,7 @@ def episode_bytes(episode: Episode) -> bytes:
 
 
 def read_episode(path: Path, files: FileAccess) -> Episode:
-    """Read an episode's file with its robots.
-
-    Args:
-        path: The file.
-        files: Files that may be read; the episode's robots must be among them.
-
-    Raises:
-        EpisodeError: If the file is not an episode, or one of its robots has changed.
-        MorphgenError: If a robot does not exist any more.
-    """
+    """Read an episode's file with its robots."""
     try:
         arrays = read_all(path)
         about = json.loads(str(arrays["about"]))

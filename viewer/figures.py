@@ -45,12 +45,7 @@ def map_svg(
 
     Robots move apart where they would cover each other. Their frame and name show their side.
 
-    Args:
-        points: Shape (n, 2).
-        names: Names of the robots.
-        sides: ``train`` or ``test`` for each robot.
-        uris: URIs of the robots.
-        pictures: Pictures as ``data:`` URLs by URI; other robots have an empty frame.
+    points: Shape (n, 2).
     """
     low, high = points.min(axis=0), points.max(axis=0)
     span = np.maximum(high - low, 1e-9)
@@ -83,11 +78,7 @@ def map_svg(
 def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:
     """Return a square for each pair of robots, dark if they are similar; titles have the values.
 
-    Args:
-        values: Shape (n, n).
-        names: Names of the robots.
-        sides: ``train`` or ``test`` for each robot, shown by the colour of its name.
-        larger: Whether larger values mean more similar robots.
+    values: Shape (n, n).
     """
     n = len(names)
     left, cell = 120.0, (_WIDTH - 120.0) / max(n, 1)
@@ -114,13 +105,7 @@ def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, la
 def histogram_svg(
     values: Sequence[float], limits: tuple[float, float], chosen: tuple[float, float]
 ) -> str:
-    """Draw how many values are where, as bars; bars outside a chosen range are grey.
-
-    Args:
-        values: The values.
-        limits: Range that the picture shows; the slider below it has the same.
-        chosen: Range of the slider.
-    """
+    """Draw how many values are where, as bars; bars outside a chosen range are grey."""
     counts, edges = np.histogram(values, _NUM_BARS, limits)
     width, tallest = _WIDTH / _NUM_BARS, max(int(counts.max()), 1)
     parts = []

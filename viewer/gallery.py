@@ -77,14 +77,7 @@ class Gallery:
 
 
 def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) -> str:
-    """Return a robot's card in the grid: a link to its page, and a check box that chooses it.
-
-    Args:
-        row: The robot.
-        thumbnail: Its picture as a ``data:`` URL; empty while there is none.
-        fault: Why it cannot be read; else empty.
-        share: Size of the picture within the card, at most 1.
-    """
+    """Return a robot's card in the grid: a link to its page, and a check box that chooses it."""
     shrunk = f' style="transform:scale({share:.3f})"' if share < 1 else ""
     image = f'<div class="picture"><img alt="" src="{thumbnail}"{shrunk}></div>'
     if not thumbnail:
@@ -104,12 +97,7 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) ->
 
 
 def shares(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> tuple[list[float], float]:
-    """Return the size of each picture, and the height that a whole card shows [m].
-
-    Args:
-        gallery: The gallery; at its own scale every size is 1, and the height NaN.
-        rows: Robots of the gallery; those of unknown size get 1.
-    """
+    """Return the size of each picture, and the height that a whole card shows [m]."""
     heights = [row.picture_height or math.nan for row in rows]
     known = [row.picture_height for row in gallery.rows if row.picture_height]
     if gallery.controls["scale"].value == "own" or not known:
@@ -205,12 +193,7 @@ def control_state(gallery: Gallery) -> dict[str, str]:
 
 
 def clear_filter(gallery: Gallery, key: str) -> None:
-    """Let every robot pass a condition of the filter.
-
-    Args:
-        gallery: The gallery.
-        key: One of ``FILTERS``, or empty for all of them.
-    """
+    """Let every robot pass a condition of the filter."""
     for name, control in gallery.controls.items():
         if name not in FILTERS or key not in ("", name):
             continue
@@ -262,11 +245,7 @@ def show_coordinates(gallery: Gallery) -> None:
 
 
 def brush(gallery: Gallery, text: str) -> None:
-    """Set a range as the pointer has chosen it at an axis; see ``parse_brush``.
-
-    Raises:
-        AddressError: If the text is invalid.
-    """
+    """Set a range as the pointer has chosen it at an axis; see ``parse_brush``."""
     fact, (low, high) = parallel_coordinates.parse_brush(text, _axes(gallery))
     control = gallery.controls[fact]
     low, high = (round(value / control.step) * control.step for value in (low, high))
@@ -276,16 +255,7 @@ def brush(gallery: Gallery, text: str) -> None:
 def parse_range(
     fact: str, text: str, limits: tuple[float, float] | None
 ) -> tuple[float, float] | None:
-    """Parse ``LOW..HIGH`` of an address.
-
-    Args:
-        fact: The fact, one of ``NUMBERS``.
-        text: The text; if empty, the limits are returned.
-        limits: Smallest and largest value of the robots; None if the fact is unknown of all.
-
-    Raises:
-        AddressError: If the text is no range, or no value of a robot can be in it.
-    """
+    """Parse ``LOW..HIGH`` of an address."""
     if not text:
         return limits
     first, dots, last = text.partition("..")
@@ -337,14 +307,7 @@ def _filter(state: Mapping[str, str]) -> robot_rows.Filter:
 
 
 def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Mapping[str, str]) -> None:
-    """Add a dropdown if there is a choice.
-
-    Args:
-        gallery: The gallery.
-        key: Key of the control.
-        label: Its label.
-        keys: Values in the address by their labels.
-    """
+    """Add a dropdown if there is a choice."""
     value = gallery.session.address.state.get(key, "")
     labels = {key: label for label, key in keys.items()}
     if value and value not in labels:
@@ -474,11 +437,7 @@ def open_panels(
 ) -> viser.PanelHandle:
     """Open the panel of thumbnails at the left and the panel of controls at the right.
 
-    Args:
-        gallery: The gallery.
-        breadcrumbs: HTML of the path to the page.
-        header: HTML above the controls.
-        width: Width of the controls [pixels].
+    width: Width of the controls [pixels].
 
     Returns:
         The panel at the left.
@@ -496,12 +455,7 @@ def open_panels(
 
 
 def add_controls(gallery: Gallery, panel: viser.PanelHandle) -> None:
-    """Add the controls, in the state that the address gives, and show the first robots.
-
-    Args:
-        gallery: The gallery.
-        panel: Panel of the thumbnails, which gets a tab for the parallel coordinates.
-    """
+    """Add the controls, in the state that the address gives, and show the first robots."""
     session = gallery.session
     add_filter(gallery)
     if len(gallery.histograms) > 1:
@@ -577,11 +531,7 @@ class Cell:
 def contact_sheet(title: str, cells: Sequence[Cell], height: float, suffix: str) -> bytes:
     """Draw a contact sheet.
 
-    Args:
-        title: Title of the sheet.
-        cells: At least one robot.
-        height: Height that a whole picture shows [m]; NaN if the pictures have different scales.
-        suffix: ``png`` or ``pdf``.
+    height: Height that a whole picture shows [m]; NaN if the pictures have different scales.
     """
     columns = max(round(math.sqrt(_ASPECT * len(cells))), 1)
     rows = math.ceil(len(cells) / columns)

@@ -130,13 +130,7 @@ def command(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Return a table.
-
-    Args:
-        header: Texts of the first row.
-        rows: Cells as HTML.
-        numbers: Columns that are aligned to the right.
-    """
+    """Return a table."""
     right = ['class="n"' if i in numbers else "" for i in range(len(header))]
 
     def row(kind: str, cells: Iterable[str]) -> str:

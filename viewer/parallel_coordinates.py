@@ -41,11 +41,7 @@ def parallel_svg(
     A line opens its robot. An element at each axis has the fact as ``data-brush``: the page's
     script lets the pointer choose a range there.
 
-    Args:
-        rows: Robots; those with an unknown fact have no line.
-        axes: The axes from left to right, at least two, by fact.
-        passing: URIs of the robots that pass the filter.
-        width: Width of the picture [pixels].
+    width: Width of the picture [pixels].
     """
     step = (width - 2 * _MARGIN) / (len(axes) - 1)
     grey, lines = [], []
@@ -78,15 +74,7 @@ def parallel_svg(
 
 
 def parse_brush(text: str, axes: Mapping[str, Axis]) -> tuple[str, tuple[float, float]]:
-    """Return the fact and the range that the pointer has chosen at an axis.
-
-    Args:
-        text: ``FACT:LOW:HIGH`` with shares of the axis in [0, 1], or ``FACT:`` for all of it.
-        axes: The axes by fact.
-
-    Raises:
-        AddressError: If the text is something else.
-    """
+    """Return the fact and the range that the pointer has chosen at an axis."""
     fact, _, ends = text.partition(":")
     first, _, last = (ends or "0:1").partition(":")
     try:

@@ -108,11 +108,7 @@ class Population:
 
 
 def make_population(rows: Sequence[Row], robots: Sequence[Robot]) -> Population:
-    """Compile robots, at least one.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Compile robots, at least one."""
     n, most = len(robots), max(robot.dof for robot in robots)
     roles = all_roles(robots)
     index = {role: i for i, role in enumerate(roles)}
@@ -132,11 +128,7 @@ def make_population(rows: Sequence[Row], robots: Sequence[Robot]) -> Population:
 
 
 def make_instances(robots: Sequence[Robot]) -> Instances:
-    """Collect the visual shapes of robots, or the collision shapes of links without any.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Collect the visual shapes of robots, or the collision shapes of links without any."""
     members: dict[Prototype, list[tuple[int, int, Array, Array, Array, Array, object]]] = {}
     for i, robot in enumerate(robots):
         for j, link in enumerate(robot.links):
@@ -173,9 +165,7 @@ def make_instances(robots: Sequence[Robot]) -> Instances:
 def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
     """Return the pose of every instance in the root frame of its robot.
 
-    Args:
-        population: The robots.
-        q: Independent joint positions, shape (n, J) [rad or m].
+    q: Independent joint positions, shape (n, J) [rad or m].
 
     Returns:
         Shape (m, 4, 4).
@@ -196,9 +186,7 @@ def instance_centres(instances: Instances, poses: NDArray[np.float32]) -> NDArra
 def robot_bounds(population: Population, T_root_shape: NDArray[np.float32]) -> Array:
     """Return the bounding boxes of robots in their root frames; the root's origin counts too.
 
-    Args:
-        population: The robots.
-        T_root_shape: Poses of all instances, shape (m, 4, 4).
+    T_root_shape: Poses of all instances, shape (m, 4, 4).
 
     Returns:
         Lowest and highest corners, shape (n, 2, 3) [m].
@@ -215,10 +203,7 @@ def robot_bounds(population: Population, T_root_shape: NDArray[np.float32]) -> A
 def move_roles(population: Population, q: Array, shares: dict[str, float]) -> Array:
     """Return configurations with the joints of some roles moved.
 
-    Args:
-        population: The robots.
-        q: Independent joint positions, shape (n, J) [rad or m].
-        shares: Position within the joint's range, 0 (lower limit) to 1 (upper), by role.
+    q: Independent joint positions, shape (n, J) [rad or m].
 
     Returns:
         Shape (n, J).
@@ -303,17 +288,7 @@ class ReadRobot:
 
 
 def find_source(subject: str, files: FileAccess, seed: int, number: int) -> Source:
-    """List the robots that an address names.
-
-    Args:
-        subject: A folder, a split with or without ``@train`` or ``@test``, or a grammar.
-        files: Files that may be read.
-        seed: Seed of robots that are sampled.
-        number: Robots that are sampled, at most ``MAX_ROBOTS``.
-
-    Raises:
-        MorphgenError: If it does not exist or holds no robot.
-    """
+    """List the robots that an address names."""
     name, at, side = subject.rpartition("@")
     if not at:
         name, side = subject, ""
@@ -344,9 +319,6 @@ def load_population(
 
     Returns:
         The population of all robots that can be read; name and error of each other one.
-
-    Raises:
-        MorphgenError: If no robot can be read.
     """
     chunks = _chunks(source.rows)
     if source.grammar:

@@ -42,8 +42,7 @@ class Layout:
 def cell_size(home_bounds: Array) -> Array:
     """Return distances of neighbours at which most robots do not overlap, for scatters and maps.
 
-    Args:
-        home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
+    home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
 
     Returns:
         Distance to the right and away from the reader, shape (2,) [m].
@@ -56,8 +55,7 @@ def cell_size(home_bounds: Array) -> Array:
 def grid(home_bounds: Array) -> Layout:
     """Arrange robots in rows from the far left to the near right, in their order.
 
-    Args:
-        home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
+    home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
     """
     return Layout(_rows_of(home_bounds)[0])
 
@@ -65,10 +63,7 @@ def grid(home_bounds: Array) -> Layout:
 def sorted_grid(rows: Sequence[Row], fact: str, home_bounds: Array) -> Layout:
     """Arrange robots in rows by a fact, smallest first, with values of rows' first robots.
 
-    Args:
-        rows: The robots.
-        fact: The fact.
-        home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
+    home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
     """
     index = {row.uri: i for i, row in enumerate(rows)}
     order = [index[row.uri] for row in sort_rows(rows, fact)]
@@ -118,9 +113,8 @@ def scatter(rows: Sequence[Row], x_fact: str, y_fact: str, cell: Array) -> Layou
 def similarity_map(points: Array, cell: Array) -> Layout:
     """Arrange robots by their points on a map, in the proportions of the map.
 
-    Args:
-        points: Shape (n, 2); NaN for robots that cannot be compared, which stand in front.
-        cell: Distances of neighbours in a grid, shape (2,) [m].
+    points: Shape (n, 2); NaN for robots that cannot be compared, which stand in front.
+    cell: Distances of neighbours in a grid, shape (2,) [m].
     """
     known = np.asarray(~np.isnan(points).any(axis=1))
     if not known.any():
@@ -170,8 +164,7 @@ def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
     A robot takes its own width, and a row the depth of most of its robots, so that few large
     robots do not make the others small.
 
-    Args:
-        bounds: Bounding boxes of the robots around their roots, shape (n, 2, 3) [m].
+    bounds: Bounding boxes of the robots around their roots, shape (n, 2, 3) [m].
 
     Returns:
         Positions of the roots, shape (n, 2) [m], and indices into them.

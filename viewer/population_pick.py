@@ -60,9 +60,7 @@ def camera_view(client: viser.ClientHandle) -> View:
 def project_points(view: View, points: Array) -> tuple[Array, Array]:
     """Project points of the world.
 
-    Args:
-        view: The camera.
-        points: Shape (..., 3) [m].
+    points: Shape (..., 3) [m].
 
     Returns:
         Points of the picture, shape (..., 2), and depths, shape (...) [m]; points behind the camera
@@ -79,10 +77,7 @@ def project_points(view: View, points: Array) -> tuple[Array, Array]:
 def project(view: View, population: Population, T_world_shape: NDArray[np.float32]) -> Capsules:
     """Project all instances.
 
-    Args:
-        view: The camera.
-        population: The robots.
-        T_world_shape: Poses of all instances, shape (m, 4, 4).
+    T_world_shape: Poses of all instances, shape (m, 4, 4).
     """
     instances = population.instances
     order = np.argsort(instances.size, axis=1)
@@ -126,11 +121,9 @@ def robot_at(capsules: Capsules, point: Array) -> int | None:
 def robots_in(view: View, centres: Array, low: Array, high: Array) -> NDArray[np.bool_]:
     """Return which robots have their centre inside a rectangle of the picture.
 
-    Args:
-        view: The camera.
-        centres: Centres of the robots in the world, shape (n, 3) [m].
-        low: Upper left corner of the rectangle, shape (2,).
-        high: Lower right corner of the rectangle, shape (2,).
+    centres: Centres of the robots in the world, shape (n, 3) [m].
+    low: Upper left corner of the rectangle, shape (2,).
+    high: Lower right corner of the rectangle, shape (2,).
 
     Returns:
         Shape (n,).

@@ -84,22 +84,14 @@ def thumbnail_of_picture(path: Path) -> str:
 
 
 def bundle_files(uri: str, files: FileAccess) -> dict[str, bytes]:
-    """Return the files of a robot's bundle by their paths; a robot without bundle gets a new one.
-
-    Raises:
-        MorphgenError: If the robot does not exist, or its bundle cannot be written.
-    """
+    """Return the files of a robot's bundle by path; a robot without bundle gets a new one."""
     if ":" not in uri and (folder := files.path(uri)).is_dir() and (folder / CARD).is_file():
         return _read_files(folder)
     return new_bundle_files(read_robot_uri(uri, files))
 
 
 def new_bundle_files(robot: Robot) -> dict[str, bytes]:
-    """Return the files of a new bundle of a robot by their paths.
-
-    Raises:
-        MorphgenError: If the bundle cannot be written.
-    """
+    """Return the files of a new bundle of a robot by their paths."""
     with tempfile.TemporaryDirectory() as folder:
         return _read_files(write_bundle(robot, Path(folder) / "robot", check(robot), picture=False))
 
@@ -167,17 +159,7 @@ _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
 
 def change_tray(session: Session, action: str, uri: str) -> None:
-    """Do what a page's script asks for: an action of the page, or one of the tray.
-
-    Args:
-        session: The page.
-        action: One of ``session.actions``, or ``choose`` or ``drop`` a robot, ``clear`` the tray,
-            or ``download`` its robots.
-        uri: Value of the action: URI of the robot.
-
-    Raises:
-        AddressError: If there is no such action, or the tray is full.
-    """
+    """Do what a page's script asks for: an action of the page, or one of the tray."""
     if action in session.actions:
         session.actions[action](uri)
     elif action == "choose":
@@ -195,12 +177,7 @@ def change_tray(session: Session, action: str, uri: str) -> None:
 
 
 def send_bundles(session: Session, uris: Sequence[str]) -> None:
-    """Send a zip with the bundles of robots, each in a folder of its name.
-
-    Raises:
-        UriError: If they are too large.
-        MorphgenError: If a robot cannot be read.
-    """
+    """Send a zip with the bundles of robots, each in a folder of its name."""
     futures = [session.workers.submit(bundle_files, uri, session.files) for uri in uris]
     files: dict[str, bytes] = {}
     size = 0

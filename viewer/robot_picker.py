@@ -47,13 +47,7 @@ class RobotPicker:
 
 
 def add_picker(session: Session, lists: RobotLists, current: Callable[[], str]) -> RobotPicker:
-    """Add the controls.
-
-    Args:
-        session: The page.
-        lists: Robots to pick from.
-        current: Returns the URI of the robot that the dropdown shows first.
-    """
+    """Add the controls."""
     gui = session.client.gui
     source = gui.add_dropdown("from", tuple(lists))
     robot = gui.add_dropdown("robot", ("",), hint="type to search")
@@ -85,12 +79,7 @@ def picked_uri(picker: RobotPicker) -> str:
 
 
 def label_robots(robots: Robots, current: Sequence[str]) -> dict[str, str]:
-    """Return URIs by distinct labels, in the order of the robots.
-
-    Args:
-        robots: Names and URIs.
-        current: URIs of the page; those that are not among the robots come first.
-    """
+    """Return URIs by distinct labels, in the order of the robots."""
     listed_uris = {uri for _, uri in robots}
     labels: dict[str, str] = {}
     for name, uri in [*((uri, uri) for uri in current if uri not in listed_uris), *robots]:
@@ -102,13 +91,7 @@ def label_robots(robots: Robots, current: Sequence[str]) -> dict[str, str]:
 
 
 def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:
-    """Return lists of robots to pick from.
-
-    Args:
-        uri: URI of a robot whose split or set comes before others; empty for none.
-        files: Files that may be read.
-        first: Lists that come before all others.
-    """
+    """Return lists of robots to pick from."""
     lists = dict(first)
     if split := member_split(uri):
         lists[split] = functools.partial(_split_robots, split, files)

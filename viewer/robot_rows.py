@@ -97,9 +97,6 @@ def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
     """Sort rows by a fact; a minus before its name sorts in descending order.
 
     Rows whose fact is unknown come last either way; ties keep the order of the set.
-
-    Raises:
-        ValueError: If the key is unknown.
     """
     name = key.removeprefix("-")
     if name not in SORTS:
@@ -117,11 +114,6 @@ def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
 
 def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:
     """Return one page of rows.
-
-    Args:
-        rows: All rows.
-        number: Page number, from 1; clipped to the existing pages.
-        size: Rows on a page.
 
     Returns:
         The page's rows, its number, and the number of pages (at least 1).
@@ -155,12 +147,7 @@ def facts_line(row: Row) -> str:
 
 
 def folder_rows(text: str, files: FileAccess) -> list[Row]:
-    """Return the robots in a folder: a set's from its index, bundles by their cards, URDFs.
-
-    Raises:
-        UriError: If the path is not a folder, or the folder holds no robot.
-        FormatError: If the index of a set is invalid.
-    """
+    """Return the robots in a folder: a set's from its index, bundles by their cards, URDFs."""
     folder = files.path(text)
     if not folder.is_dir():
         raise UriError(f"{text}: not a folder")
@@ -217,11 +204,7 @@ def split_rows(name: str, split: Split) -> list[Row]:
 
 
 def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
-    """Return the rows of robots; those of sets and splits have the facts that these know.
-
-    Raises:
-        MorphgenError: If a robot's split or folder does not exist.
-    """
+    """Return the rows of robots; those of sets and splits have the facts that these know."""
     rows = []
     for i, uri in enumerate(uris):
         split, folder = member_split(uri), parent_folder(uri)

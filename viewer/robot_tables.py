@@ -149,13 +149,7 @@ def link_details(robot: Robot, name: str) -> str:
 
 
 def link_card(robot: Robot, name: str, findings: Sequence[Finding]) -> str:
-    """Return a link's mass and inertia, its joint with limits, and the findings about both.
-
-    Args:
-        robot: The robot.
-        name: Name of the link.
-        findings: Findings about the robot; those about other links and joints are left out.
-    """
+    """Return a link's mass and inertia, its joint with limits, and the findings about both."""
     link, i = robot.link(name), robot.link_index[name]
     joint = robot.joints[i - 1] if i else None
     rows = _inertial_rows(link)

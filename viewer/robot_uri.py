@@ -78,11 +78,7 @@ class FileAccess:
         return Library(self.library_folders)
 
     def path(self, text: str) -> Path:
-        """Return the existing file or folder that a path or an ``upload:`` URI names.
-
-        Raises:
-            UriError: If it does not exist, or lies outside the allowed folders.
-        """
+        """Return the existing file or folder that a path or an ``upload:`` URI names."""
         base, name, allowed = self.roots[0], text, self.roots
         if text.startswith(UPLOAD):
             base, name, allowed = self.uploads, text.removeprefix(UPLOAD), (self.uploads,)
@@ -112,11 +108,7 @@ class FileAccess:
 
 
 def owned_set(text: str, files: FileAccess) -> Path:
-    """Return the folder of a robot set whose robots the viewer may delete.
-
-    Raises:
-        UriError: If it is not a set below the allowed folders, or belongs to somebody else.
-    """
+    """Return the folder of a robot set whose robots the viewer may delete."""
     folder = Path() if ":" in text else files.path(text)
     if not (folder / INDEX).is_file() or not (folder / SETTINGS).is_file():
         raise UriError(
@@ -158,12 +150,7 @@ def member_split(uri: str) -> str:
 
 
 def read_robot_uri(uri: str, files: FileAccess) -> Robot:
-    """Read or compose the robot of a URI.
-
-    Raises:
-        UnsoundError: If the robot's structure is broken; has the findings.
-        MorphgenError: If the robot does not exist, or cannot be read or composed.
-    """
+    """Read or compose the robot of a URI."""
     try:
         if uri.startswith(MEMBER):
             return compose_member(resolve_member(uri, files), files.library)
@@ -186,9 +173,6 @@ def _require_readable_upload(uri: str, path: Path, files: FileAccess) -> None:
 
     A xacro is a program: those of an upload are never expanded. An address may name any MJCF of an
     upload, also one that another includes, so their files are checked whenever they are read.
-
-    Raises:
-        MorphgenError: If it is not, or names files elsewhere.
     """
     if path.suffix.lower() not in (".urdf", ".xml"):
         raise UriError(f"{shorten(uri)}: only a URDF, an MJCF or a bundle is read from an upload")
@@ -202,11 +186,6 @@ def require_own_files(mjcf: Path, folder: Path) -> None:
 
     The paths are found by the function that later reads them: it joins ``meshdir`` and the like,
     decodes escapes (``%2f``) and finds packages elsewhere on this machine.
-
-    Raises:
-        UnsoundError: If a mesh is not found.
-        FormatError: If the MJCF cannot be read.
-        UriError: If it names a file elsewhere.
     """
     document = read_document(mjcf, PackageFinder())
     for file in (*document.includes, *document.meshes.values()):
@@ -215,11 +194,7 @@ def require_own_files(mjcf: Path, folder: Path) -> None:
 
 
 def resolve_derivation(uri: str, files: FileAccess) -> Derivation | None:
-    """Return the derivation of a URI's robot; None if the robot is read from a description.
-
-    Raises:
-        MorphgenError: If the robot does not exist, or its derivation is invalid.
-    """
+    """Return the derivation of a URI's robot; None if the robot is read from a description."""
     if uri.startswith(WORDS):
         return resolve_words(uri.removeprefix(WORDS), files)[0]
     if uri.startswith(DERIVATION):
@@ -230,24 +205,14 @@ def resolve_derivation(uri: str, files: FileAccess) -> Derivation | None:
 
 
 def resolve_grammar(name: str, files: FileAccess) -> Grammar:
-    """Return the grammar of a name or of an allowed file.
-
-    Raises:
-        UriError: If the file may not be read.
-        GrammarError: If the grammar does not exist or is invalid.
-    """
+    """Return the grammar of a name or of an allowed file."""
     folders = files.library.folders
     (word,) = _resolve_grammar_path([name], files)
     return load_grammar(find_grammar(word, folders), folders)
 
 
 def resolve_words(text: str, files: FileAccess) -> tuple[Derivation, str]:
-    """Return the derivation and name of the robot that words of ``morphgen compose`` describe.
-
-    Raises:
-        UriError: If they name a grammar's file that may not be read.
-        MorphgenError: If they name something that does not exist or does not fit.
-    """
+    """Return the derivation and name of the robot that words of ``morphgen compose`` describe."""
     return parse_words(_resolve_grammar_path(text.split(), files), files.library)
 
 
@@ -263,11 +228,7 @@ def _resolve_grammar_path(words: list[str], files: FileAccess) -> list[str]:
 
 
 def resolve_split(text: str, files: FileAccess) -> Split:
-    """Return a split by its name, its file or its built folder.
-
-    Raises:
-        MorphgenError: If the split does not exist or cannot be read.
-    """
+    """Return a split by its name, its file or its built folder."""
     if text in split_names():
         return read_split_file(find_split(text)).split
     path = files.path(text)
@@ -275,11 +236,7 @@ def resolve_split(text: str, files: FileAccess) -> Split:
 
 
 def resolve_member(uri: str, files: FileAccess) -> Member:
-    """Return the member of a split that a URI names.
-
-    Raises:
-        UriError: If there is no such member.
-    """
+    """Return the member of a split that a URI names."""
     name, at, member = uri.removeprefix(MEMBER).rpartition("@")
     side_name, _, robot = member.partition("/")
     side = next((side for side in SIDES if side == side_name), None)
@@ -314,9 +271,6 @@ def content_hash(uri: str, files: FileAccess) -> str:
     """Return a hash that changes with the robot's description, its parts and morphgen's version.
 
     Meshes and included xacro files are not looked at: who edits one restarts the viewer.
-
-    Raises:
-        MorphgenError: If the robot does not exist.
     """
     lines = [_VERSION]
     if derivation := resolve_derivation(uri, files):

@@ -113,17 +113,7 @@ class Rollout:
         files: FileAccess,
         progress: Callable[[str], object] = lambda text: None,
     ) -> None:
-        """Start an episode.
-
-        Args:
-            config: Task, robots and policy.
-            files: Robots and checkpoints that may be read.
-            progress: Called with the current activity.
-
-        Raises:
-            MorphgenError: If the policy is unknown, or none of the robots can do the task; if only
-                some cannot, ``faults`` says why.
-        """
+        """Start an episode."""
         self.faults: dict[str, str] = {}
         self._robots: list[_SimulatedRobot] = []
         spec = _read_controller(config.policy, config.task, files)
@@ -168,12 +158,7 @@ def simulators() -> list[str]:
 
 
 def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpec:
-    """Return the controller that a page names.
-
-    Raises:
-        TaskError: If the policy is unknown, is for another task, or is not a checkpoint.
-        UriError: If it is a file that may not be read.
-    """
+    """Return the controller that a page names."""
     if not is_named(policy):
         policy = str(_checkpoint_path(policy, policies_for(task), files))
     return read_controller(policy, task)
@@ -204,9 +189,6 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
     Returns:
         Task of the first robot; whether any robot had obstacles, because then the policy observes
         them; names and URIs of all robots, or none if they were drawn and their list is missing.
-
-    Raises:
-        MorphgenError: If the file is not a checkpoint, or its robot cannot be read or composed.
     """
     path = _checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
@@ -340,9 +322,7 @@ class Player:
     def load(self, make_source: Callable[[], EpisodeSource], *, start: float | None = None) -> None:
         """Show another episode; of several that are requested meanwhile, the last.
 
-        Args:
-            make_source: Makes the episode.
-            start: Time at which it is paused [s]; by default it plays from its beginning.
+        start: Time at which it is paused [s]; by default it plays from its beginning.
         """
         self._command("load", lambda: self._load(make_source, start))
 

@@ -66,12 +66,7 @@ class SplitStudy:
 
 
 def make_member(uri: str, category: str, task: str, obstacles: bool, files: FileAccess) -> Member:
-    """Return a robot as a member of a split. Runs in a worker.
-
-    Raises:
-        BenchmarkError: If the robot has no derivation.
-        MorphgenError: If it cannot be composed.
-    """
+    """Return a robot as a member of a split. Runs in a worker."""
     if uri.startswith(MEMBER):
         return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
     robot = read_robot_uri(uri, files)
@@ -91,19 +86,7 @@ def make_members(
     workers: Workers,
     progress: Callable[[int, int], None],
 ) -> list[Member]:
-    """Compose the robots of rows in the worker processes; return them as members of a split.
-
-    Args:
-        rows: Robots of a gallery.
-        task: Name of their task.
-        obstacles: Whether the task has obstacles.
-        files: Files that may be read.
-        workers: The processes.
-        progress: Called with the number of composed robots and of all robots.
-
-    Raises:
-        MorphgenError: If a robot has no derivation or cannot be composed.
-    """
+    """Compose the robots of rows in the worker processes; return them as members of a split."""
     futures = [
         workers.submit(make_member, row.uri, row.category, task, obstacles, files) for row in rows
     ]
@@ -117,12 +100,7 @@ def make_members(
 def save_split(
     name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], files: FileAccess
 ) -> Path:
-    """Write a split's file into ``splits/`` of the folder where the viewer was started.
-
-    Raises:
-        BenchmarkError: If the name is invalid, a side is empty, or the file exists or cannot be
-            written.
-    """
+    """Write a split's file into ``splits/`` of the folder where the viewer was started."""
     require_split_name(name)
     if not train or not test:
         raise BenchmarkError(
@@ -144,17 +122,7 @@ def study_split(
     workers: Workers,
     progress: Callable[[int, int], None],
 ) -> SplitStudy:
-    """Measure and compare a split's robots in worker processes.
-
-    Args:
-        split: At most ``MAX_ROBOTS`` robots.
-        folders: Folders of the library.
-        workers: The processes.
-        progress: Called with the number of measured robots and of all robots.
-
-    Raises:
-        BenchmarkError: If there are more robots, or the split's record of its making is malformed.
-    """
+    """Measure and compare a split's robots in worker processes."""
     members = [*split.train, *split.test]
     if len(members) > MAX_ROBOTS:
         raise BenchmarkError(
@@ -186,13 +154,7 @@ def measure_derivation(
 def conclude_study(
     split: Split, measured: Mapping[str, MeasuredRobot | Fault], folders: tuple[Path, ...]
 ) -> SplitStudy:
-    """Compare measured robots, audit the split and compute its statistics. Runs in a worker.
-
-    Args:
-        split: The split.
-        measured: Its robots by derivation.
-        folders: Folders of the library.
-    """
+    """Compare measured robots, audit the split and compute its statistics. Runs in a worker."""
     members = [(side, member) for side in SIDES for member in split.side(side)]
     results = [measured[member.derivation] for _, member in members]
     sound = [i for i, result in enumerate(results) if isinstance(result, MeasuredRobot)]
@@ -231,14 +193,7 @@ def add_split_form(
     *,
     expanded: bool = False,
 ) -> None:
-    """Add controls that save a new split.
-
-    Args:
-        session: The browser.
-        add_choice: Adds the controls that choose the sides; returns the function that reads them.
-        hint: Text above the controls.
-        expanded: Whether the controls are shown before the user opens their folder.
-    """
+    """Add controls that save a new split."""
     gui = session.client.gui
     with gui.add_folder("New split", expand_by_default=expanded):
         if hint:

@@ -46,8 +46,7 @@ _DARK = _Theme(_DARK_SCALE, "0.85", "0.55")
 def token_differences(tables: Sequence[Array]) -> list[NDArray[np.bool_]]:
     """Return which tokens of each robot differ from those of the first robot.
 
-    Args:
-        tables: Tokens by robot, shape (n_links, 48) each.
+    tables: Tokens by robot, shape (n_links, 48) each.
 
     Returns:
         By robot, shape (n_links, 48); links that the first robot does not have differ throughout.
@@ -74,11 +73,7 @@ def tokens_png(
     Blue is negative, red positive, saturated at -1 and 1. A dot marks a difference from the first
     robot. Vertical lines separate the fields of a token.
 
-    Args:
-        names: Names of the robots.
-        links: Names of their links.
-        tables: Their tokens, shape (n_links, 48) each.
-        dark: Whether the page behind the picture is dark.
+    tables: Their tokens, shape (n_links, 48) each.
     """
     theme = _DARK if dark else _LIGHT
     with matplotlib.rc_context():

@@ -101,16 +101,6 @@ def audit(
     ``body-repeated`` (a side has a robot twice at one task) is an error if the split says what it
     holds out, because such splits are made without repeated robots; else it is a warning. So is
     ``accepted-unused`` (the split accepts a finding that does not occur).
-
-    Args:
-        split: The split.
-        library: The library of parts.
-        near: Thresholds of near duplicates.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all.
-
-    Raises:
-        BenchmarkError: If ``jobs`` is below 1, or the provenance of the split is malformed.
     """
     return audit_survey(survey_split(split, library, jobs=jobs, progress=progress), library, near)
 

@@ -89,18 +89,7 @@ def split_difficulty(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> tuple[RobotDifficulty, ...]:
-    """Compose, measure and compare the robots of a split; see ``survey_difficulty``.
-
-    Args:
-        split: The split.
-        library: Library of its parts.
-        results: Results of baselines.
-        jobs: Number of processes.
-        progress: Called as by ``survey_split``.
-
-    Raises:
-        BenchmarkError: As ``survey_split`` and ``survey_difficulty``.
-    """
+    """Compose, measure and compare the robots of a split; see ``survey_difficulty``."""
     survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
     return survey_difficulty(survey, results)
 
@@ -112,14 +101,6 @@ def survey_difficulty(
 
     The nearest robot of a train robot is another one: robots with the same hash, such as the same
     robot at another task, do not count. A test robot is compared with all train robots.
-
-    Args:
-        survey: Survey of the split with ``within_train``.
-        results: Results of baselines.
-
-    Raises:
-        BenchmarkError: If a robot cannot be composed, or is not the one that the split names.
-        ValueError: If the survey is without ``within_train``.
     """
     return tuple(_rows(survey, results or {}))
 
@@ -158,16 +139,8 @@ def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDiffic
 def train_similarity(survey: SplitSurvey, side: Side, index: int) -> Array:
     """Return the similarity of a robot to the train robots, shape (n_train, n_measures).
 
-    Args:
-        survey: Survey of the split with ``within_train``.
-        side: Side of the robot.
-        index: Index of the robot on its side.
-
     Returns:
         Values of ``MEASURES``; NaN where a train robot is the robot itself.
-
-    Raises:
-        ValueError: If the survey is without ``within_train``.
     """
     if survey.train_similarity is None:
         raise ValueError("the survey has no similarity of train robots; expected within_train=True")
@@ -207,10 +180,6 @@ def difficulty_csv(rows: Sequence[RobotDifficulty], baselines: Sequence[str] = (
     """Return a CSV table with a line per robot: ``STRUCTURAL``, then two columns per baseline.
 
     The same rows give the same text. Cells without a value are empty.
-
-    Args:
-        rows: The rows.
-        baselines: Names of the baselines in the order of their columns.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

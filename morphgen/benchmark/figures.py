@@ -76,10 +76,6 @@ def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
     """Draw matrices side by side, bright where robots are similar, and return the PNG.
 
     Up to ``MAX_NAMED`` robots are named, and up to ``MAX_WITH_VALUES`` have their values written.
-
-    Args:
-        names: Names of n robots.
-        panels: At least one matrix.
     """
     n = len(names)
     side = max(_MIN_SIDE, n * _ROW_HEIGHT) if n <= MAX_NAMED else _UNNAMED_SIDE
@@ -105,10 +101,6 @@ def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
 
     Colours distinguish families: robots whose names differ only in the number at their end. Up to
     ``MAX_NAMED`` robots are named where there is room.
-
-    Args:
-        names: Names of n robots.
-        panels: At least one map.
     """
     figure = Figure(figsize=(7.5 * len(panels), 7), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)

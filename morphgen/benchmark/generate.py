@@ -81,11 +81,7 @@ class SplitRequest:
 
 
 def require_size(request: SplitRequest) -> None:
-    """Check that a request has a number of train robots.
-
-    Raises:
-        BenchmarkError: If it has none.
-    """
+    """Check that a request has a number of train robots."""
     if not request.train:
         raise BenchmarkError("--train: say how many robots to train on, such as 10 or 10,30,100")
 
@@ -139,15 +135,7 @@ class TestRobotSearch:
         *,
         skip_unfit: bool = False,
     ) -> None:
-        """Begin with no test robots.
-
-        Args:
-            request: Number of test robots.
-            train: Robots that no test robot may equal.
-            factory: Makes the robots.
-            progress: Receives the number of robots that are finished.
-            skip_unfit: Reject robots that cannot be members of a split, instead of raising.
-        """
+        """Begin with no test robots."""
         self._skip_unfit = skip_unfit
         self._request, self._factory, self._progress = request, factory, progress
         self._num_train = len(train)
@@ -225,17 +213,7 @@ def assemble(
     provenance: Mapping[str, object],
     per_robot: int = 1,
 ) -> tuple[Split, ...]:
-    """Return the requested splits, one for each size.
-
-    Args:
-        request: The request.
-        regime: Regime of the splits.
-        summary: Summary with ``{n}`` for the number of train robots.
-        train: Train members of the largest split.
-        test: Test members.
-        provenance: Arguments of the generator besides the request.
-        per_robot: Number of members of each robot.
-    """
+    """Return the requested splits, one for each size."""
     sizes = request.train or (len(train) // per_robot,)
     nested = {"nested": list(sizes)} if len(sizes) > 1 else {}
     links = {} if request.max_links == MAX_LINKS else {MAX_LINKS_KEY: request.max_links}
@@ -296,22 +274,8 @@ def interpolation(
     Train robots are numbers 0, 1, ... of the grammar with one seed; test robots are sampled with
     another seed.
 
-    Args:
-        request: Sizes, tasks and seed.
-        grammar: Grammar of all robots.
-        library: The library of parts.
-        hull: ``inside``, ``outside`` or ``any``: position of the parameters of test robots relative
-            to the convex hull of the train robots of their structure. With several sizes it is
-            the hull of the smallest split for ``inside``, of the largest one for ``outside``.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished.
-
     Returns:
         A split for each size.
-
-    Raises:
-        BenchmarkError: If ``MAX_DRAWS`` draws give too few test robots.
-        SamplingError: If the grammar gives no valid robot.
     """
     require_size(request)
     if hull not in HULLS:
@@ -400,19 +364,8 @@ def composition(
     With several tasks, a candidate is a robot with one task, and the split composes robots with
     tasks: the outermost part of a test robot is in no train robot of its task, but in others.
 
-    Args:
-        request: Sizes, tasks and seed. Without a size, all remaining candidates are train robots.
-        patterns: Patterns of the candidates, see ``pattern_robots``.
-        library: The library of parts.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished.
-
     Returns:
         A split for each size.
-
-    Raises:
-        BenchmarkError: If the candidates allow no such split; the message gives the reason.
-        MorphgenError: If a pattern names an unknown part, or parts do not fit.
     """
     candidates = list(_candidates(patterns, request.tasks, library))
     sequence = np.random.SeedSequence(request.seed)
@@ -454,11 +407,7 @@ def _require_no_near(
     train: Sequence[HoldOutCandidate],
     robot_of: Mapping[str, Candidate],
 ) -> None:
-    """Require that no test robot is nearly a train robot of its task, as the audit does.
-
-    Raises:
-        BenchmarkError: If one is.
-    """
+    """Require that no test robot is nearly a train robot of its task, as the audit does."""
     for each in test:
         others = [robot_of[other.text] for other in train if other.task == each.task]
         if reason := NearReason(others)(robot_of[each.text]):
@@ -517,18 +466,9 @@ def hold_out(
     With several tasks, candidates with the outermost part and the task of a test candidate are
     excluded, too. The remaining candidates cover every part and task of the test candidates.
 
-    Args:
-        candidates: The candidates.
-        n: Number of test candidates.
-        min_train: Smallest number of candidates that remain for training.
-        seed: Seed of the random orders in which candidates are tried.
-
     Returns:
         Test candidates, and train candidates in an order such that the first few cover each part
         and task of the test candidates.
-
-    Raises:
-        BenchmarkError: If too few candidates can be held out; the message gives the reason.
     """
     rng = np.random.default_rng(seed)
     max_held = 0
@@ -653,11 +593,7 @@ class Bound:
 
 
 def parse_bound(text: str) -> Bound:
-    """Read a bound such as ``<0.6``.
-
-    Raises:
-        BenchmarkError: If the text is malformed.
-    """
+    """Read a bound such as ``<0.6``."""
     match = _BOUND.fullmatch(text)
     if match is None or float(match[2]) > 1:
         raise BenchmarkError(
@@ -680,22 +616,8 @@ def extrapolation(
 
     Robots are sampled from the grammars in turn, so each grammar gives equally many.
 
-    Args:
-        request: Sizes, tasks and seed.
-        train_grammars: Grammars of the train robots.
-        test_grammars: Grammars of the test robots.
-        library: The library of parts.
-        similarity: Bound that test robots must meet in the split of every size.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished.
-
     Returns:
         A split for each size.
-
-    Raises:
-        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of which
-            ``MAX_COMPOSED`` are composed, give too few test robots.
-        SamplingError: If a grammar gives no valid robot.
     """
     require_size(request)
     _require_apart(train_grammars, test_grammars)

@@ -159,16 +159,7 @@ class HoldOutRule:
 def parse_rules(
     texts: Sequence[str], library: Library, origin: str = "--hold-out"
 ) -> tuple[HoldOutRule, ...]:
-    """Parse rules; each text has one, or several that are separated by commas.
-
-    Args:
-        texts: The texts.
-        library: Library of the parts that rules may name.
-        origin: Option or key that has the texts, for messages.
-
-    Raises:
-        BenchmarkError: If a rule is malformed, names nothing in the library, or is there twice.
-    """
+    """Parse rules; each text has one, or several that are separated by commas."""
     rules: list[HoldOutRule] = []
     for text in texts:
         for entry in text.split(","):
@@ -328,17 +319,7 @@ def make_pool(
     patterns: Sequence[str],
     grammars: Sequence[Grammar],
 ) -> list[Draft]:
-    """Return every robot that may be drawn, each derivation once.
-
-    Args:
-        request: Sizes and seed.
-        maker: Converts derivations to drafts.
-        patterns: Patterns of robots, see ``pattern_robots``.
-        grammars: Grammars that robots are sampled from.
-
-    Raises:
-        MorphgenError: If a pattern is malformed or names an unknown part.
-    """
+    """Return every robot that may be drawn, each derivation once."""
     drafts: dict[str, Draft] = {}
     for draft in (
         *_from_patterns(request, maker, patterns),
@@ -566,11 +547,7 @@ class HoldOutSearch:
     _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
 
     def run(self, jobs: int, progress: Progress) -> tuple[list[Candidate], list[Candidate]]:
-        """Return the test and the train robots.
-
-        Raises:
-            BenchmarkError: If there are too few.
-        """
+        """Return the test and the train robots."""
         while True:
             test, train = self._choose()
             unknown = [number for number in (*test, *train) if number not in self.robots]
@@ -734,11 +711,7 @@ def has_hold_out_rules(split: Split) -> bool:
 
 
 def hold_out_rules(split: Split, library: Library) -> tuple[HoldOutRule, ...]:
-    """Return the rules of what a split holds out.
-
-    Raises:
-        BenchmarkError: If they are missing or malformed, or name nothing in the library.
-    """
+    """Return the rules of what a split holds out."""
     origin = f"split {split.name!r}: made: {HOLD_OUT_KEY}"
     texts = split.provenance.get(HOLD_OUT_KEY)
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
@@ -753,11 +726,6 @@ def hold_out_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     - ``held-out-absent``: a test robot does not have it;
     - ``held-out-untested``: a rule holds for no test robot;
     - ``part-unseen``: a part of a test robot is not held out as such, but no train robot has it.
-
-    Raises:
-        BenchmarkError: If the rules are missing or malformed.
-        GrammarError: If a derivation is malformed.
-        PartError: If the library lacks a part.
     """
     rules = hold_out_rules(split, library)
     train, test = (
@@ -867,24 +835,8 @@ def hold_out(
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have held-out parts, and whose train robots have none.
 
-    Args:
-        request: Sizes, tasks and seed.
-        hold_out: Rules, see ``hold_out_rules.parse_rules``.
-        library: The library of parts.
-        patterns: Patterns of the robots to draw from, see ``pattern_robots``. Parameters with
-            held-out ranges are drawn, others have the pattern's values.
-        grammars: Grammars to draw from. Without patterns and grammars, robots are drawn from all
-            arms with all end-effectors.
-        jobs: Number of processes; it does not change the result.
-        progress: Receives the number of robots that are finished.
-
     Returns:
         A split for each size.
-
-    Raises:
-        BenchmarkError: If a rule is malformed, or there are too few different robots; the message
-            says how many there are.
-        MorphgenError: If a pattern names an unknown part, or parts do not fit.
     """
     require_size(request)
     rules = parse_rules(hold_out, library)

@@ -91,12 +91,7 @@ def find_licence(identifier: str) -> Licence:
 
 
 def licenced_parts(split: Split, library: Library) -> tuple[LicencedPart, ...]:
-    """Return the parts of a split's robots with their licences, sorted by licence and name.
-
-    Raises:
-        GrammarError: If a derivation is malformed.
-        PartError: If the library lacks a part.
-    """
+    """Return the parts of a split's robots with their licences, sorted by licence and name."""
     robots: dict[str, dict[tuple[str, str], None]] = {}
     for side in SIDES:
         for member in split.side(side):
@@ -152,17 +147,7 @@ def restriction_line(parts: Iterable[LicencedPart]) -> str:
 
 
 def require_allowed(split: Split, parts: Iterable[LicencedPart], allowed: Collection[str]) -> None:
-    """Require that every licence with restrictions is allowed by its identifier.
-
-    Args:
-        split: The split.
-        parts: Its parts.
-        allowed: Identifiers of licences.
-
-    Raises:
-        BenchmarkError: If a licence is not allowed, or an allowed one is not a licence of a part;
-            the message names parts and robots.
-    """
+    """Require that every licence with restrictions is allowed by its identifier."""
     parts = tuple(parts)
     ids = licence_ids(parts)
     for identifier in allowed:

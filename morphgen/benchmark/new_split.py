@@ -61,11 +61,7 @@ class RobotChoice:
     """Extrapolation: bound on the cosine to the nearest train robot, such as ``<0.6``."""
 
     def __post_init__(self) -> None:
-        """Check that there are the rules that the regime needs, and no others.
-
-        Raises:
-            BenchmarkError: If the regime is unknown, or a field is missing or has no effect.
-        """
+        """Check that there are the rules that the regime needs, and no others."""
         if self.regime not in REGIMES:
             raise BenchmarkError(f"unknown regime {self.regime!r}{nearest(self.regime, REGIMES)}")
         required = _REQUIRED[self.regime]
@@ -109,19 +105,7 @@ def choose_robots(
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
-    """Return a split for each size of a request.
-
-    Args:
-        choice: Rules by which the robots are chosen.
-        request: Sizes, tasks and seed.
-        library: The library of parts.
-        jobs: Number of processes; it does not change the result.
-        progress: Receives the number of robots that are finished.
-
-    Raises:
-        BenchmarkError: If too few robots meet the rules, or a rule is malformed.
-        MorphgenError: If a grammar or a part is unknown, or parts do not fit.
-    """
+    """Return a split for each size of a request."""
     grammars, train, test = (
         [load_sound_grammar(name, library) for name in names]
         for names in (choice.grammar, choice.train_category, choice.test_category)

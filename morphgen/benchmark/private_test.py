@@ -66,12 +66,7 @@ class PrivateSource:
 
 
 def private_source(split: Split, library: Library) -> PrivateSource:
-    """Return the source of private test robots that follow the rules of a split's public ones.
-
-    Raises:
-        BenchmarkError: As ``test_grammars``.
-        MorphgenError: If a public robot cannot be composed.
-    """
+    """Return the source of private test robots that follow the rules of a split's public ones."""
     grammars = test_grammars(split, library)
     made = split.provenance
     train, test = (_candidates(split, side, library) for side in SIDES)
@@ -95,12 +90,7 @@ def private_source(split: Split, library: Library) -> PrivateSource:
 
 
 def test_grammars(split: Split, library: Library) -> tuple[Grammar, ...]:
-    """Return the grammars of the test robots, as the split's provenance names them.
-
-    Raises:
-        BenchmarkError: If the test robots are not all drawn from grammars, or a grammar is unknown
-            or has changed.
-    """
+    """Return the grammars of the test robots, as the split's provenance names them."""
     refusal = BenchmarkError(
         f"split {split.name!r}: its test robots are not drawn from grammars ({split.regime}); a "
         "private test side is for splits of morphgen split new interpolation or extrapolation, and "
@@ -172,9 +162,6 @@ def make_secret(path: Path) -> str:
     """Return the secret of a file, which is made with a new one if it does not exist.
 
     Only the owner can read the new file.
-
-    Raises:
-        BenchmarkError: If the file holds no secret, others can read it, or it cannot be written.
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -193,11 +180,7 @@ def make_secret(path: Path) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """Read a secret; errors do not quote the file.
-
-    Raises:
-        BenchmarkError: If the file is missing, or holds something else.
-    """
+    """Read a secret; errors do not quote the file."""
     try:
         text = read_text(path, _MAX_FILE_BYTES).strip()
     except FormatError as error:
@@ -220,20 +203,8 @@ def draw_private_test(
     They follow the rules of the split's regime, and none is a train or public test robot, or nearly
     the same as one (see ``morphgen.benchmark.audit``).
 
-    Args:
-        split: The split of the release.
-        version: Version of the release.
-        robots: Number of private robots.
-        secret: The secret, 64 hexadecimal digits.
-        library: The library of parts.
-
     Returns:
         The split with the private robots as its test side, and their public description.
-
-    Raises:
-        BenchmarkError: If the split's test robots are not drawn from grammars, or there are too few
-            different robots.
-        MorphgenError: If a robot cannot be composed.
     """
     if not 1 <= robots <= MAX_ROBOTS:
         raise BenchmarkError(f"--private-test {robots}: expected 1 to {MAX_ROBOTS} robots")
@@ -262,10 +233,6 @@ def reveal(split: Split, release: Release, secret: str, library: Library) -> Spl
 
     Returns:
         The split with the private robots as its test side.
-
-    Raises:
-        BenchmarkError: If the release has no private test side, or the secret does not give the
-            robots that it committed to.
     """
     if release.private_test is None:
         raise BenchmarkError(f"{release.stem}: the release has no private test side")

@@ -46,14 +46,6 @@ def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
     """Return the robots that a pattern stands for: every choice in braces with every other one.
 
     A wildcard such as ``ee=*`` stands for all parts that fit; the part ``none`` must be named.
-
-    Args:
-        pattern: Arguments of ``morphgen compose`` with braces and wildcards.
-        library: The library of parts.
-
-    Raises:
-        BenchmarkError: If braces do not match or have an invalid choice, or no part matches.
-        MorphgenError: If the pattern names an unknown part, or parts that do not fit.
     """
     robots: list[PatternRobot] = []
     for words in expand(pattern):
@@ -74,14 +66,7 @@ def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
 
 
 def expand(pattern: str) -> list[tuple[str, ...]]:
-    """Expand the choices in braces in arguments of ``morphgen compose``: the product of all.
-
-    Args:
-        pattern: A pattern such as ``arm={ur5,panda} ee={plane,stick}``.
-
-    Raises:
-        BenchmarkError: If braces do not match, or contain an empty or repeated choice.
-    """
+    """Expand the choices in braces in arguments of ``morphgen compose``: the product of all."""
     joined = _CHOICE.sub(lambda match: re.sub(r"\s", "", match[0]), pattern)
     if "{" in _CHOICE.sub("", joined) or "}" in _CHOICE.sub("", joined):
         raise BenchmarkError(f"--from {pattern!r}: a brace is not closed, or opened twice")
@@ -136,9 +121,6 @@ def structure(derivation: Derivation, library: Library) -> str:
 
     Labels and parameters that are not whole numbers are omitted. Robots of one structure have the
     same links and joints at different sizes.
-
-    Raises:
-        PartError: If the library lacks a part.
     """
     counts = [
         f"{name}={value:g}"
@@ -164,9 +146,6 @@ def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
     """Return all parameters that are not whole numbers, under keys such as ``1.length`` [SI units].
 
     Parts are numbered as in ``Derivation.walk``, so robots of one structure have the same keys.
-
-    Raises:
-        PartError: If the library lacks a part.
     """
     result: dict[str, float] = {}
     for index, node in enumerate(derivation.walk()):
@@ -187,9 +166,8 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
     range over the other points. It is the solution of a linear program. A coordinate in which the
     other points are equal is omitted, but a point that differs in it is infinitely far away.
 
-    Args:
-        point: The point, shape (d,).
-        points: The other points, shape (n, d), at least one.
+    point: The point, shape (d,).
+    points: The other points, shape (n, d), at least one.
 
     Returns:
         The distance; 0 inside, up to rounding, see ``ON_HULL``.
@@ -224,10 +202,6 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     - Extrapolation: no train robot has its grammar or its structure.
     - Hold-out: see ``morphgen.benchmark.hold_out``, which tests all robots of a split.
     - All regimes: a train robot has its task.
-
-    Raises:
-        GrammarError: If a derivation is malformed.
-        PartError: If the library lacks a part.
     """
     train = [_Parsed(member, library) for member in split.train]
     rule = _RULES[split.regime]

@@ -131,11 +131,7 @@ def is_release(folder: Path) -> bool:
 
 
 def read_release(folder: Path) -> Release:
-    """Read the description of a release.
-
-    Raises:
-        BenchmarkError: If the folder is no release, or its description is malformed.
-    """
+    """Read the description of a release."""
     path = folder / RELEASE_FILE
     try:
         return read_record(read_json(path), Release, str(path), BenchmarkError)
@@ -156,11 +152,7 @@ def is_archive(path: Path) -> bool:
 
 @contextmanager
 def opened_folder(path: Path) -> Iterator[Path]:
-    """Yield a split folder: the one at a path, or that of an archive in a temporary folder.
-
-    Raises:
-        BenchmarkError: If it is neither, or the archive is broken, too large or not safe.
-    """
+    """Yield a split folder: the one at a path, or that of an archive in a temporary folder."""
     if not is_archive(path):
         require_split_folder(path)
         yield path

@@ -89,14 +89,7 @@ _FIELDS = (
 def croissant_text(
     split: Split, release: Release, licences: Sequence[str], sums: Mapping[str, str]
 ) -> str:
-    """Return the text of ``croissant.json``.
-
-    Args:
-        split: The split.
-        release: The release.
-        licences: Identifiers of the licences of its parts.
-        sums: SHA-256 of the release's files by path, hexadecimal.
-    """
+    """Return the text of ``croissant.json``."""
     data: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -250,15 +243,7 @@ def card_text(
     names: Iterable[str],
     rows: Sequence[RobotDifficulty],
 ) -> str:
-    """Return the dataset card: Markdown with the front matter that Hugging Face reads.
-
-    Args:
-        split: The split.
-        release: The release.
-        parts: The parts of its robots.
-        names: Paths of the release's files.
-        rows: Difficulty of every robot.
-    """
+    """Return the dataset card: Markdown with the front matter that Hugging Face reads."""
     text = _CARD.format(
         name=release.name,
         version=release.version,

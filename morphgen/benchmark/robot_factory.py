@@ -103,14 +103,7 @@ class RobotFactory:
         return Library(self.folders)
 
     def __call__(self, recipe: Recipe) -> Candidate:
-        """Make a robot.
-
-        Raises:
-            UnfitRobotError: If ``morphgen check`` reports an error of a composed robot, or a robot
-                has more than ``max_links`` links.
-            SamplingError: If the grammar gives no valid robot.
-            MorphgenError: If the recipe names an unknown part, or its parts do not fit.
-        """
+        """Make a robot."""
         if isinstance(recipe, SampledRecipe):
             sample = sample_robot(
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
@@ -162,14 +155,7 @@ def make_robots(
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> list[Candidate]:
-    """Make robots and return them in the order of their recipes.
-
-    Args:
-        recipes: The recipes.
-        factory: Factory that makes each robot.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished.
-    """
+    """Make robots and return them in the order of their recipes."""
     return list(parallel_map(factory, recipes, jobs, lambda done, _: progress(done)))
 
 
@@ -188,10 +174,6 @@ def stream_seed(seed: int, prefix: str) -> int:
     """Return the seed of the robots with one name prefix.
 
     It depends on the prefix, so robots do not change with the other robots that a split samples.
-
-    Args:
-        seed: Seed of the split.
-        prefix: Prefix of the robots' names.
     """
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
 

@@ -45,13 +45,8 @@ def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
     robot under other names has the same hash. Numbers have a resolution of 1e-7 (m, rad, kg ...),
     because their last bits differ between machines.
 
-    Args:
-        robot: The robot.
-        visuals: Include visual shapes. Without them, and with primitives as collision shapes, the
-            hash does not depend on how meshes are stored.
-
-    Raises:
-        MeshError: If a mesh file cannot be read.
+    visuals: Include visual shapes. Without them, and with primitives as collision shapes, the
+        hash does not depend on how meshes are stored.
     """
     tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
     tool_frame = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]

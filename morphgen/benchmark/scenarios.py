@@ -205,15 +205,7 @@ SCENARIOS: tuple[Scenario, ...] = (
 
 
 def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
-    """Make the splits of a scenario from its table, one for each variant.
-
-    Args:
-        name: Name of the scenario, such as ``extrapolation/arms``.
-        library: The library of parts.
-
-    Raises:
-        BenchmarkError: If the scenario is unknown.
-    """
+    """Make the splits of a scenario from its table, one for each variant."""
     scenarios = {scenario.name: scenario for scenario in SCENARIOS}
     if name not in scenarios:
         raise BenchmarkError(f"unknown scenario {name!r}{nearest(name, scenarios)}")
@@ -247,12 +239,7 @@ def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
 
 
 def write_scenarios(folder: Path, names: Iterable[str] = ()) -> list[Path]:
-    """Write the split files of scenarios and return their paths.
-
-    Args:
-        folder: Folder of the files, such as ``<folder>/extrapolation/arms/reach.yaml``.
-        names: Names of the scenarios; by default all.
-    """
+    """Write the split files of scenarios and return their paths."""
     library = default_library()
     paths = []
     for name in tuple(names) or [scenario.name for scenario in SCENARIOS]:

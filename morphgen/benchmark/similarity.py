@@ -73,14 +73,8 @@ def labelled_tree(robot: Robot, shapes: Mapping[str, Shape], reach: float) -> La
     parent. The order of children does not depend on the file: subtrees are sorted by their cost,
     descending, and then by the labels of their nodes.
 
-    Args:
-        robot: The robot.
-        shapes: One primitive per link with geometry, by link name.
-        reach: Length by which all lengths are divided [m].
-
-    Raises:
-        RobotError: If a joint axis is zero.
-        ValueError: If a shape is a mesh.
+    shapes: One primitive per link with geometry, by link name.
+    reach: Length by which all lengths are divided [m].
     """
     nodes, parents = [_Node(_GROUND)], [-1]
     T_root_link = forward_kinematics(robot, robot.home)
@@ -283,15 +277,7 @@ class Measure:
 def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
     """Compute the properties of a robot that the measures compare.
 
-    Args:
-        robot: The robot.
-        shapes: One primitive per link with geometry, by link name, as from ``token_shapes``.
-        max_links: Normalization of link indices in tokens, the same for all compared robots.
-
-    Raises:
-        BenchmarkError: If the robot has no movable tool, no tokens, or more than ``max_links``
-            links.
-        RobotError: If a joint axis is zero.
+    shapes: One primitive per link with geometry, by link name, as from ``token_shapes``.
     """
     table = compared_tokens(robot, shapes, max_links=max_links)
     space = workspace(robot)
@@ -353,16 +339,8 @@ def similarity_matrix(
 ) -> Array:
     """Compare all pairs of robots.
 
-    Args:
-        robots: Features of n robots.
-        measure: A name in ``MEASURES``.
-        progress: Called with the number of pairs compared since the last call.
-
     Returns:
         Symmetric matrix, shape (n, n).
-
-    Raises:
-        BenchmarkError: If the measure is unknown.
     """
     function = get_measure(measure).function
     values = np.empty((len(robots), len(robots)))
@@ -374,11 +352,7 @@ def similarity_matrix(
 
 
 def to_distances(values: Array, measure: str) -> Array:
-    """Convert a matrix of a measure to distances, shape (n, n): 1 - x for similarities.
-
-    Raises:
-        BenchmarkError: If the measure is unknown.
-    """
+    """Convert a matrix of a measure to distances, shape (n, n): 1 - x for similarities."""
     distances = 1 - values if get_measure(measure).larger_is_more_alike else values.copy()
     np.fill_diagonal(distances, 0.0)
     return np.asarray(np.maximum(distances, 0.0))
@@ -387,26 +361,17 @@ def to_distances(values: Array, measure: str) -> Array:
 def most_alike(values: Array, measure: str) -> int | None:
     """Return the index of the most similar robot, the first of several equal ones.
 
-    Args:
-        values: A measure of the similarity to n robots, NaN where it is not known, shape (n,).
-        measure: A name in ``MEASURES``.
+    values: A measure of the similarity to n robots, NaN where it is not known, shape (n,).
 
     Returns:
         The index; None if no value is known.
-
-    Raises:
-        BenchmarkError: If the measure is unknown.
     """
     best = np.nanargmax if get_measure(measure).larger_is_more_alike else np.nanargmin
     return None if np.isnan(values).all() else int(best(values))
 
 
 def get_measure(name: str) -> Measure:
-    """Return a measure by name.
-
-    Raises:
-        BenchmarkError: If the measure is unknown.
-    """
+    """Return a measure by name."""
     if name not in MEASURES:
         raise BenchmarkError(f"no measure {name!r}{nearest(name, MEASURES)}")
     return MEASURES[name]
@@ -436,11 +401,7 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
     analysis, 1979, section 14.4), because non-Euclidean distances give negative eigenvalues. The
     sign of each axis is chosen so that the farthest point, or the first of several, is positive.
 
-    Args:
-        distances: Symmetric distances with a zero diagonal, shape (n, n).
-
-    Raises:
-        ValueError: If the matrix is not one of distances.
+    distances: Symmetric distances with a zero diagonal, shape (n, n).
     """
     d = np.asarray(distances, dtype=np.float64)
     if d.ndim != 2 or d.shape[0] != d.shape[1] or not len(d):

@@ -61,11 +61,7 @@ class Member:
 
 
 def require_side(side: str) -> None:
-    """Require a side of a split.
-
-    Raises:
-        BenchmarkError: If it is none.
-    """
+    """Require a side of a split."""
     if side not in SIDES:
         raise BenchmarkError(f"unknown side {side!r}{nearest(str(side), SIDES)}")
 
@@ -94,11 +90,7 @@ class Split:
 
     @property
     def max_links(self) -> int:
-        """Largest number of links of a robot, which scales link indices in tokens.
-
-        Raises:
-            BenchmarkError: If the split's provenance has a value that is not a valid number.
-        """
+        """Largest number of links of a robot, which scales link indices in tokens."""
         max_links = self.provenance.get(MAX_LINKS_KEY, MAX_LINKS)
         if type(max_links) is not int or not 2 <= max_links <= LARGEST_MAX_LINKS:
             raise BenchmarkError(
@@ -108,11 +100,7 @@ class Split:
         return max_links
 
     def side(self, side: Side) -> tuple[Member, ...]:
-        """Return the members of a side.
-
-        Raises:
-            BenchmarkError: If there is no such side.
-        """
+        """Return the members of a side."""
         require_side(side)
         return self.train if side == "train" else self.test
 
@@ -127,9 +115,6 @@ def split_id(split: Split) -> str:
     """Return a hash of the regime and of the members of each side in order: 32 hex digits.
 
     It covers ``max_links`` where a split names it: the tokens of its robots depend on it.
-
-    Raises:
-        BenchmarkError: If ``max_links`` is no valid number.
     """
     sides = [[list(member.as_dict().values()) for member in split.side(side)] for side in SIDES]
     links = [split.max_links] if MAX_LINKS_KEY in split.provenance else []
@@ -143,15 +128,7 @@ def compose_side(split: Split, side: Side, library: Library) -> Iterator[Robot]:
 
 
 def compose_member(member: Member, library: Library) -> Robot:
-    """Compose the robot of a member.
-
-    Raises:
-        BenchmarkError: If the robot is not the one that the split was made with.
-        GrammarError: If the derivation is malformed.
-        CompositionError: If the parts do not fit any more.
-        PartError: If the library lacks a part or one of its parameters.
-        FormatError: If the source of a part cannot be read.
-    """
+    """Compose the robot of a member."""
     derivation = parse_derivation(member.derivation, f"derivation of {member.name!r}")
     robot = compose(derivation, library, member.name)
     composed_hash = robot_hash(robot)

@@ -74,19 +74,6 @@ def build_split(
 
     Robots that an interrupted build has written are kept if they are correct. The same split gives
     the same bytes.
-
-    Args:
-        split: The split.
-        folder: Parent folder, such as ``data``.
-        library: The library of parts.
-        jobs: Number of processes.
-        settings: Settings of the build.
-        progress: Receives the number of robots that are finished, and of all.
-
-    Raises:
-        BenchmarkError: If a robot is not the one that the split names, or the folder has other
-            content or cannot be written.
-        MorphgenError: If a robot cannot be composed.
     """
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
@@ -105,11 +92,7 @@ def build_split(
 
 
 def split_folder_path(split: Split, folder: Path) -> Path:
-    """Return the folder of a split in a parent folder.
-
-    Raises:
-        FormatError: If the split's name contains an invalid folder name.
-    """
+    """Return the folder of a split in a parent folder."""
     for name in split.name.split("/"):
         folder = bundle_folder(folder, name)
     return folder

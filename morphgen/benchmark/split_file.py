@@ -73,15 +73,7 @@ class SplitFile:
 
 
 def parse_split(text: str, path: Path) -> SplitFile:
-    """Parse the text of a split file.
-
-    Args:
-        text: YAML, see ``split_text``.
-        path: Path of the file, for messages.
-
-    Raises:
-        BenchmarkError: If it is malformed; the message has the line.
-    """
+    """Parse the text of a split file."""
     try:
         require_plain_yaml(text, str(path))
         loader = _Loader(text)
@@ -250,15 +242,7 @@ def split_names() -> list[str]:
 
 
 def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
-    """Return the path of a split file.
-
-    Args:
-        name_or_path: A file, or the name of a split in a folder or shipped with morphgen.
-        folders: Folders that are searched first for ``<folder>/<name>.yaml``.
-
-    Raises:
-        BenchmarkError: If the split does not exist.
-    """
+    """Return the path of a split file."""
     name = str(name_or_path)
     path = Path(name)
     if path.suffix == SUFFIX or path.is_file():
@@ -276,11 +260,7 @@ def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
 
 
 def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
-    """Read a split by its name or file; see ``find_split``.
-
-    Raises:
-        BenchmarkError: If it does not exist, is malformed, or was changed since it was written.
-    """
+    """Read a split by its name or file; see ``find_split``."""
     stored = read_split_file(find_split(name_or_path, folders))
     if not stored.is_whole:
         raise BenchmarkError(
@@ -292,11 +272,7 @@ def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
 
 
 def read_split_file(path: Path) -> SplitFile:
-    """Read a split file without checking its id.
-
-    Raises:
-        BenchmarkError: If it cannot be read or is malformed.
-    """
+    """Read a split file without checking its id."""
     try:
         text = read_text(path)
     except FormatError as error:
@@ -307,11 +283,7 @@ def read_split_file(path: Path) -> SplitFile:
 
 
 def write_split(split: Split, path: Path) -> None:
-    """Write a split file through a temporary file; the folder is created if needed.
-
-    Raises:
-        BenchmarkError: If it cannot be written.
-    """
+    """Write a split file through a temporary file; the folder is created if needed."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, split_text(split))
@@ -320,11 +292,7 @@ def write_split(split: Split, path: Path) -> None:
 
 
 def split_text(split: Split) -> str:
-    """Return the text of a split file.
-
-    Raises:
-        BenchmarkError: If the name of the split or of a robot is invalid.
-    """
+    """Return the text of a split file."""
     require_split_name(split.name)
     head: dict[str, object] = {
         "format": FORMAT,
@@ -345,11 +313,7 @@ def split_text(split: Split) -> str:
 
 
 def require_split_name(name: str) -> None:
-    """Check that the name of a split can be a file's name.
-
-    Raises:
-        BenchmarkError: If it cannot.
-    """
+    """Check that the name of a split can be a file's name."""
     if not is_split_name(name):
         raise BenchmarkError(f"name {name!r}: {_NAME_RULE}")
 
@@ -404,12 +368,7 @@ _VERSION = re.compile(r"(?m)^morphgen: .*\n")
 
 
 def split_paths(out: Path, splits: Sequence[Split]) -> list[Path]:
-    """Return the path of each split's file.
-
-    Args:
-        out: A file that ends in ``.yaml``, or a folder for ``<name>.yaml``.
-        splits: Splits of several sizes, or one.
-    """
+    """Return the path of each split's file."""
     if out.suffix != SUFFIX:
         return [out / f"{split.name}{SUFFIX}" for split in splits]
     if len(splits) == 1:
@@ -421,9 +380,6 @@ def write_new_splits(splits: Sequence[Split], paths: Sequence[Path]) -> None:
     """Write all files, or none if one of them exists with another content.
 
     A file of the same content that another version of morphgen wrote is kept.
-
-    Raises:
-        BenchmarkError: If a file exists with another content, or cannot be written.
     """
     missing = []
     for split, path in zip(splits, paths, strict=True):

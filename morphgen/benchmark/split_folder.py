@@ -117,14 +117,7 @@ class SplitFolder:
 
 
 def load_split_folder(folder: str | Path) -> SplitFolder:
-    """Read a folder that ``morphgen split build`` wrote, without its bundles.
-
-    Args:
-        folder: The folder, such as ``data/extrapolation/arms/reach``.
-
-    Raises:
-        BenchmarkError: If it is not a split folder, is not finished, or its files disagree.
-    """
+    """Read a folder that ``morphgen split build`` wrote, without its bundles."""
     folder = Path(folder)
     require_split_folder(folder)
     records = read_records(folder / ROBOTS_FILE)
@@ -137,11 +130,7 @@ def load_split_folder(folder: str | Path) -> SplitFolder:
 
 
 def require_split_folder(folder: Path) -> None:
-    """Check that a folder is a finished split folder.
-
-    Raises:
-        BenchmarkError: If it is not.
-    """
+    """Check that a folder is a finished split folder."""
     if not folder.is_dir():
         raise BenchmarkError(f"{folder}: no such folder")
     if not (folder / BUILD_FILE).is_file():
@@ -155,11 +144,7 @@ def require_split_folder(folder: Path) -> None:
 
 
 def read_records(path: Path) -> list[Record]:
-    """Read the lines of ``robots.jsonl``.
-
-    Raises:
-        BenchmarkError: If the file is missing or a line is malformed; the message has its number.
-    """
+    """Read the lines of ``robots.jsonl``."""
     records = []
     for number, line in enumerate(_text(path).splitlines(), 1):
         try:
@@ -173,11 +158,7 @@ def read_records(path: Path) -> list[Record]:
 
 
 def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.bool_]]:
-    """Read names, tokens and mask of ``tokens.npz``.
-
-    Raises:
-        BenchmarkError: If it is missing or cannot be read, or the shapes of its arrays disagree.
-    """
+    """Read names, tokens and mask of ``tokens.npz``."""
     try:
         names, tokens, mask = read_npz(path, ("names", "tokens", "mask"))
     except FileNotFoundError as error:
@@ -200,11 +181,7 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
 
 
 def read_sums(path: Path) -> dict[str, str]:
-    """Read SHA-256 hashes by path, as ``sha256sum`` writes them.
-
-    Raises:
-        BenchmarkError: If the file is missing or a line is malformed; the message has its number.
-    """
+    """Read SHA-256 hashes by path, as ``sha256sum`` writes them."""
     sums = {}
     for number, line in enumerate(_text(path).splitlines(), 1):
         match = _SUM.fullmatch(line)
@@ -215,11 +192,7 @@ def read_sums(path: Path) -> dict[str, str]:
 
 
 def read_settings(path: Path) -> tuple[str, bool]:
-    """Read the id of the split, and if its robots were built light, from ``build.json``.
-
-    Raises:
-        BenchmarkError: If the file is missing or malformed.
-    """
+    """Read the id of the split, and if its robots were built light, from ``build.json``."""
     try:
         data = parse_json(_text(path), str(path))
         if data["format"] != FORMAT:
@@ -289,11 +262,7 @@ class BuildSettings:
     """Add ``preview.png`` to the bundles."""
 
     def __post_init__(self) -> None:
-        """Check that both can be done.
-
-        Raises:
-            BenchmarkError: If a light build is to have pictures.
-        """
+        """Check that both can be done."""
         if self.light and self.picture:
             raise BenchmarkError("a light build has no pictures; choose one of light and picture")
 
@@ -312,26 +281,13 @@ class RobotData:
 
 
 def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotData:
-    """Measure a robot.
-
-    Args:
-        robot: The robot.
-        folders: Folders of parts, for their stored fits.
-        max_links: Largest number of links in the split.
-
-    Raises:
-        BenchmarkError: If the robot has more links.
-    """
+    """Measure a robot."""
     table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     return RobotData(robot_stats(robot).as_dict(), table)
 
 
 def unique_robots(split: Split) -> list[Member]:
-    """Return the first member of each robot, train first; its name is that of the folder.
-
-    Raises:
-        BenchmarkError: If two different robots have the same name.
-    """
+    """Return the first member of each robot, train first; its name is that of the folder."""
     firsts: dict[str, Member] = {}
     hash_by_name: dict[str, str] = {}
     for _, member in sided_members(split):
@@ -350,12 +306,7 @@ def robot_paths(split: Split) -> dict[str, str]:
 
 
 def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
-    """Return the lines of ``robots.jsonl``.
-
-    Args:
-        split: The split.
-        known: Data of each robot by its hash.
-    """
+    """Return the lines of ``robots.jsonl``."""
     paths = robot_paths(split)
     return [
         {
@@ -444,11 +395,7 @@ _REL_TOL, _ABS_TOL = 1e-6, 1e-9
 
 
 def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
-    """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation.
-
-    Raises:
-        FormatError: If the folder cannot be written.
-    """
+    """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation."""
     if light:
         with replacing_folder(folder) as partial:
             for name, text in _light_files(robot).items():

@@ -13,11 +13,7 @@ from morphgen.errors import BenchmarkError
 
 
 def read_split_or_folder(name: str | PathLike[str]) -> tuple[Split, Path | None]:
-    """Return a split by its name, its file or its built folder; and that folder.
-
-    Raises:
-        BenchmarkError: If there is no such split.
-    """
+    """Return a split by its name, its file or its built folder; and that folder."""
     folder = Path(name)
     if is_archive(folder):
         raise BenchmarkError(f"{folder}: the archive of a release; unpack it, and name the folder")

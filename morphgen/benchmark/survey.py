@@ -103,11 +103,7 @@ class SplitSurvey:
         return self.similarity[:, :, tuple(MEASURES).index(measure)]
 
     def composed(self, side: Side) -> tuple[SurveyedRobot, ...]:
-        """Return the robots of a side.
-
-        Raises:
-            BenchmarkError: If one cannot be composed or measured; the message says why.
-        """
+        """Return the robots of a side."""
         split, robots = self.split, []
         surveyed = self.train if side == "train" else self.test
         for member, robot in zip(split.side(side), surveyed, strict=True):
@@ -131,16 +127,7 @@ def robot_stats(robot: Robot) -> RobotStats:
 
 
 def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> MeasuredRobot | Fault:
-    """Measure a robot, unless it has more links than its split allows.
-
-    Args:
-        robot: The robot.
-        folders: Folders of parts, for their stored fits.
-        max_links: Largest number of links in the split.
-
-    Raises:
-        MorphgenError: If the robot has no tokens or no movable tool.
-    """
+    """Measure a robot, unless it has more links than its split allows."""
     if len(robot.links) > max_links:
         why = f"it has {len(robot.links)} links, more than max_links {max_links}"
         return Fault("links-many", why)
@@ -157,19 +144,7 @@ def survey_split(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> SplitSurvey:
-    """Compose, measure and compare the robots of a split; equal ones once in train and test each.
-
-    Args:
-        split: The split.
-        library: Library of its parts.
-        within_train: Compare the train robots with each other, too.
-        jobs: Number of processes.
-        progress: Called repeatedly with the numbers of finished and of all robots; train robots
-            count twice with ``within_train``.
-
-    Raises:
-        BenchmarkError: If ``jobs`` is below 1, or the split's provenance is malformed.
-    """
+    """Compose, measure and compare the robots of a split; equal ones once in each side."""
     train_members, test_members = _firsts(split.train), _firsts(split.test)
     done_first = len(train_members) + len(test_members)
     total = done_first + within_train * len(train_members)
@@ -314,17 +289,8 @@ def statistics(
 ) -> dict[str, object]:
     """Compute the statistics that the file of a split contains.
 
-    Args:
-        split: The split.
-        library: Library of its parts.
-        jobs: Number of processes.
-        progress: Called as by ``survey_split``.
-
     Returns:
         Plain data; see ``summarize_survey``.
-
-    Raises:
-        BenchmarkError: If a robot cannot be composed, or train or test is empty.
     """
     return summarize_survey(survey_split(split, library, jobs=jobs, progress=progress))
 
@@ -338,9 +304,6 @@ def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
         tool (``movable_to_tool``); mean, minimum and maximum of ``mass`` [kg] and ``reach`` [m]. A
         robot with two tasks counts twice. For ``cosine``: mean, minimum and maximum of the cosine
         similarity over all pairs of a test and a train robot.
-
-    Raises:
-        BenchmarkError: If a robot could not be composed, or train or test is empty.
     """
     return {
         **{side: _side(survey, side) for side in SIDES},

@@ -96,11 +96,7 @@ def default_max_links(link_counts: Iterable[int]) -> int:
 
 
 def require_max_links(n_links: int, what: str, max_links: int) -> None:
-    """Require at most ``max_links`` links, and a valid ``max_links``.
-
-    Raises:
-        BenchmarkError: If one of the two is violated; ``what`` names the robot in the message.
-    """
+    """Require at most ``max_links`` links, and a valid ``max_links``."""
     max_links = whole_number("max_links", max_links, BenchmarkError)
     if not 2 <= max_links <= LARGEST_MAX_LINKS:
         raise BenchmarkError(
@@ -114,11 +110,7 @@ def require_max_links(n_links: int, what: str, max_links: int) -> None:
 
 
 def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
-    """Require that tokens (n_links, 48) are finite.
-
-    Raises:
-        BenchmarkError: If a number is not finite; the message names its link and field.
-    """
+    """Require that tokens (n_links, 48) are finite."""
     invalid = np.argwhere(~np.isfinite(tokens))
     if len(invalid):
         row, column = invalid[0].tolist()
@@ -130,15 +122,10 @@ def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
 def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
     """Pad tokens with rows of zeros, so that robots of different sizes share a batch.
 
-    Args:
-        tokens: Tokens of one robot, shape (..., n_links, 48).
-        max_links: Number of rows after padding.
+    tokens: Tokens of one robot, shape (..., n_links, 48).
 
     Returns:
         Tokens (..., max_links, 48), and a mask (max_links,) that is True for links.
-
-    Raises:
-        BenchmarkError: If there are more links than ``max_links``.
     """
     n_links = tokens.shape[-2]
     require_max_links(n_links, "the robot", max_links)
@@ -172,8 +159,7 @@ def encode_position(x: Array) -> Array:
     As in NeRF (Mildenhall et al. 2020, equation 4), but the lowest frequency is pi/2 instead of pi,
     with which both limits would have the same code.
 
-    Args:
-        x: Positions, -1 at the lower and 1 at the upper limit, shape (...).
+    x: Positions, -1 at the lower and 1 at the upper limit, shape (...).
 
     Returns:
         Eight sines, then eight cosines, shape (..., 16).
@@ -183,11 +169,7 @@ def encode_position(x: Array) -> Array:
 
 
 def decode_position(numbers: Array) -> float:
-    """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2].
-
-    Raises:
-        ValueError: If the frequencies contradict each other.
-    """
+    """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2]."""
     x = math.atan2(numbers[0], numbers[len(FREQUENCIES)]) / (math.pi / 2)
     error = np.abs(encode_position(np.array(x)) - numbers)
     if error.max() > TOLERANCE:
@@ -199,11 +181,7 @@ def decode_position(numbers: Array) -> float:
 
 
 def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
-    """Encode a primitive; a capsule becomes the cylinder of its total length.
-
-    Raises:
-        ValueError: If the geometry is a mesh, or a size is not positive.
-    """
+    """Encode a primitive; a capsule becomes the cylinder of its total length."""
     match geometry:
         case Sphere(radius):
             kind, sizes = "sphere", (radius, radius, radius)
@@ -222,11 +200,7 @@ def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
 
 
 def decode_primitive(numbers: Array) -> Primitive | None:
-    """Decode the 6 numbers of ``geometry``; None if they are zeros.
-
-    Raises:
-        ValueError: If they are not the code of a primitive.
-    """
+    """Decode the 6 numbers of ``geometry``; None if they are zeros."""
     if not numbers.any():
         return None
     kind = SHAPES[_hot_index(numbers[:3], SHAPES)]
@@ -246,29 +220,17 @@ def encode_kind(kind: JointKind) -> tuple[float, ...]:
 
 
 def decode_kind(numbers: Array) -> JointKind:
-    """Decode the 3 numbers of ``joint type``.
-
-    Raises:
-        ValueError: If they are not a one-hot code.
-    """
+    """Decode the 3 numbers of ``joint type``."""
     return KINDS[_hot_index(numbers, KINDS)]
 
 
 def encode_pose(pose: Pose) -> tuple[float, ...]:
-    """Encode a pose as its position [m] and its quaternion (w, x, y, z) with w >= 0.
-
-    Raises:
-        ValueError: If the quaternion is zero or not finite.
-    """
+    """Encode a pose as its position [m] and its quaternion (w, x, y, z) with w >= 0."""
     return (*pose.position, *rotation.normalize(pose.quaternion))
 
 
 def decode_pose(numbers: Array) -> Pose:
-    """Decode the 7 numbers of a pose.
-
-    Raises:
-        ValueError: If the quaternion is not of unit length.
-    """
+    """Decode the 7 numbers of a pose."""
     x, y, z, w, a, b, c = numbers.tolist()
     norm = math.hypot(w, a, b, c)
     if abs(norm - 1) > TOLERANCE:
@@ -277,11 +239,7 @@ def decode_pose(numbers: Array) -> Pose:
 
 
 def decode_axis(numbers: Array) -> Vec3:
-    """Decode the 3 numbers of ``joint axis``.
-
-    Raises:
-        ValueError: If the axis is not of unit length.
-    """
+    """Decode the 3 numbers of ``joint axis``."""
     x, y, z = numbers.tolist()
     length = math.hypot(x, y, z)
     if abs(length - 1) > TOLERANCE:
@@ -290,11 +248,7 @@ def decode_axis(numbers: Array) -> Vec3:
 
 
 def decode_flag(numbers: Array) -> bool:
-    """Decode the 4 numbers of ``end-effector``.
-
-    Raises:
-        ValueError: If its four numbers are neither all 0 nor all 1.
-    """
+    """Decode the 4 numbers of ``end-effector``."""
     flag = numbers[0] > 0.5
     if np.abs(numbers - flag).max() > TOLERANCE:
         raise ValueError(f"{_format(numbers.tolist())} is neither four times 0 nor four times 1")
@@ -395,16 +349,10 @@ def tokens(
 def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
     """Return the field ``joint position``, the only part of the tokens that changes with ``q``.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (..., dof) [rad or m].
+    q: Independent joint positions, shape (..., dof) [rad or m].
 
     Returns:
         Codes, shape (..., n_links, 16); zeros for the root and for fixed joints.
-
-    Raises:
-        BenchmarkError: If a position is not finite or a joint has no range.
-        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
     x = normalize_positions(robot, q)
     codes = np.zeros((*x.shape[:-1], len(robot.links), POSITION.size))
@@ -419,16 +367,10 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
     and divided by pi. Those of prismatic joints without limits stay in metres. Mimic joints follow
     their leaders.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (..., dof) [rad or m].
+    q: Independent joint positions, shape (..., dof) [rad or m].
 
     Returns:
         Normalized positions in the order of ``robot.movable_joints``, shape (..., n_movable).
-
-    Raises:
-        BenchmarkError: If a position is not finite or a joint has no range.
-        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
     joints = [robot.joints[k] for k in robot.movable_joints]
     for joint in joints:
@@ -462,16 +404,10 @@ def robot_from_tokens(
     so that q is the normalized position. The home is the configuration of the tokens, and the tool
     frame is its link's frame. ``docs/tokens.md`` lists what tokens do not contain.
 
-    Args:
-        tokens: Tokens of one robot in one configuration, without padding, shape (n_links, 48).
-        name: Name of the robot.
-        max_links: The value with which the tokens were encoded.
+    tokens: Tokens of one robot in one configuration, without padding, shape (n_links, 48).
 
     Returns:
         The robot, and its primitives by link name, as ``tokens`` takes them.
-
-    Raises:
-        BenchmarkError: If the tokens are invalid; the message names link and field.
     """
     table = np.asarray(tokens, dtype=np.float64)
     what = f"tokens of {name!r}"
@@ -520,11 +456,7 @@ class _Token:
     """The numbers of the token, shape (48,)."""
 
     def decode(self, field: Field, decode: Callable[[Array], T]) -> T:
-        """Decode a field.
-
-        Raises:
-            BenchmarkError: If its numbers are invalid.
-        """
+        """Decode a field."""
         try:
             return decode(self.numbers[field.columns])
         except ValueError as error:

@@ -81,15 +81,7 @@ def release_differences(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what a release states otherwise than its split: a file, and what is wrong with it.
-
-    Args:
-        folder: The unpacked release.
-        split: Its split.
-        library: The library of parts.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all.
-    """
+    """Yield what a release states otherwise than its split: a file, and what is wrong with it."""
     try:
         release = read_release(folder)
         if (release.name, release.id) != (split.name, split_id(split)):
@@ -207,15 +199,6 @@ def verify(
     The id of the split and the hash of each robot are tested. In a split folder every file is
     compared with ``SHA256SUMS`` and with the robot that its derivation gives, too; in a release
     also its description, its licences and its difficulty.
-
-    Args:
-        name_or_path: Name or file of a split, a split folder, or the archive of a release.
-        library: The library of parts.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all.
-
-    Raises:
-        BenchmarkError: If the split does not exist or cannot be read.
     """
     folder = Path(name_or_path)
     if is_archive(folder):
@@ -245,15 +228,7 @@ def verify(
 
 
 def require_unchanged(folder: Path, name: str) -> None:
-    """Require that the files of a split folder are those that ``SHA256SUMS`` lists.
-
-    Args:
-        folder: A split folder.
-        name: Name of the folder or archive, for the error.
-
-    Raises:
-        BenchmarkError: If a file differs, is missing or is not listed.
-    """
+    """Require that the files of a split folder are those that ``SHA256SUMS`` lists."""
     changed = list(_file_differences(folder))
     if changed:
         more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""

@@ -51,25 +51,13 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
     is fixed and joints are drawn from the base on, so that one arm with different grippers gets the
     same arm configurations. Each sample is distributed over the eight nodes around it by trilinear
     weights.
-
-    Args:
-        robot: The robot.
-        samples: Number of configurations.
-
-    Raises:
-        BenchmarkError: If the robot has no frame ``tool``, no joint moves it, or a joint has no
-            range.
     """
     points, centre, farthest = _tool_points(robot, samples)
     return Workspace(_density(points / farthest), centre, farthest)
 
 
 def tool_reach(robot: Robot) -> tuple[Vec3, float]:
-    """Return the ``shoulder`` and the ``reach`` of a robot's ``workspace``.
-
-    Raises:
-        BenchmarkError: As ``workspace``.
-    """
+    """Return the ``shoulder`` and the ``reach`` of a robot's ``workspace``."""
     _, centre, farthest = _tool_points(robot, SAMPLES)
     return centre, farthest
 
@@ -107,10 +95,6 @@ def shoulder(robot: Robot) -> Vec3:
     nearest to the next axis not parallel to it, as in the Denavit-Hartenberg convention. If all
     axes are parallel, it is the point nearest to the tool; without rotational joints, the tool
     itself. Joints are in the middle of their range, which matters for prismatic joints only.
-
-    Raises:
-        BenchmarkError: If the robot has no frame ``tool``, no joint moves it, or a joint has no
-            range.
     """
     chain = _tool_chain(robot)
     T_root_link = forward_kinematics(robot, joint_limits(robot).mean(axis=1))

@@ -134,14 +134,6 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
     The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared with
     ``morphgen.model.kinematics``. Mimic joints are set like any other joint, except in yourdfpy,
     which moves them itself. A robot without a frame ``tool`` is compared at its last link.
-
-    Args:
-        bundle_dir: Folder of the bundle.
-        samples: Number of random configurations within the joint limits.
-        seed: Seed of the configurations.
-
-    Raises:
-        FormatError: If ``bundle_dir`` is not a bundle, ``samples`` is below 1 or ``seed`` below 0.
     """
     robot = read_bundle(bundle_dir)
     with loader_copy(bundle_dir) as folder:
@@ -152,9 +144,6 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
     """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``.
 
     The loaders open the folder, so it must be morphgen's own or a ``loader_copy``.
-
-    Raises:
-        FormatError: If ``samples`` is below 1, ``seed`` below 0, or one of them no whole number.
     """
     samples = whole_number("samples", samples, FormatError, 1)
     seed = whole_number("seed", seed, FormatError, 0)
@@ -178,15 +167,6 @@ def compare_file(
 
     The loaders get a private copy of the file, with its meshes beside it; see ``loader_copy``. The
     pose is that of the last link that moves, because loaders may join others to their parents.
-
-    Args:
-        path: The file.
-        finder: Finds ROS packages, and the folder that files may come from.
-        samples: Number of random configurations within the joint limits.
-        seed: Seed of the configurations.
-
-    Raises:
-        MorphgenError: If morphgen cannot read the file.
     """
     robot = read_description(path, finder=finder)
     moving = [joint.child for joint in robot.joints if joint.is_movable]

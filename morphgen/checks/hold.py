@@ -110,12 +110,7 @@ class HoldRow:
 
 
 def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
-    """Hold a robot at home and step its joints with the files of its bundle in each simulator.
-
-    Args:
-        robot: The robot that the bundle holds.
-        folder: Folder of the bundle.
-    """
+    """Hold a robot at home and step its joints with the files of its bundle in each simulator."""
 
     def in_new_bundle(hold: Callable[[Robot, Path], HoldRow], robot: Robot) -> HoldRow:
         with TemporaryDirectory() as parent:
@@ -143,11 +138,6 @@ def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) ->
 
     A property of the joints is a cause if the robot fails with it and passes, or fails only for
     known causes, without it.
-
-    Args:
-        row: The row.
-        robot: The robot.
-        hold: Returns the row of a robot in the same simulator.
     """
     if not _is_unknown(row):
         return row
@@ -193,12 +183,7 @@ def hold_row(
     The joints step one after the other, each from home, away from their nearer limit. A robot that
     does not hold its home makes no steps.
 
-    Args:
-        name: Name of the row.
-        module: Import name of the simulator, which may not be installed.
-        robot: The robot.
-        simulated: Opens the simulation; raises ``MorphgenError`` if it cannot.
-        contact_margin: Distance at which links push each other away [m]; None if they never do.
+    contact_margin: Distance at which links push each other away [m]; None if they never do.
     """
     if find_spec(module) is None:
         return HoldRow(name, None, message="not installed")
@@ -400,11 +385,7 @@ def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
 
 
 def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
-    """Return a simulator's indices of the movable joints.
-
-    Raises:
-        FormatError: If the simulator lacks one.
-    """
+    """Return a simulator's indices of the movable joints."""
     names = [robot.joints[k].name for k in robot.movable_joints]
     if missing := sorted(set(names) - index.keys()):
         raise FormatError(f"lacks joints {', '.join(missing)}")

@@ -733,18 +733,10 @@ def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
     that they have on their two bodies: the nested transforms of the prims are only the pose in
     which all joints are at zero.
 
-    Args:
-        urdf: The robot's URDF.
-        frame: Name of the frame's link in the URDF; empty for the root.
-        q: Positions of every movable joint, shape (n,) [rad or m].
-        n: Number of configurations.
+    q: Positions of every movable joint, shape (n,) [rad or m].
 
     Returns:
         The robot. Of its joints only the position limits are read: ``UsdPhysics`` has no others.
-
-    Raises:
-        FormatError: If the converter refuses the URDF, or the stage has no prim for the frame.
-        ModuleNotFoundError: If urdf-usd-converter is not installed.
     """
     from pxr import Usd, UsdPhysics
 

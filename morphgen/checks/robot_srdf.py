@@ -68,15 +68,6 @@ def collision_matrix(
 
     As in all collision checks, meshes count as their convex hulls. Hulls contain their meshes, so
     that a pair whose hulls never collide is safe for planners that test the meshes, too.
-
-    Args:
-        robot: The robot.
-        samples: Number of configurations, drawn uniformly within the joint limits.
-        seed: Seed of the configurations.
-
-    Raises:
-        MeshError: If a collision mesh cannot be read.
-        RobotError: If MuJoCo refuses the shapes, or contacts exceed its memory.
     """
     loose, columns = _with_loose_joints(robot)
     collidable = [link.name for link in robot.links if link.collisions]
@@ -156,19 +147,7 @@ def robot_srdf_text(
     seed: int = 0,
     spheres: tuple[LinkSpheres, ...] = (),
 ) -> str:
-    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
-
-    Args:
-        robot: The robot.
-        samples: Number of sampled configurations.
-        seed: Seed of the configurations.
-        spheres: Spheres that approximate links.
-
-    Raises:
-        FormatError: As ``robot_srdf``.
-        MeshError: If a collision mesh cannot be read.
-        RobotError: As ``collision_matrix``.
-    """
+    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment."""
     require_tool(robot)
     matrix = collision_matrix(robot, samples=samples, seed=seed)
     srdf = replace(robot_srdf(robot, matrix), link_spheres=spheres)
@@ -182,13 +161,6 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
     the robot has an end-effector there: the links of its part, or in a robot that was not composed
     of parts, the links around the joints that do not move the tool, such as those of a gripper.
     The groups of a robot with several limbs are named after them, such as ``left_arm``.
-
-    Args:
-        robot: The robot, with a frame ``tool``.
-        matrix: The pairs of its links whose collisions need no test.
-
-    Raises:
-        FormatError: If the robot has no frame ``tool``.
     """
     require_tool(robot)
     groups: list[Group] = []

@@ -48,15 +48,7 @@ class SelfCollisionChecker:
     ) -> None:
         """Compile the collision model.
 
-        Args:
-            robot: The robot.
-            ignore: Pairs of links that are not tested; by default ``robot.ignore_pairs``. Links
-                joined by fixed joints are one MuJoCo body and never tested against each other.
-            margin: Links that are nearer than this count, too, with a negative depth [m].
-
-        Raises:
-            MeshError: If a collision mesh cannot be read.
-            RobotError: If ``ignore`` names an unknown link.
+        margin: Links that are nearer than this count, too, with a negative depth [m].
         """
         import mujoco  # here, because commands that test no collisions should start quickly
 
@@ -76,12 +68,7 @@ class SelfCollisionChecker:
         self._perturbation = np.linspace(1.0, 0.5, len(self._qpos))
 
     def place(self, link: str, T_parent_joint: Pose) -> None:
-        """Move the joint of a link in its parent, from now on.
-
-        Args:
-            link: Name of the link.
-            T_parent_joint: New pose of its joint.
-        """
+        """Move the joint of a link in its parent, from now on."""
         body = self._model.body(str(self._robot.link_index[link])).id
         self._model.body_pos[body] = T_parent_joint.position
         self._model.body_quat[body] = T_parent_joint.quaternion
@@ -89,17 +76,11 @@ class SelfCollisionChecker:
     def penetrations(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
         """Test configurations, one at a time as the result is iterated.
 
-        Args:
-            q: Independent joint positions, shape (n, dof) [rad or m].
+        q: Independent joint positions, shape (n, dof) [rad or m].
 
         Returns:
             For each configuration, every penetrating pair of links and its depth [m], which is
             more than ``PENETRATION``.
-
-        Raises:
-            ValueError: If ``q`` has another shape.
-            RobotError: If the contacts of one configuration do not fit into memory, or MuJoCo
-                finds no depth for two overlapping shapes. Raised while iterating.
         """
         rows = self._require_rows(q)
         return (self._test(positions) for positions in movable_positions(self._robot, rows))
@@ -109,15 +90,10 @@ class SelfCollisionChecker:
 
         Several times as fast as ``penetrations``, which says what penetrates.
 
-        Args:
-            q: Independent joint positions, shape (n, dof) [rad or m].
+        q: Independent joint positions, shape (n, dof) [rad or m].
 
         Returns:
             Shape (n,).
-
-        Raises:
-            ValueError: As ``penetrations``.
-            RobotError: As ``penetrations``.
         """
         import mujoco
 
@@ -140,11 +116,7 @@ class SelfCollisionChecker:
         return free
 
     def _require_rows(self, q: ArrayLike) -> Array:
-        """Return configurations as an array.
-
-        Raises:
-            ValueError: If it has not two axes.
-        """
+        """Return configurations as an array."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2:
             raise ValueError(f"q has shape {q.shape}; {self._robot.name} needs (n, dof)")
@@ -214,17 +186,6 @@ def survey_collisions(
 
     A robot composed of parts whose own pairs are known costs less: pass these as ``known_pairs``
     and, as ``should_test``, whether two links belong to different parts.
-
-    Args:
-        robot: The robot.
-        known_pairs: Pairs to ignore without a test.
-        should_test: Whether two links are tested at random configurations; by default all are.
-            At home, every pair is tested.
-        samples: Number of random configurations; none are drawn if no pair is left to test.
-        seed: Seed of the random configurations.
-
-    Raises:
-        MeshError: If a collision mesh cannot be read.
     """
     ignore = {sorted_pair(*pair) for pair in known_pairs} | set(adjacent_pairs(robot))
     collidable = [link.name for link in robot.links if link.collisions]

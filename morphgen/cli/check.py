@@ -61,18 +61,7 @@ def check(args: argparse.Namespace) -> int:
 def _findings(
     source: RobotSource, library: Library, args: argparse.Namespace, written: dict[Path, str]
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
-    """Return a robot's findings, and those that its repair into ``--fix`` removed.
-
-    Args:
-        source: The robot.
-        library: The library of parts.
-        args: The options.
-        written: Robots of the bundles that the command has written; the new one is added.
-
-    Raises:
-        FormatError: If another robot of the same name was repaired.
-        MorphgenError: If the robot cannot be read.
-    """
+    """Return a robot's findings, and those that its repair into ``--fix`` removed."""
     from morphgen.api.checks import bundle_of, check_source
     from morphgen.checks import check, fix
     from morphgen.formats.bundle import bundle_folder, write_bundle

@@ -64,12 +64,7 @@ def repeated(name: str, help: str, **settings: object) -> Option:
 
 
 def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]:
-    """Return a type for argparse: a whole number, also as ``2e6``.
-
-    Args:
-        least: The smallest valid number.
-        largest: The largest valid number; None for no limit.
-    """
+    """Return a type for argparse: a whole number, also as ``2e6``."""
     valid = f"{least} or more" if largest is None else f"{least} to {largest}"
 
     def parse(text: str) -> int:
@@ -213,15 +208,7 @@ def add_commands(
     dest: str = "command",
     has_options: bool = False,
 ) -> None:
-    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest.
-
-    Args:
-        parser: Parser of the group.
-        commands: Commands of the group.
-        required: Whether one of them must be given.
-        dest: Attribute for the name of the chosen one.
-        has_options: Whether the group can run without a command and has options for that.
-    """
+    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest."""
     action = _CommandAfterOptions if has_options else argparse._SubParsersAction
     parsers = parser.add_subparsers(
         metavar="COMMAND", dest=dest, required=required, parser_class=Parser, action=action
@@ -231,11 +218,7 @@ def add_commands(
 
 
 def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the arguments; words of a request may stand before and after options.
-
-    Raises:
-        UsageError: If the command line is invalid.
-    """
+    """Return the arguments; words of a request may stand before and after options."""
     args, rest = parser.parse_known_args(argv)
     used = getattr(args, "parser", parser)
     unknown = next((word for word in rest if word.startswith("-")), None)

@@ -80,21 +80,7 @@ def plan_submission(
     training_seed: int | None = None,
     training: Training | None = None,
 ) -> PlannedSubmission | None:
-    """Return the submission that the arguments ask for, or None.
-
-    Args:
-        args: Arguments of ``morphgen eval``.
-        source: The robots, any side of a split.
-        config: Configuration of the evaluation.
-        method: Name of the method unless ``--method`` is given.
-        mode: How the policy acts; empty for a baseline.
-        training_seed: Seed of the training; None for a baseline.
-        training: How the policy was trained, if it is known.
-
-    Raises:
-        TaskError: If the robots are not those of a split, or the test side is left out.
-        BenchmarkError: If the evaluation does not follow the rules, or the name is invalid.
-    """
+    """Return the submission that the arguments ask for, or None."""
     from morphgen.formats.files import require_writable_file
     from morphgen.rl.runs.robot_source import split_of
     from morphgen.rl.scores.submission import SubmissionRecorder, require_rules

@@ -325,11 +325,7 @@ def export(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> ExportSettings:
-    """Return the values of the options that only some formats have.
-
-    Raises:
-        FormatError: If one is given that the format does not have.
-    """
+    """Return the values of the options that only some formats have."""
     given = {
         "samples": args.samples,
         "seed": args.seed,

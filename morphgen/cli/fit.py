@@ -159,11 +159,7 @@ def fit(args: argparse.Namespace) -> None:
 
 
 def _require_own_names(targets: Sequence[Target]) -> None:
-    """Require that no two robots have one name, which is that of their folder.
-
-    Raises:
-        FormatError: If two have; better now than after the fits.
-    """
+    """Require that no two robots have one name, which is that of their folder."""
     labels: dict[str, str] = {}
     for target in targets:
         other = labels.setdefault(target.robot.name, target.label)
@@ -175,11 +171,7 @@ def _require_own_names(targets: Sequence[Target]) -> None:
 
 
 def _reject_idle_options(args: argparse.Namespace) -> None:
-    """Refuse options that have no effect on the kind of fit.
-
-    Raises:
-        MorphgenError: If there is one.
-    """
+    """Refuse options that have no effect on the kind of fit."""
     several = {"--iou": args.iou is not None, "--search": args.search is not None}
     if args.spheres is None:
         opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
@@ -233,11 +225,7 @@ def _targets(args: argparse.Namespace) -> list[Target]:
 
 
 def _folder(args: argparse.Namespace, target: Target, *, several: bool) -> Path:
-    """Return the folder of the bundle.
-
-    Raises:
-        FormatError: If the bundle cannot be written there; better now than after the fit.
-    """
+    """Return the folder of the bundle."""
     from morphgen.formats.bundle import bundle_folder, require_replaceable
 
     parent, name = (args.out, target.robot.name) if several else (args.out.parent, args.out.name)

@@ -96,11 +96,7 @@ def goal_option(default: str = GOAL_KINDS[0]) -> Option:
 def with_goal(
     configs: Iterable[TaskConfig], goal: str | None, tasks: Iterable[str]
 ) -> tuple[TaskConfig, ...]:
-    """Return configs of tasks with the goal of reach that ``--goal`` names; None changes nothing.
-
-    Raises:
-        TaskError: If a goal is named and none of the robots' tasks is reach.
-    """
+    """Return configs of tasks with the goal of reach that ``--goal`` names; None keeps it."""
     from morphgen.tasks.reach.config import ReachConfig
 
     if goal is None:
@@ -132,15 +128,7 @@ def library_of(args: argparse.Namespace) -> Library:
 def sources_of(
     args: argparse.Namespace, refuse: Callable[[str, FormatError], object] | None = None
 ) -> list[RobotSource]:
-    """Return the sources of the robots that the arguments name, one or several.
-
-    Args:
-        args: The arguments.
-        refuse: As for ``find_robots``.
-
-    Raises:
-        MorphgenError: If a word names no robot, or ``--root`` is given for a composed robot.
-    """
+    """Return the sources of the robots that the arguments name, one or several."""
     from morphgen.grammar.robot_source import find_robots
 
     sources = find_robots(args.words, library_of(args), refuse)
@@ -153,11 +141,7 @@ def sources_of(
 
 
 def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
-    """Return the robots that the arguments name, one or several, with their sources.
-
-    Raises:
-        MorphgenError: As ``sources_of``; or if a robot is broken.
-    """
+    """Return the robots that the arguments name, one or several, with their sources."""
     from morphgen.cli.progress import track
     from morphgen.grammar.robot_source import read_source
 
@@ -173,17 +157,9 @@ def for_each_robot(
 ) -> tuple[dict[str, T], dict[str, dict[str, str]]]:
     """Do something with every robot that the arguments name; a refused one does not stop others.
 
-    Args:
-        args: The arguments.
-        verb: What is done, for the progress, such as ``checking``.
-        work: Called with a robot's source and the library of parts.
-
     Returns:
         The results by the label of the source, and the class and message of the errors by the
         label of those that failed, which are printed. With any of these, the exit code is 2.
-
-    Raises:
-        MorphgenError: As ``sources_of``; or the error if there is one robot only.
     """
     from morphgen.cli.progress import track
 
@@ -207,13 +183,7 @@ def for_each_robot(
 
 
 def refusal(error: MorphgenError, label: str, name: str) -> dict[str, str]:
-    """Print why one of several robots is refused; return it for ``--json``.
-
-    Args:
-        error: The error.
-        label: What names the robot; it precedes a message without ``name``.
-        name: Part of a message by which a reader recognizes the robot.
-    """
+    """Print why one of several robots is refused; return it for ``--json``."""
     reason = one_line(str(error))
     if name not in reason:
         reason = f"{label}: {reason}"
@@ -226,9 +196,6 @@ def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
 
     It is the value of ``--max-links``, else the benchmark's or that of the largest robot if it has
     more, such as a robot with two arms. All robots of a command share it.
-
-    Raises:
-        BenchmarkError: If a robot has more links than ``--max-links``.
     """
     from morphgen.benchmark.tokens import default_max_links, require_max_links
 
@@ -240,11 +207,7 @@ def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
 
 
 def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> Grammar:
-    """Return a grammar by its name or file.
-
-    Raises:
-        GrammarError: If the grammar is unknown, malformed, or ``sound`` and it has faults.
-    """
+    """Return a grammar by its name or file."""
     from morphgen.grammar.analysis import load_sound_grammar
     from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
@@ -254,16 +217,7 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
 
 
 def require_other_name(words: dict[str, str], split: str, word: str) -> None:
-    """Require that no other argument names a split of this name; keep the argument.
-
-    Args:
-        words: The argument that names each split so far, by the name of the split; gets this one.
-        split: Name of the split.
-        word: The argument that names it.
-
-    Raises:
-        BenchmarkError: If two splits have one name: results could not be told apart.
-    """
+    """Require that no other argument names a split of this name; keep the argument."""
     if split in words:
         raise BenchmarkError(
             f"{word}: split {split!r} is also in {words[split]}; expected splits of different names"
@@ -272,14 +226,6 @@ def require_other_name(words: dict[str, str], split: str, word: str) -> None:
 
 
 def reject_idle(options: dict[str, Any], reason: str) -> None:
-    """Raise if options are given that have no effect.
-
-    Args:
-        options: Whether each option was given, by its name.
-        reason: When the options have an effect, such as ``only with --out``.
-
-    Raises:
-        MorphgenError: If one was given.
-    """
+    """Raise if options are given that have no effect."""
     if idle := [name for name, is_given in options.items() if is_given]:
         raise MorphgenError(f"{' '.join(idle)}: {reason}")

@@ -73,13 +73,7 @@ def bar(
 
     Nothing is shown without a terminal or with ``--json``.
 
-    Args:
-        args: Arguments of the command.
-        title: What the command does, such as ``reading``.
-        unit: Name of an item.
-        total: Number of items; None if the updates tell it.
-        layout: Format of the bar, as for tqdm.
-        delay: Time before the bar appears, so that quick commands do not flicker [s].
+    delay: Time before the bar appears, so that quick commands do not flicker [s].
     """
     from tqdm import tqdm
 

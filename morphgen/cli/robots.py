@@ -351,11 +351,7 @@ def _import_several(
 
 
 def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict[str, str]:
-    """Return the names of the bundles: those of the descriptions, without their suffixes.
-
-    Raises:
-        FormatError: If several descriptions would have one name, or one has no valid name.
-    """
+    """Return the names of the bundles: those of the descriptions, without their suffixes."""
     from morphgen.formats.bundle import bundle_folder
 
     names = {

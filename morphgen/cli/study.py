@@ -91,11 +91,7 @@ def study(args: argparse.Namespace) -> int:
 
 
 def _cells(args: argparse.Namespace) -> list[Cell]:
-    """Return the cells of the study, baselines first.
-
-    Raises:
-        MorphgenError: If a split, agent or seed is invalid, or a run could not begin.
-    """
+    """Return the cells of the study, baselines first."""
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.runs.agent_spec import parse_agents
     from morphgen.rl.runs.robot_source import other_side, tasks_of
@@ -134,11 +130,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
 
 
 def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) -> None:
-    """Require that training and fine-tuning of a cell can begin, before any of them does.
-
-    Raises:
-        MorphgenError: If they cannot.
-    """
+    """Require that training and fine-tuning of a cell can begin, before any of them does."""
     from morphgen.rl.runs.training import is_done, require_runnable, subruns_of
     from morphgen.rl.scores.study import finetuning_run
     from morphgen.tasks.device import require_device
@@ -164,11 +156,7 @@ def _splits(word: str) -> tuple[str, ...]:
 
 
 def _finetune(text: str) -> list[int]:
-    """Read ``10000,30000``.
-
-    Raises:
-        TaskError: If the text is something else.
-    """
+    """Read ``10000,30000``."""
     parts = [part.strip() for part in text.split(",")] if text else []
     if not all(part.isdecimal() and int(part) for part in parts):
         raise TaskError(f"--finetune {text}: expected numbers of steps, such as 10000,30000")
@@ -176,11 +164,7 @@ def _finetune(text: str) -> list[int]:
 
 
 def _seeds(text: str) -> list[int]:
-    """Read ``0..2`` or ``0,3``.
-
-    Raises:
-        TaskError: If the text is something else.
-    """
+    """Read ``0..2`` or ``0,3``."""
     seeds: list[int] = []
     for part in text.split(","):
         first, dots, last = part.partition("..")

@@ -86,11 +86,7 @@ AGENT_OPTIONS = (*(on_off(name, switch_help(name)) for name in SWITCHES), OBSERV
 
 
 def agent_spec(args: argparse.Namespace) -> AgentSpec:
-    """Return the agent with the switches that were given.
-
-    Raises:
-        TaskError: If the agent is unknown.
-    """
+    """Return the agent with the switches that were given."""
     from morphgen.rl.runs.agent_spec import OBSERVATION_SWITCHES, parse_agent
 
     values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
@@ -135,11 +131,7 @@ DRAWN_OPTIONS = (
 
 
 def split_option(purpose: str) -> Option:
-    """Return the option ``--split``, whose words ``robots_to_train`` reads.
-
-    Args:
-        purpose: Whose robots the option names.
-    """
+    """Return the option ``--split``, whose words ``robots_to_train`` reads."""
     return option(
         "--split",
         dest="words",
@@ -151,24 +143,14 @@ def split_option(purpose: str) -> Option:
 
 
 def require_split_for_options(args: argparse.Namespace) -> None:
-    """Require ``--split`` with options that describe other robots than the checkpoint's.
-
-    Raises:
-        TaskError: If it is missing.
-    """
+    """Require ``--split`` with options that describe other robots than the checkpoint's."""
     for name in ("obstacles", "library", "goal_seed"):
         if not args.words and getattr(args, name) not in (None, False, []):
             raise TaskError(f"--{name.replace('_', '-')} goes with --split")
 
 
 def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
-    """Return the robots that a split, or a robot and ``task=NAME``, describe.
-
-    Raises:
-        TaskError: If a robot has no task, or the seed of the goals differs from that of the goals
-            that a built split ships.
-        MorphgenError: If the split or the robot is unknown.
-    """
+    """Return the robots that a split, or a robot and ``task=NAME``, describe."""
     from morphgen.benchmark.split_source import read_split_or_folder
     from morphgen.rl.runs.robot_source import robot_source, split_source
     from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
@@ -206,12 +188,7 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
 
 
 def robots_to_draw(args: argparse.Namespace) -> RobotSource:
-    """Return the source that ``--robots`` describes; none of its robots is drawn yet.
-
-    Raises:
-        TaskError: If the positional arguments are not a task, or ``--on`` is given.
-        MorphgenError: If a grammar or a split is unknown or faulty.
-    """
+    """Return the source that ``--robots`` describes; none of its robots is drawn yet."""
     from morphgen.rl.runs.drawn_robots import drawn_source
 
     choices = " or ".join(f"task={name}" for name in TASKS)
@@ -257,11 +234,7 @@ def draw_robots(
 
 
 def require_robots_for_options(args: argparse.Namespace) -> None:
-    """Require ``--robots`` with the other options of drawn robots.
-
-    Raises:
-        MorphgenError: If it is missing.
-    """
+    """Require ``--robots`` with the other options of drawn robots."""
     if args.robots is None:
         given = {
             "--robot-seed": args.robot_seed is not None,
@@ -278,12 +251,7 @@ NETWORK_SWITCHES = {
 
 
 def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Option, ...]:
-    """Return the options of all commands that train.
-
-    Args:
-        num_steps: Default of ``--steps``; None if the preset determines it.
-        num_envs: Default of ``--envs``; None if the preset determines it.
-    """
+    """Return the options of all commands that train."""
     preset = "" if num_steps else " (default: the preset's)"
     return (
         number(
@@ -446,11 +414,7 @@ def _next_command(folder: Path, config: RunConfig) -> str:
 
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
-    """Return the configuration of a run from the options.
-
-    Raises:
-        TaskError: If a number is out of its range.
-    """
+    """Return the configuration of a run from the options."""
     from morphgen.rl.runs.agent_spec import configs_of, parse_constants
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import tasks_of
@@ -477,12 +441,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
 
 
 def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
-    """Draw the robots of a run, after all that can be checked before; return its configuration.
-
-    Raises:
-        TaskError: If a number is out of its range or has no effect.
-        MorphgenError: If a robot cannot be drawn.
-    """
+    """Draw the robots of a run, after all that can be checked before; return its configuration."""
     from morphgen.rl.runs.training import default_slice_updates, num_slices, require_runnable
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -518,11 +477,7 @@ def _max_links(source: RobotSource) -> int:
 
 
 def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskConfig, ...]:
-    """Return the configurations of the tasks from ``--goal`` and ``--train-goals``.
-
-    Raises:
-        TaskError: If the split ships its own goals, or no robot has the task of ``--goal``.
-    """
+    """Return the configurations of the tasks from ``--goal`` and ``--train-goals``."""
     from morphgen.rl.runs.robot_source import tasks_of
 
     tasks, num_goals = tasks_of(source), args.train_goals
@@ -542,9 +497,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
     """Require that the agent uses all options that were given.
 
     A study does not require it: its options may be for some of its agents.
-
-    Raises:
-        TaskError: If an option has no effect.
     """
     from morphgen.rl.runs.agent_spec import owners_of, parse_constants
 
@@ -564,11 +516,7 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 
 
 def execution_config(args: argparse.Namespace) -> ExecutionConfig:
-    """Return how runs are executed.
-
-    Raises:
-        MissingDependencyError: If ``--wandb`` is given and Weights & Biases is not installed.
-    """
+    """Return how runs are executed."""
     from morphgen.rl.runs.training import ExecutionConfig
 
     minutes = getattr(args, "minutes", None)  # a study has none

@@ -42,12 +42,7 @@ def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
 
 
 def failure(name: str, error: Exception) -> Entry:
-    """Return the result of an examination that raised an error.
-
-    Raises:
-        KeyboardInterrupt: If a package made the error of a Ctrl-C, as some do while they are
-            imported.
-    """
+    """Return the result of an examination that raised an error."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, KeyboardInterrupt):

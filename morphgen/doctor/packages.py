@@ -24,12 +24,7 @@ def entries() -> Iterator[Entry]:
 
 
 def requirements_of(extra: str, declared: Sequence[Requirement]) -> list[Requirement]:
-    """Return the requirements of an extra, and of the extras that it includes.
-
-    Args:
-        extra: Name of the extra; empty for the core.
-        declared: All requirements of morphgen.
-    """
+    """Return the requirements of an extra, and of the extras that it includes."""
     chosen: dict[str, Requirement] = {}
     for requirement in declared:
         marker = requirement.marker

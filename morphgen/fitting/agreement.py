@@ -66,11 +66,7 @@ def agreement(
 
     Pairs of links that one of the robots ignores are ignored on both.
 
-    Args:
-        meshes: The robot with its meshes, the reference.
-        primitives: The same robot with primitives as collision shapes.
-        n: Number of random configurations within the joint limits.
-        seed: Seed of the configurations.
+    primitives: The same robot with primitives as collision shapes.
 
     Returns:
         The agreement of the primitives, and that of the convex hulls, with the meshes.

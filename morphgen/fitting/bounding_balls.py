@@ -21,8 +21,7 @@ _MAX_PIVOTS = 100
 def smallest_balls(points: Array) -> tuple[Array, Array]:
     """Return the smallest balls that contain each of ``n`` sets of ``m`` points.
 
-    Args:
-        points: Shape (n, d, m).
+    points: Shape (n, d, m).
 
     Returns:
         Centres, shape (n, d), and radii that reach every point, shape (n,).
@@ -54,8 +53,7 @@ def smallest_balls(points: Array) -> tuple[Array, Array]:
 def _balls_through_origin(others: Array) -> tuple[Array, Array, NDArray[np.intp]]:
     """Return the smallest balls around ``d + 1`` points with the origin on their boundary.
 
-    Args:
-        others: Shape (n, d, d + 1).
+    others: Shape (n, d, d + 1).
 
     Returns:
         Centres, shape (n, d), squared radii (infinite where there is no such ball), and indices of

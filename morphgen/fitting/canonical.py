@@ -58,9 +58,7 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
     A sphere has the identity. A cylinder has the rotation that takes z to its axis, where the axis
     points above the xy plane. A box has the one of its 24 rotations nearest to the link's axes.
 
-    Args:
-        kind: The kind of primitive.
-        R: Any of the rotations, shape (3, 3).
+    R: Any of the rotations, shape (3, 3).
     """
     if kind == "sphere":
         return IDENTITY

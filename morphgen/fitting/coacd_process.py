@@ -16,10 +16,8 @@ import numpy as np
 def main(mesh_file: str, pieces_file: str, settings: str) -> None:
     """Decompose a mesh.
 
-    Args:
-        mesh_file: npz file with ``vertices`` (n, 3) and ``faces`` (m, 3).
-        pieces_file: npz file to write, with the vertices (k, 3) of each piece under its number.
-        settings: JSON object with keyword arguments of ``coacd.run_coacd``.
+    mesh_file: npz file with ``vertices`` (n, 3) and ``faces`` (m, 3).
+    pieces_file: npz file to write, with the vertices (k, 3) of each piece under its number.
     """
     coacd.set_log_level("error")
     with np.load(mesh_file, allow_pickle=False) as arrays:

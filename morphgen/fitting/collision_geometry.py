@@ -44,20 +44,6 @@ def as_spheres(
     from the user's cache or from a new fit, about two seconds per link, which is then cached.
     Masses, inertias and visuals stay; the pairs of links whose contacts are ignored are determined
     again.
-
-    Args:
-        robot: The robot.
-        folders: Folders of parts, for the stored primitives of tokens.
-        spheres: Number of spheres per link.
-        cover: Share of a link's volume that its spheres must cover; None for the largest IoU.
-        jobs: Number of processes; the result does not depend on it.
-        progress: Receives the number of links that are fitted, and of all that need a fit.
-
-    Raises:
-        FitError: If a link has no volume to fit spheres to, or an argument is out of its range.
-        FormatError: If a stored or cached fit is malformed.
-        MeshError: If a mesh cannot be read.
-        RobotError: If a joint axis is zero.
     """
     from morphgen.fitting.link_fit import FitOptions  # imports torch, which takes seconds
 
@@ -109,21 +95,7 @@ GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
 def with_geometry(
     robot: Robot, geometry: str, folders: Sequence[Path], *, progress: Progress = no_progress
 ) -> Robot:
-    """Return the robot with the collision shapes of a geometry.
-
-    Args:
-        robot: The robot.
-        geometry: One of ``GEOMETRIES``.
-        folders: Folders of parts, for their stored fits.
-        progress: Receives the number of links or meshes that are done, and of all.
-
-    Raises:
-        FitError: If the geometry is unknown, or does not suit a mesh.
-        FormatError: If a stored fit is malformed, or the cache cannot be written.
-        MeshError: If a mesh cannot be read.
-        ModuleNotFoundError: If the package that makes the shapes is not installed.
-        RobotError: If a joint axis is zero.
-    """
+    """Return the robot with the collision shapes of a geometry."""
     if geometry not in GEOMETRIES:
         raise FitError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
     if geometry == "primitive":

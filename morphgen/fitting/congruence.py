@@ -34,12 +34,6 @@ def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) 
     Both must have the same numbers of vertices and faces. The transform of a rotated body of very
     high symmetry, such as a sphere, may not be found.
 
-    Args:
-        a: Triangles, coincident vertices merged.
-        b: Triangles, coincident vertices merged.
-        tolerance: Largest distance of a vertex from its counterpart, relative to the size: twice
-            the distance of the farthest vertex from the mean.
-
     Returns:
         ``T_b_a``, shape (4, 4), which maps coordinates of ``a`` to ``b``: the identity for equal
         arrays, a motion rather than a mirroring if both fit; None if there is none.
@@ -71,12 +65,8 @@ def moved(shape: Shape, T_b_a: Array) -> Shape:
 
     Every primitive is its own mirror image, so mirroring only changes its pose.
 
-    Args:
-        shape: A primitive in frame a.
-        T_b_a: Transform with an orthogonal upper left part, shape (4, 4).
-
-    Raises:
-        ValueError: If the shape is a mesh, or the transform scales or shears.
+    shape: A primitive in frame a.
+    T_b_a: Transform with an orthogonal upper left part, shape (4, 4).
     """
     if isinstance(shape.geometry, Mesh):
         raise ValueError(f"{shape.geometry} is not a primitive")

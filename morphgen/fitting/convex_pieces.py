@@ -74,18 +74,6 @@ def as_convex(
     once, in seconds to minutes. A mesh that is convex stays as it is, and so do primitives: the
     result of this function, and its bundle, give themselves. Masses, inertias and fits of
     primitives stay. The pairs of links whose contacts are ignored are determined again.
-
-    Args:
-        robot: The robot.
-        folders: Folders of parts, for their stored fits.
-        progress: Receives the number of meshes that are decomposed, and of all that have to be.
-
-    Raises:
-        FitError: If CoACD fails on a mesh, or takes longer than ``MAX_SECONDS``.
-        FormatError: If the cache cannot be written.
-        MeshError: If a mesh cannot be read or is flat.
-        ModuleNotFoundError: If CoACD is not installed.
-        RobotError: If a joint axis is zero.
     """
     meshed = [link for link in robot.links if has_meshes(link.collisions)]
     shapes = [shape for link in meshed for shape in link.collisions]
@@ -135,16 +123,8 @@ def decompose(mesh: Mesh) -> list[trimesh.Trimesh]:
     The result depends on the mesh, ``SETTINGS`` and the version of CoACD alone: CoACD runs in one
     thread and with a seed.
 
-    Args:
-        mesh: The mesh.
-
     Returns:
         1 to ``MAX_PIECES`` pieces, in the frame of the mesh and with its scale.
-
-    Raises:
-        FitError: If CoACD fails, finds no piece or takes longer than ``MAX_SECONDS``.
-        MeshError: If the mesh cannot be read or is flat.
-        ModuleNotFoundError: If CoACD is not installed.
     """
     importlib.import_module("coacd")
     triangles, hull = load_mesh(mesh), convex_hull(mesh)
@@ -170,11 +150,7 @@ def decompose(mesh: Mesh) -> list[trimesh.Trimesh]:
 
 
 def _run_coacd(mesh: Mesh, settings: Mapping[str, object]) -> tuple[list[Array] | None, str]:
-    """Return the vertices of each piece, or None and why CoACD failed.
-
-    Raises:
-        FitError: If CoACD takes longer than ``MAX_SECONDS``.
-    """
+    """Return the vertices of each piece, or None and why CoACD failed."""
     triangles = load_mesh(mesh)
     with tempfile.TemporaryDirectory() as scratch:
         source, result = Path(scratch) / "mesh.npz", Path(scratch) / "pieces.npz"

@@ -53,16 +53,10 @@ def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
     The pose is rounded (1 um, 9 decimals of the quaternion) before the dimensions are measured and
     rounded up to 1 um, so no point is more than 1e-9 m outside.
 
-    Args:
-        points: Points in the link frame [m], shape (n, 3).
-        kinds: Kinds to choose from; of equal volumes the first in ``KINDS`` wins.
+    points: Points in the link frame [m], shape (n, 3).
 
     Returns:
         The primitive in its canonical pose.
-
-    Raises:
-        FitError: If points are not finite, flat, or fewer than four are distinct.
-        ValueError: If ``points`` is not (n, 3), or ``kinds`` is empty or unknown.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have the shape {points.shape}; expected (n, 3)")

@@ -70,18 +70,7 @@ def fit_robot(
 ) -> FittedRobot:
     """Fit primitives to a robot's links.
 
-    Args:
-        robot: The robot.
-        options: Options of the fits.
-        folders: Folders of parts, for their stored fits.
-        visual: Whether to replace the visual shapes, too.
-        jobs: Number of processes; the result does not depend on it.
-        progress: Receives the number of links that are fitted, and of all.
-
-    Raises:
-        FitError: If no link has a shape.
-        MeshError: If a mesh cannot be read.
-        MorphgenError: If a process died.
+    visual: Whether to replace the visual shapes, too.
     """
     if not any(map(shapes_to_fit, robot.links)):
         raise FitError(f"robot {robot.name!r}: no link has a shape")

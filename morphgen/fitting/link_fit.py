@@ -42,11 +42,7 @@ class FitOptions:
     """How several primitives of largest intersection over union are searched for."""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FitError: If one is out of its range, or has no effect on a fit of this kind.
-        """
+        """Check the values."""
         self._check_spheres()
         if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
             raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
@@ -107,16 +103,10 @@ def fit_shapes(
 ) -> LinkFit:
     """Fit the shapes of one link.
 
-    Args:
-        shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
-            there are no more than ``max_primitives``; by the residual search also capsules; by a
-            fit of spheres, if all are spheres.
-        options: Options of the fit.
-        solid: The solid of the shapes, if it is known already.
-
-    Raises:
-        FitError: If the shapes have no volume.
-        MeshError: If a mesh cannot be read.
+    shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
+        there are no more than ``max_primitives``; by the residual search also capsules; by a
+        fit of spheres, if all are spheres.
+    solid: The solid of the shapes, if it is known already.
     """
     start = time.perf_counter()
     solid = solid or solid_of(shapes)

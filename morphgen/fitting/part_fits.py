@@ -37,12 +37,7 @@ COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Return the parts that have meshes, except those that are another part at another scale.
-
-    Args:
-        library: The library of parts.
-        missing: Return only parts with a link that has no stored fit.
-    """
+    """Return the parts that have meshes, except those that are another part at another scale."""
     stored = read_stored_fits(library.folders) if missing else {}
     return [
         manifest
@@ -52,27 +47,12 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 
 
 def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
-    """Fit and store several parts; yield the path of each file when it is written.
-
-    Args:
-        manifests: The parts.
-        jobs: Number of processes; each fits one part at a time.
-
-    Raises:
-        FormatError: If a file cannot be written.
-        MeshError: If a mesh cannot be read.
-        MorphgenError: If a process died.
-    """
+    """Fit and store several parts; yield the path of each file when it is written."""
     yield from parallel_map(store_part, manifests, jobs, chunk=1)
 
 
 def store_part(manifest: Manifest) -> Path:
-    """Fit the links of a part, write the fits beside its manifest, and return the path.
-
-    Raises:
-        FormatError: If the file cannot be written.
-        MeshError: If a mesh cannot be read.
-    """
+    """Fit the links of a part, write the fits beside its manifest, and return the path."""
     fragment = load_part(manifest).fragment
     fits = {}
     for report in fit_links(fragment, COLLISION_OPTIONS).links:
@@ -88,14 +68,6 @@ def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, St
     """Return the fits of a report by link name, each with the primitive of the link's token.
 
     The token's primitive is the known one if the robot carries it or it is stored.
-
-    Args:
-        robot: The robot that was fitted.
-        report: Its fits.
-        stored: The stored fits of a library.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     fits = {}
     for row in report.links:

@@ -70,16 +70,8 @@ def quality(
     The surface of a solid with holes consists of the triangles that exist. Triangles inside of the
     solid count only for distances from points inside of it.
 
-    Args:
-        solid: The solid in the link frame.
-        primitives: Boxes, cylinders, spheres and capsules in the link frame, at least one.
-        seed: Seed of the sample points.
-        volume_points: Number of points in the bounding box of both, rounded up to a power of two.
-        surface_points: Number of points on each surface; rounded up likewise on the primitives.
-
-    Raises:
-        FitError: If no sample point is in the solid: it is too thin, or far from the primitives.
-        ValueError: If there are no primitives, one has no volume, or one is a mesh.
+    solid: The solid in the link frame.
+    primitives: Boxes, cylinders, spheres and capsules in the link frame, at least one.
     """
     vertices = np.asarray(solid.mesh.vertices)[solid.mesh.referenced_vertices]
     at_vertices = signed_distance(primitives, vertices)
@@ -123,15 +115,10 @@ def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
     They are exact outside, and inside of one primitive; inside of several overlapping primitives
     the surface may be farther away.
 
-    Args:
-        primitives: At least one primitive, no meshes.
-        points: Points in the link frame [m], shape (n, 3).
+    points: Points in the link frame [m], shape (n, 3).
 
     Returns:
         Distances [m], shape (n,).
-
-    Raises:
-        ValueError: If there are no primitives, one has no volume, or one is a mesh.
     """
     if not primitives:
         raise ValueError("there are no primitives")

@@ -38,12 +38,7 @@ _LOGGER = logging.getLogger(__name__)
 def cached_fits(links: Iterable[Link], kind: str) -> dict[str, StoredFit]:
     """Return the fits of links that are in the cache, by link name.
 
-    Args:
-        links: Links with collision shapes.
-        kind: Folder of the cache, which stands for all options of a fit.
-
-    Raises:
-        FormatError: If a file of the cache is malformed, or a mesh cannot be read.
+    links: Links with collision shapes.
     """
     fits = {}
     for link in links:
@@ -72,21 +67,10 @@ def fit_and_keep(
 ) -> dict[str, StoredFit]:
     """Fit primitives to links, say so, and keep the fits in the cache.
 
-    Args:
-        robot: The robot.
-        links: Its links with collision shapes to fit.
-        options: Options of the fits.
-        kind: As for ``cached_fits``.
-        stored: Stored fits, whose token primitives are kept.
-        jobs: Number of processes; the result does not depend on it.
-        progress: Receives the number of links that are fitted, and of all.
+    links: Its links with collision shapes to fit.
 
     Returns:
         Fits by link name.
-
-    Raises:
-        FitError: If a link has no volume to fit a primitive to.
-        MeshError: If a mesh cannot be read.
     """
     # These import torch, which takes seconds to load.
     from morphgen.fitting.part_fits import fits_of
@@ -127,17 +111,6 @@ def as_primitives(
     fitted once, which takes seconds per link and is logged, and their fits are cached. The result
     carries the token primitive of each link. A robot, its bundle (with meshes or primitives) and
     the result of this function all give the same result.
-
-    Args:
-        robot: The robot.
-        folders: Folders of parts.
-        progress: Receives the number of links that are fitted, and of all that need a fit.
-
-    Raises:
-        FitError: If a link has no volume to fit a primitive to.
-        FormatError: If a stored fit is malformed.
-        MeshError: If a mesh cannot be read.
-        RobotError: If a joint axis is zero.
     """
     fits = _known_fits(robot, read_stored_fits(folders))
     if missing := _meshed_links(robot, fits):
@@ -161,9 +134,7 @@ def _meshed_links(robot: Robot, fits: Mapping[str, StoredFit]) -> list[Link]:
 def with_fits(robot: Robot, fits: Mapping[str, StoredFit]) -> Robot:
     """Return the robot with the fits that its collision primitives come from, for its tokens.
 
-    Args:
-        robot: A robot with primitives as collision shapes.
-        fits: Fits by link name, at the scale of the link.
+    robot: A robot with primitives as collision shapes.
     """
     fits_at_scale = (
         replace(fits[link.name], collision=link.collisions)
@@ -180,14 +151,8 @@ def with_primitives(
 
     Masses and inertias stay. The pairs of links whose contacts are ignored are determined again.
 
-    Args:
-        robot: The robot.
-        primitives: Collision primitives by link name. A link without an entry keeps its collision
-            shapes if they are primitives, and loses them if they are meshes.
-        visual: Replace the visuals, too.
-
-    Raises:
-        RobotError: If a joint axis is zero.
+    primitives: Collision primitives by link name. A link without an entry keeps its collision
+        shapes if they are primitives, and loses them if they are meshes.
     """
     links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
     fitted = as_written(replace(robot, links=links, ignore_pairs=()))

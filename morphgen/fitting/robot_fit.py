@@ -98,16 +98,7 @@ def fit_links(
 
     Congruent links, mirrored ones included, share one fit.
 
-    Args:
-        robot: The robot.
-        options: Options of the fits.
-        only: Names of the links to fit; by default all that have shapes.
-        jobs: Number of processes; the result does not depend on it.
-        progress: Receives the number of links that are fitted, and of all.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-        MorphgenError: If a process died.
+    only: Names of the links to fit; by default all that have shapes.
     """
     solids: dict[str, Solid] = {}
     failures: dict[str, FitError] = {}

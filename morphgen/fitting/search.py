@@ -51,12 +51,9 @@ def around(
 ) -> Candidates:
     """Return guesses of one primitive each around a point cloud.
 
-    Args:
-        points: Points, shape (n, 3).
-        axes: Rotations, shape (3, 3) each, whose axes boxes and cylinders follow, besides the
-            principal axes of the points.
-        sphere: Add a sphere.
-        capsules: Add a capsule for each cylinder.
+    points: Points, shape (n, 3).
+    axes: Rotations, shape (3, 3) each, whose axes boxes and cylinders follow, besides the
+        principal axes of the points.
     """
     _, principal_axes = np.linalg.eigh(np.cov(points.T))
     principal_axes *= (1.0, 1.0, np.linalg.det(principal_axes))  # right-handed
@@ -93,14 +90,9 @@ def by_pieces(
 ) -> Candidates | None:
     """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
 
-    Args:
-        points: Points over the solid and its surroundings, shape (n, 3).
-        inside: Points that are inside the solid, shape (n,).
-        weights: Weights of the points, shape (n,).
-        k: Number of primitives.
-        seeds: Seeds of one clustering each. A clustering gives three guesses: the best kind for
-            each cluster, only boxes, and only cylinders.
-        capsules: Capsules are among the kinds, and a fourth guess has only capsules.
+    points: Points over the solid and its surroundings, shape (n, 3).
+    inside: Points that are inside the solid, shape (n,).
+    weights: Weights of the points, shape (n,).
 
     Returns:
         The guesses; None if a cluster has too few points in every clustering.
@@ -132,13 +124,9 @@ def by_growth(
 ) -> Candidates | None:
     """Return guesses with one more primitive, around a part of the solid that is not covered.
 
-    Args:
-        fewer: One candidate of ``k - 1`` primitives.
-        points: Points over the solid and its surroundings, shape (n, 3).
-        inside: Points that are inside the solid, shape (n,).
-        weights: Weights of the points, shape (n,).
-        seed: Seed of the clusterings of the uncovered points.
-        capsules: Add guesses with a capsule.
+    points: Points over the solid and its surroundings, shape (n, 3).
+    inside: Points that are inside the solid, shape (n,).
+    weights: Weights of the points, shape (n,).
 
     Returns:
         The guesses; None if too few points are uncovered.
@@ -181,12 +169,10 @@ def _best_of_each_kind(
 ) -> Candidates:
     """Return guesses around a cluster: the best, the best box, the best cylinder, a capsule.
 
-    Args:
-        piece: Points of the cluster, shape (n, 3).
-        piece_weights: Weights of these points, shape (n,).
-        outside: Points outside the solid, shape (m, 3).
-        outside_weights: Weights of these points, shape (m,).
-        capsules: Guess capsules, too.
+    piece: Points of the cluster, shape (n, 3).
+    piece_weights: Weights of these points, shape (n,).
+    outside: Points outside the solid, shape (m, 3).
+    outside_weights: Weights of these points, shape (m,).
     """
     guesses = around(piece, [np.eye(3)], capsules=capsules)
     points = np.concatenate([piece, outside])
@@ -305,11 +291,7 @@ class SearchResult:
 
 
 def sample_solid(solid: Solid, seed: int) -> SampledSolid:
-    """Draw the sample points of a search.
-
-    Raises:
-        FitError: If almost no point is inside, because the solid is too thin.
-    """
+    """Draw the sample points of a search."""
     T_box_link, extents = trimesh.bounds.oriented_bounds(solid.hull)
     T_link_box = np.linalg.inv(T_box_link)
     R_link_box, centre, extents = T_link_box[:3, :3], T_link_box[:3, 3], extents / solid.size
@@ -343,13 +325,6 @@ def best_several(
     target: SampledSolid, fewer: SearchResult, seed: int, *, residual: bool = False
 ) -> SearchResult | None:
     """Return the primitives of largest IoU, one more than in an earlier result.
-
-    Args:
-        target: The solid.
-        fewer: The earlier result.
-        seed: Seed of the clusterings.
-        residual: Use capsules, too, and replace primitives one at a time by others where the rest
-            leaves the solid uncovered.
 
     Returns:
         The primitives; None if the solid has too few sample points for them.
@@ -457,14 +432,7 @@ _MIN_RADIUS = 1e-3
 
 
 def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -> SearchResult:
-    """Return the spheres of largest IoU.
-
-    Args:
-        target: The solid.
-        n: Number of spheres.
-        cover: Share of the solid's volume that the spheres must cover; None for no such condition.
-        seed: Seed of the clusterings, and of the points on which the cover is counted.
-    """
+    """Return the spheres of largest IoU."""
     seeds = np.random.SeedSequence(seed).generate_state(NUM_SPHERE_CLUSTERINGS + 1).tolist()
     emphases = (1.0,) if cover is None else EMPHASES
     judge = target if cover is None else sample_solid(target.solid, seeds[-1])

@@ -77,14 +77,9 @@ def ascend(
 ) -> Candidates:
     """Improve candidates by gradient ascent (Adam) on the soft IoU.
 
-    Args:
-        candidates: Initial candidates.
-        points: Points over the solid and its surroundings, shape (m, 3).
-        inside: Points that are inside the solid, shape (m,).
-        weights: Weights of the points, shape (m,), or per candidate, (n, m); by default 1.
-        num_steps: Number of gradient steps.
-        tau: Softness of the membership at the first and last step [units of the points].
-        rate: Learning rates at the first and last step [units of the points].
+    points: Points over the solid and its surroundings, shape (m, 3).
+    inside: Points that are inside the solid, shape (m,).
+    weights: Weights of the points, shape (m,), or per candidate, (n, m); by default 1.
 
     Returns:
         The candidates after the last step.
@@ -134,11 +129,9 @@ def overlaps(
 ) -> Array:
     """Return the IoU of each candidate by counting points, shape (n,).
 
-    Args:
-        candidates: The candidates.
-        points: Points over the solid and its surroundings, shape (m, 3).
-        inside: Points that are inside the solid, shape (m,).
-        weights: Weights of the points, shape (m,); by default 1.
+    points: Points over the solid and its surroundings, shape (m, 3).
+    inside: Points that are inside the solid, shape (m,).
+    weights: Weights of the points, shape (m,); by default 1.
     """
     target = torch.from_numpy(inside)
     weight = torch.from_numpy(np.ones(len(points)) if weights is None else weights)

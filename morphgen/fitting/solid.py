@@ -117,12 +117,7 @@ class Solid:
 def solid_of(shapes: Sequence[Shape]) -> Solid:
     """Return the solid of shapes that are fixed to each other.
 
-    Args:
-        shapes: At least one shape.
-
-    Raises:
-        FitError: If there are no shapes, or all are flat.
-        MeshError: If a mesh cannot be read.
+    shapes: At least one shape.
     """
     if not shapes:
         raise FitError("there are no shapes")
@@ -246,8 +241,7 @@ class Cavities:
 
         It is at least one half for a point outside of the convex hull.
 
-        Args:
-            points: Points in the frame of the mesh, shape (n, 3).
+        points: Points in the frame of the mesh, shape (n, 3).
 
         Returns:
             Shares, shape (n,), in steps of ``1 / NUM_RAYS``.

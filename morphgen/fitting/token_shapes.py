@@ -116,8 +116,7 @@ def fit_composite(shapes: Sequence[Shape]) -> Shape | None:
     Its axes are those of the link or of one of the primitives. If the axes of the primitives
     differ, tilted axes are tried, too.
 
-    Args:
-        shapes: Boxes, cylinders and spheres in the link frame.
+    shapes: Boxes, cylinders and spheres in the link frame.
 
     Returns:
         The primitive in its canonical pose, lengths rounded to 1 um; None if there is no volume.
@@ -378,17 +377,8 @@ def token_shapes(
        every machine (``composite``). A fit to meshes depends on the last bits of floating-point
        numbers, so it may differ between machines.
 
-    Args:
-        robot: The robot.
-        folders: Folders of parts, for their stored fits.
-        progress: Receives the number of new fits that are done, and of all that are needed.
-
     Returns:
         Primitives by link name, without links that have no collision shapes or no volume.
-
-    Raises:
-        FormatError: If a stored or cached fit is malformed.
-        MeshError: If a mesh cannot be read.
     """
     stored = read_stored_fits(folders)
     primitives: dict[str, Shape | None] = {}

@@ -50,11 +50,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
 
 
 def bundle_folder(parent: Path, name: str) -> Path:
-    """Return the folder of a robot's bundle below ``parent``.
-
-    Raises:
-        FormatError: If the name is not a plain folder name.
-    """
+    """Return the folder of a robot's bundle below ``parent``."""
     if not _NAME.fullmatch(name):
         raise FormatError(
             f"name {name!r}: use letters, digits, '-', '_', '+' and '.', a letter or digit first, "
@@ -67,10 +63,6 @@ def require_replaceable(folder: Path) -> None:
     """Require that a folder does not exist or is an unedited bundle, so that one may replace it.
 
     The card, the picture and exported files may differ from those that were written.
-
-    Raises:
-        FormatError: If it is something else, has a file that was changed or added since, or cannot
-            be created.
     """
     if folder.is_symlink():
         raise FormatError(f"{folder} is a link; choose another name or folder")
@@ -98,19 +90,8 @@ def write_bundle(
 ) -> Path:
     """Write a robot's bundle atomically.
 
-    Args:
-        robot: The robot.
-        folder: The folder to write; an existing bundle is replaced.
-        findings: Findings of the checks, for the card.
-        picture: Whether to draw ``preview.png``.
-        edits_kept: Whether to refuse to replace a bundle that was edited.
-
     Returns:
         ``folder``.
-
-    Raises:
-        FormatError: If the folder cannot be written, or exists and is no unedited bundle.
-        MissingDependencyError: If a picture is wanted and nothing can draw it.
     """
     if edits_kept:
         require_replaceable(folder)
@@ -129,27 +110,14 @@ def write_bundle(
 
 
 def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
-    """Read a robot from its bundle.
-
-    Args:
-        folder: The bundle.
-        root: A folder from which meshes may be read, besides the bundle's own.
-
-    Raises:
-        FormatError: If it is not a bundle or is invalid. Files that differ from the card's hashes
-            are not an error here; ``file_findings`` reports them.
-    """
+    """Read a robot from its bundle."""
     card = _read_card(folder)
     robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
     return replace(apply_card(robot, card, str(folder / CARD)), fits=fits_in(folder))
 
 
 def fits_in(folder: Path) -> StoredFits:
-    """Return the fits that a folder has beside a robot's description; none without the file.
-
-    Raises:
-        FormatError: If the file is malformed, or a link that leaves the folder.
-    """
+    """Return the fits that a folder has beside a robot's description; none without the file."""
     path = folder / FITS
     if not path.exists():
         return {}
@@ -179,11 +147,7 @@ def _card_hashes(folder: Path) -> dict[str, object]:
 
 
 def file_findings(folder: Path) -> tuple[Finding, ...]:
-    """Return findings about files of a bundle that are missing or differ from the card's hashes.
-
-    Raises:
-        FormatError: If the folder has no readable card.
-    """
+    """Return findings about files of a bundle that are missing or differ from the card's hashes."""
     findings = []
     for name, expected in _card_hashes(folder).items():
         path = folder / name
@@ -217,15 +181,7 @@ def read_robot(
     The URDF or MJCF of a bundle stands for the bundle. Another description gets the fits of a
     ``primitives.json`` beside it, such as that of an exported URDF.
 
-    Args:
-        path: The file or folder.
-        args: xacro arguments.
-        root: A folder from which meshes, includes and YAML may be read, besides the description's
-            own folder and package.
-        skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out.
-
-    Raises:
-        FormatError: If it is neither of these, or invalid.
+    skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out.
     """
     if path.is_dir():
         return read_bundle(path, root=root)
@@ -267,16 +223,9 @@ def _split_shape(shape: Shape) -> tuple[Shape, ...]:
 def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
     """Write every mesh of a robot once, in metres, as STL or, if it is large, as OBJ.
 
-    Args:
-        robot: The robot.
-        folder: A folder named ``MESHES``, which is created if there is a mesh.
-
     Returns:
         The file of every mesh, such as ``meshes/hand-1a2b3c4d.stl``: relative to the parent of
         ``folder``.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     files: dict[Mesh, str] = {}
     for link in robot.links:
@@ -292,11 +241,7 @@ def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
 
 
 def mesh_file(mesh: Mesh) -> tuple[str, bytes]:
-    """Return the name and content of the file that every loader can read for a mesh.
-
-    Raises:
-        MeshError: If the mesh cannot be read.
-    """
+    """Return the name and content of the file that every loader can read for a mesh."""
     triangles = load_mesh(mesh)
     if len(triangles.faces) <= MAX_STL_FACES:
         data, suffix = export_stl(triangles), "stl"

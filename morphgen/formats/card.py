@@ -64,12 +64,6 @@ def robot_card(
     """Return the data of a robot's ``card.json``.
 
     It contains no time and no path, so that the same robot gives the same bytes on any machine.
-
-    Args:
-        robot: The robot.
-        findings: Findings of the checks.
-        hashes: SHA-256 of the bundle's files, by name.
-        versions: Versions of the software that wrote the bundle, by name.
     """
     has_tool = any(frame.name == "tool" for frame in robot.frames)
     joints = [robot.joints[k] for k in robot.independent_joints]
@@ -112,17 +106,7 @@ def card_text(card: Mapping[str, object]) -> str:
 
 
 def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
-    """Complete a robot that was read from a bundle's URDF by what only its card holds.
-
-    Args:
-        robot: The robot, whose frames are still links.
-        card: The content of the card.
-        origin: Name of the card in errors, usually its path.
-
-    Raises:
-        FormatError: If the card lacks a key, holds an invalid value or is of another format, or if
-            the robot lacks a link of a frame.
-    """
+    """Complete a robot that was read from a bundle's URDF by what only its card holds."""
     if "format" not in card:
         raise FormatError(f"{origin}: not a card: missing key 'format'")
     if card["format"] != CARD_FORMAT:

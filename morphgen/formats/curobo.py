@@ -28,18 +28,7 @@ def curobo_text(
     urdf: str,
     comment: str,
 ) -> str:
-    """Return a robot's configuration as YAML.
-
-    Args:
-        robot: The robot; its names are those of the URDF that morphgen writes.
-        spheres: Spheres of the links.
-        ignored: Pairs of links whose collisions need no test.
-        urdf: Path of the URDF, relative to the configuration.
-        comment: One line about where the spheres and pairs come from.
-
-    Raises:
-        FormatError: If the robot has no frame ``tool``, or no spheres.
-    """
+    """Return a robot's configuration as YAML."""
     require_tool(robot)
     # "tool" of a robot with several limbs is the tool of the last one.
     names = (frame.name for frame in robot.frames)

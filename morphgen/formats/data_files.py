@@ -24,13 +24,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Return the content of a regular file.
 
-    Args:
-        path: The file, or a link to it. Pipes and devices, which may never end, are not opened.
-        max_bytes: Largest file to read [bytes].
-
-    Raises:
-        FormatError: If it is not a regular file or too large.
-        OSError: If it cannot be read.
+    max_bytes: Largest file to read [bytes].
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
@@ -45,12 +39,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a regular UTF-8 file, with its line ends unified.
-
-    Raises:
-        FormatError: As ``read_bytes``, or if it is not UTF-8.
-        OSError: If it cannot be read.
-    """
+    """Return the text of a regular UTF-8 file, with its line ends unified."""
     try:
         text = read_bytes(path, max_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -60,25 +49,12 @@ def read_text(path: Path, max_bytes: int = MAX_FILE_BYTES) -> str:
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401
-    """Return the content of a JSON file.
-
-    Raises:
-        FormatError: As ``read_text``, or if it is not JSON.
-        OSError: If it cannot be read.
-    """
+    """Return the content of a JSON file."""
     return parse_json(read_text(path), str(path))
 
 
 def parse_json(text: str, origin: str) -> Any:  # noqa: ANN401
-    """Return the value of a JSON text.
-
-    Args:
-        text: One JSON value.
-        origin: Name of its file, for messages.
-
-    Raises:
-        FormatError: If it is not JSON, or deeper than ``MAX_DEPTH``.
-    """
+    """Return the value of a JSON text."""
     try:
         data = json.loads(text)
     except RecursionError as error:
@@ -103,14 +79,6 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
 
     PyYAML's C parser crashes the process on deeply nested brackets, and nested aliases multiply
     ("billion laughs"). Counting the parser's events first needs neither recursion nor expansion.
-
-    Args:
-        text: One document.
-        origin: Name of its file, for messages.
-
-    Raises:
-        FormatError: If it is deeper than ``MAX_DEPTH`` or holds more than ``MAX_YAML_VALUES``.
-        yaml.YAMLError: If it is not YAML.
     """
     sizes: dict[str, int] = {}
     opened: list[tuple[str | None, int]] = []

@@ -30,20 +30,7 @@ def read_description(
     root_link: str | None = None,
     written_frames: bool = False,
 ) -> Robot:
-    """Read a xacro (by its suffix), an MJCF (by its root element ``<mujoco>``), or a URDF.
-
-    Args:
-        path: The file.
-        args: Values of the xacro's arguments.
-        finder: Finds ROS packages, and the folder that files may come from.
-        root_link: Body of an MJCF to read, with all below it; see ``read_mjcf``. Without effect on
-            other files.
-        written_frames: Whether to turn links that ``urdf_text`` wrote for frames into frames.
-
-    Raises:
-        UnsoundError: If the tree of a URDF is broken or a mesh is not found.
-        FormatError: If the file cannot be read, is of no such format, or does not expand.
-    """
+    """Read a xacro (by its suffix), an MJCF (by its root element ``<mujoco>``), or a URDF."""
     require_description_file(path)
     if is_mjcf(path):
         if args:
@@ -58,9 +45,6 @@ def is_mjcf(path: Path) -> bool:
     """Return whether a file is an MJCF: its root element is ``<mujoco>``.
 
     A file with the suffix ``.xacro`` is none; it is not opened.
-
-    Raises:
-        OSError: If the file cannot be read.
     """
     if path.suffix == ".xacro" or not path.is_file():
         return False
@@ -86,14 +70,7 @@ class NamedDescription:
 
 
 def find_description(text: str) -> NamedDescription:
-    """Return the file of a robot: of a collection, or the path itself.
-
-    Args:
-        text: ``COLLECTION:NAME`` with a key of ``COLLECTIONS``, or a path.
-
-    Raises:
-        FormatError: If the package is not installed, has no such robot, or cannot download it.
-    """
+    """Return the file of a robot: of a collection, or the path itself."""
     collection, colon, name = text.partition(":")
     if not colon or collection not in COLLECTIONS:
         return NamedDescription(Path(text))

@@ -23,11 +23,7 @@ LOCK = ".lock"
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal.
-
-    Raises:
-        OSError: If it cannot be read.
-    """
+    """Return the SHA-256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -46,11 +42,6 @@ def first_edit(
 ) -> tuple[str, bool] | None:
     """Return the first file of a folder that is not as it was written.
 
-    Args:
-        folder: The folder.
-        hashes: SHA-256 of the files that were written, by their path.
-        generated: Files that are not compared.
-
     Returns:
         Path of the file, and whether it was changed (True) or added (False); None without such a
         file. Links are followed; one that leads to no file counts as changed or added. Missing
@@ -67,17 +58,7 @@ def first_edit(
 
 
 def require_writable_file(path: Path, name: str = "", suffix: str = "") -> None:
-    """Require, before long work, that a file can be written.
-
-    Args:
-        path: The file.
-        name: Name of the option that it is the value of, for the message.
-        suffix: Suffix that it must have, so that a file of another kind is never replaced.
-
-    Raises:
-        FormatError: If it is a folder, has another suffix, or its folder does not exist or cannot
-            be written.
-    """
+    """Require, before long work, that a file can be written."""
     if path.suffix.lower() != suffix and suffix:
         why = f"expected a name that ends in {suffix}"
     elif path.is_dir():
@@ -92,11 +73,7 @@ def require_writable_file(path: Path, name: str = "", suffix: str = "") -> None:
 
 
 def require_writable_folder(folder: Path) -> None:
-    """Require, before long work, that a folder can be written, or created with its parents.
-
-    Raises:
-        FormatError: If it cannot.
-    """
+    """Require, before long work, that a folder can be written, or created with its parents."""
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise FormatError(f"cannot write to {folder}: {existing} is a file")
@@ -105,11 +82,7 @@ def require_writable_folder(folder: Path) -> None:
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, by way of ``partial_path``; one process at a time may do so.
-
-    Raises:
-        OSError: If it cannot be written, with its name; then nothing is left behind.
-    """
+    """Write a file atomically, by way of ``partial_path``; one process at a time may do so."""
     partial = partial_path(path)
     try:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -133,11 +106,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file that the user named; concurrent processes may write the same one.
-
-    Raises:
-        FormatError: If it cannot be written; then nothing is left behind.
-    """
+    """Write a file that the user named; several processes may write the same one."""
     try:
         _replace(path, content)
     except OSError as error:
@@ -154,9 +123,6 @@ def replacing_file(path: Path) -> Iterator[Path]:
     """Yield a path in a temporary folder whose file replaces ``path`` if the block succeeds.
 
     Unlike ``write_atomic``, concurrent processes may write the same file.
-
-    Raises:
-        OSError: If it cannot be written; then nothing is left behind.
     """
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         partial = Path(folder) / path.name
@@ -165,11 +131,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 
 def write_cache_file(path: Path, content: str | bytes) -> None:
-    """Write a file of a cache and create its folder; concurrent processes may write the same one.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
+    """Write a file of a cache and create its folder; several processes may write the same one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, content)
 
@@ -182,11 +144,7 @@ def _replace(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Lock a folder against other runs; the lock ends with its process.
-
-    Raises:
-        FormatError: If another run has locked it, or it cannot be written.
-    """
+    """Lock a folder against other runs; the lock ends with its process."""
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
@@ -206,11 +164,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces ``folder`` if the block succeeds.
-
-    Raises:
-        FormatError: If it cannot be written, or the block meets another ``OSError``.
-    """
+    """Yield a temporary folder that replaces ``folder`` if the block succeeds."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -257,15 +211,6 @@ def writing_export(folder: Path, format_name: str, robot_name: str) -> Iterator[
 
     The manifest is added at the end. A folder that holds anything else than an unchanged export is
     never replaced, because it may contain work of the user.
-
-    Args:
-        folder: The folder to write.
-        format_name: Name of the export format, for the manifest.
-        robot_name: Name of the robot, for the manifest.
-
-    Raises:
-        FormatError: If the folder cannot be written, or exists with files that are not of an
-            export of this robot or were changed since.
     """
     _require_replaceable(folder, robot_name)
     with replacing_folder(folder) as partial:

@@ -119,21 +119,13 @@ class _FileRecord(Record, frozen=True):
 
 
 def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
-    """Return the stored fit of shapes, scaled to them; None if there is none.
-
-    Raises:
-        FormatError: If a mesh file cannot be read.
-    """
+    """Return the stored fit of shapes, scaled to them; None if there is none."""
     fit = stored.get(shapes_key(shapes))
     return fit and fit.scaled(shapes_scale(shapes))
 
 
 def find_fit(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> StoredFit | None:
-    """Return the fit of a link's collision shapes: the robot's own, else for meshes a stored one.
-
-    Raises:
-        FormatError: If a mesh file cannot be read.
-    """
+    """Return the fit of a link's collision shapes: the robot's own, or else a stored one."""
     if not shapes:
         return None
     fit = stored_fit(shapes, robot.fits)
@@ -150,11 +142,7 @@ def shapes_scale(shapes: Sequence[Shape]) -> float:
 
 
 def shapes_key(shapes: Sequence[Shape]) -> str:
-    """Return a hash of the content and poses of shapes at unit scale.
-
-    Raises:
-        FormatError: If a mesh file cannot be read.
-    """
+    """Return a hash of the content and poses of shapes at unit scale."""
     factor = 1 / shapes_scale(shapes)
     lines = []
     for shape in (scale_shape(shape, factor) for shape in shapes):
@@ -181,11 +169,7 @@ def shapes_to_fit(link: Link) -> tuple[Shape, ...]:
 
 
 def read_stored_fits(folders: Iterable[Path]) -> dict[str, StoredFit]:
-    """Return all fits in folders of parts, except those of another version of the fitter.
-
-    Raises:
-        FormatError: If a file is malformed.
-    """
+    """Return all fits in folders of parts, except those of another version of the fitter."""
     fits: dict[str, StoredFit] = {}
     for folder in folders:
         for path in sorted(folder.rglob(f"*{SUFFIX}")):
@@ -194,11 +178,7 @@ def read_stored_fits(folders: Iterable[Path]) -> dict[str, StoredFit]:
 
 
 def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
-    """Return the robot with the fits of its collision meshes that folders of parts contain.
-
-    Raises:
-        FormatError: If a file of fits is malformed, or a mesh file cannot be read.
-    """
+    """Return the robot with the fits of its collision meshes that folders of parts contain."""
     meshed = [link.collisions for link in robot.links if has_meshes(link.collisions)]
     if not meshed:
         return robot
@@ -208,11 +188,7 @@ def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
 
 
 def read_fits(path: Path) -> dict[str, StoredFit]:
-    """Return the fits of one file; none if another version of the fitter wrote it.
-
-    Raises:
-        FormatError: If it cannot be read or is malformed.
-    """
+    """Return the fits of one file; none if another version of the fitter wrote it."""
     try:
         return dict(_read(path.absolute(), file_stamp(path)))
     except OSError as error:

@@ -49,20 +49,10 @@ def loader_copy(
 ) -> Iterator[Path]:
     """Yield a private folder with a copy of a robot that other libraries may open.
 
-    Args:
-        path: A bundle's folder, a URDF, a xacro or an MJCF. Nothing in it is trusted.
-        finder: Finds ROS packages, and the folder that files may come from.
-        args: Values of the xacro's arguments.
-
     Yields:
         The folder, which is removed afterwards. It holds ``robot.urdf`` of a bundle, a URDF or a
         xacro, ``robot.xml`` of a bundle or an MJCF, and beside them their meshes as STL or OBJ.
         Elements that a robot does not need are left out.
-
-    Raises:
-        UnsoundError: If the tree of a URDF is broken or a mesh is not found.
-        MeshError: If a mesh cannot be read.
-        FormatError: If a file cannot be read, is refused, or names one outside of its folder.
     """
     finder = finder or default_finder()
     with TemporaryDirectory(prefix="morphgen-") as name:

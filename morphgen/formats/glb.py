@@ -33,13 +33,6 @@ def glb_bytes(robot: Robot) -> bytes:
     Every link is a node of its name below the node of its parent link, frames are nodes, too, and
     visual shapes are nodes ``LINK_visual_0`` and so on with their colour as base colour. A node
     whose name is taken gets a number.
-
-    Args:
-        robot: The robot; a mesh of several colours needs ``split_colours`` before.
-
-    Raises:
-        FormatError: If the robot has no visual shape.
-        MeshError: If a mesh cannot be read.
     """
     if not any(link.visuals for link in robot.links):
         raise FormatError(f"robot {robot.name!r} has no visual shape, so a GLB would be empty")

@@ -22,11 +22,7 @@ class MujocoKinematics:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Compile a robot.
-
-        Raises:
-            FormatError: If MJCF cannot express the robot.
-        """
+        """Compile a robot."""
         bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
         self._robot = robot
         self.model = to_spec(robot.with_links(bare)).compile()

@@ -56,14 +56,8 @@ def render(
 ) -> Image.Image:
     """Draw a robot from its MJCF with MuJoCo's renderer.
 
-    Args:
-        robot: The robot that the file describes.
-        mjcf: The MJCF.
-        q: Configuration, shape (dof,); home by default.
-        size: Width and height [px].
-
-    Raises:
-        MissingDependencyError: If there is no offscreen OpenGL.
+    q: Configuration, shape (dof,); home by default.
+    size: Width and height [px].
     """
     import mujoco
 
@@ -130,11 +124,7 @@ def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
 
 
 def gl_context(width: int, height: int) -> GlContext:
-    """Create an offscreen OpenGL context of MuJoCo by EGL or OSMesa.
-
-    Raises:
-        MissingDependencyError: If neither is installed.
-    """
+    """Create an offscreen OpenGL context of MuJoCo by EGL or OSMesa."""
     # Triton, a part of PyTorch's CUDA build, and Mesa's software renderer contain LLVM. A process
     # that loads triton after Mesa crashes, such as one that draws and then loads a policy.
     if find_spec("triton") is not None:

@@ -76,18 +76,7 @@ def read_record(
     *,
     yaml_text: str | bytes | None = None,
 ) -> T:
-    """Convert plain data to a declared type.
-
-    Args:
-        data: The content of a file as a JSON or YAML reader returns it.
-        kind: A ``Record``, or ``dict``, ``list`` or ``tuple`` of such.
-        where: The file, for messages.
-        error: Type of the error to raise.
-        yaml_text: The YAML that ``data`` was read from, to name lines in errors.
-
-    Raises:
-        MorphgenError: Of type ``error``, if a key is missing or unknown or a value is invalid.
-    """
+    """Convert plain data to a declared type."""
     try:
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as invalid:

@@ -62,9 +62,6 @@ class PackageFinder:
         ``package.xml`` has that name. Descriptions are often copied into a folder without ROS's
         suffix, so ``x_description`` and ``x_support`` are then searched as ``x``. Names are
         case-sensitive, and the root of the file system is not searched.
-
-        Raises:
-            FormatError: The name is invalid, or no folder was found.
         """
         prefix = f"{files[0]}: " if files else ""
         if not _PACKAGE_NAME.match(package):
@@ -130,18 +127,10 @@ def default_finder(
 ) -> PackageFinder:
     """Return a finder for the given roots, then ROS's environment, then the pip data packages.
 
-    Args:
-        roots: Folders that hold packages, searched first.
-        packages: Folders of packages by name.
-        root: A folder from which files may be read, besides the description's own folder and
-            package; it is also searched for packages.
-        skip_missing: Whether shapes of a URDF whose mesh is not found are left out.
+    skip_missing: Whether shapes of a URDF whose mesh is not found are left out.
 
     Returns:
         A finder with the present values of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
-
-    Raises:
-        FormatError: If ``root`` is not a folder.
     """
     if root is not None:
         if not root.is_dir():
@@ -190,14 +179,6 @@ def find_file(uri: str, base_file: Path, finder: PackageFinder) -> FoundFile:
     leaves the tree is refused unless it leads into the finder's ``root``. An absolute path outside
     the tree, the finder's folders and all ROS packages is refused, too; name its folder as the root
     to allow it. The targets of symbolic links must meet the same rules.
-
-    Args:
-        uri: As written in the description.
-        base_file: The description's own path.
-        finder: Where packages may lie.
-
-    Raises:
-        FormatError: The URI is malformed, leaves its tree, or the file does not exist.
     """
     base = _absolute(base_file)
     text = uri.strip().replace("\\", "/")
@@ -293,14 +274,6 @@ def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> Non
     ``*_description`` or ``*_support``) of the xacro's files; without one, their own folders, and
     the folder above one that is named ``urdf`` or similar. Also allowed are folders with a
     ``package.xml``, the finder's folders and its root. Symbolic links are resolved first.
-
-    Args:
-        path: The file or folder.
-        finder: Finds packages.
-        *files: The description, and the included file that refers to the path.
-
-    Raises:
-        RefusedError: If the path is elsewhere.
     """
     real = path.resolve()
     if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
@@ -340,15 +313,7 @@ def portable_uri(path: Path) -> str:
 
 
 def distribution_file(package: str, relative: str) -> Path:
-    """Return a file of an installed pip distribution.
-
-    Args:
-        package: Distribution name, such as ``rtb-data``.
-        relative: Path below the distribution's install root, with forward slashes.
-
-    Raises:
-        FormatError: The distribution is not installed, or has no such file.
-    """
+    """Return a file of an installed pip distribution."""
     requirement = REQUIREMENTS.get(package, package)
     inside = PurePosixPath(relative)
     if inside.is_absolute() or ".." in inside.parts:

@@ -79,18 +79,7 @@ def ros_package_name(robot_name: str) -> str:
 
 
 def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
-    """Write the files of a description package into an empty folder.
-
-    Args:
-        robot: The robot.
-        folder: The package's folder, which exists.
-        srdf: Text of the robot's SRDF.
-
-    Raises:
-        FormatError: If the URDF cannot be written, the robot's name is not a plain file name, or
-            its root's name is not one of a ROS frame.
-        MeshError: If a mesh cannot be read.
-    """
+    """Write the files of a description package into an empty folder."""
     robot = split_colours(robot)
     package, stem = ros_package_name(robot.name), bundle_folder(folder, robot.name).name
     files = write_meshes(robot, folder / MESHES)

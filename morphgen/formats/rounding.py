@@ -60,11 +60,7 @@ def rounded_pose(pose: Pose) -> Pose:
 
 
 def rounded_axis(joint: Joint) -> Vec3:
-    """Return the unit axis of a joint with 12 digits; a rounded one is not normalised again.
-
-    Raises:
-        RobotError: If the axis is zero.
-    """
+    """Return the unit axis of a joint with 12 digits; a rounded one is not normalised again."""
     is_unit = abs(math.hypot(*joint.axis) - 1) < _UNIT_TOLERANCE
     return _vector(joint.axis if is_unit else joint.unit_axis)
 
@@ -74,9 +70,6 @@ def as_written(robot: Robot) -> Robot:
 
     Values that a file must contain and the robot does not specify get their default. The function
     is idempotent, and gives the same for the robot that was read back.
-
-    Raises:
-        RobotError: If an axis is zero.
     """
     return replace(
         robot,

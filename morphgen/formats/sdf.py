@@ -33,14 +33,6 @@ def sdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
 
     All names in a model must differ, unlike in a URDF: a joint that is named like a link gets
     ``_joint`` appended, a frame ``_frame``, as by SDFormat's own converter of URDF.
-
-    Args:
-        robot: The robot.
-        mesh_uri: Maps a mesh to the URI to write, such as ``meshes/hand.stl``.
-
-    Raises:
-        FormatError: If SDFormat does not allow a name: ``world`` is reserved, ``::`` separates
-            names, and names between double underscores are reserved.
     """
     has_world_root = robot.root.name == _WORLD and robot.root.is_empty
     links = {link.name for link in robot.links}

@@ -157,11 +157,7 @@ GROUP, STATE, SPHERES = "group", "group_state", "link_sphere_approximation"
 
 
 def require_tool(robot: Robot) -> None:
-    """Require that a robot has the frame ``tool``, which an SRDF and planners need.
-
-    Raises:
-        FormatError: If it has no such frame.
-    """
+    """Require that a robot has the frame ``tool``, which an SRDF and planners need."""
     if all(frame.name != TOOL for frame in robot.frames):
         raise FormatError(
             f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
@@ -170,12 +166,7 @@ def require_tool(robot: Robot) -> None:
 
 
 def srdf_text(srdf: Srdf, evidence: str = "") -> str:
-    """Write SRDF; ``morphgen.formats.srdf`` reads the same value back.
-
-    Args:
-        srdf: The content.
-        evidence: Text of a comment before the disabled pairs, such as how they were found.
-    """
+    """Write SRDF; ``morphgen.formats.srdf`` reads the same value back."""
     root = etree.Element("robot", name=srdf.robot)
     _write_flat(root, "virtual_joint", srdf.virtual_joints)
     for group in srdf.groups:
@@ -208,12 +199,7 @@ def srdf_text(srdf: Srdf, evidence: str = "") -> str:
 
 
 def disabled_link_pairs(srdf: Srdf, links: Iterable[str]) -> tuple[Pair, ...]:
-    """Return the pairs of links whose collisions an SRDF disables, sorted.
-
-    Args:
-        srdf: The SRDF.
-        links: Names of all links, with which unchecked links form pairs.
-    """
+    """Return the pairs of links whose collisions an SRDF disables, sorted."""
     pairs = {sorted_pair(unchecked.link, b) for unchecked in srdf.unchecked_links for b in links}
     pairs -= {sorted_pair(pair.link1, pair.link2) for pair in srdf.enabled_pairs}
     pairs |= {sorted_pair(pair.link1, pair.link2) for pair in srdf.disabled_pairs}
@@ -224,14 +210,6 @@ def with_disabled_pairs(robot: Robot, srdf: Srdf, origin: str = "SRDF") -> Robot
     """Return a robot that also ignores the contacts of the pairs that an SRDF disables.
 
     Links that are frames of the robot have no shapes, so their pairs are left out.
-
-    Args:
-        robot: The robot that the SRDF describes.
-        srdf: The SRDF.
-        origin: Name of the SRDF in errors, usually its path.
-
-    Raises:
-        FormatError: If the SRDF names a link that the robot does not have.
     """
     frames = {frame.name for frame in robot.frames}
     pairs = disabled_link_pairs(srdf, robot.link_index)
@@ -263,25 +241,12 @@ MAX_SRDF_BYTES = 16 * 2**20
 
 
 def read_srdf(path: Path) -> Srdf:
-    """Read an SRDF file.
-
-    Raises:
-        FormatError: If it cannot be read, or as ``parse_srdf``.
-    """
+    """Read an SRDF file."""
     return parse_srdf(read_bytes(path, MAX_SRDF_BYTES), str(path))
 
 
 def parse_srdf(data: bytes, origin: str) -> Srdf:
-    """Read SRDF text; writing the result again loses nothing but comments.
-
-    Args:
-        data: The XML.
-        origin: Name of the document in errors, usually its path.
-
-    Raises:
-        FormatError: If it is not XML, or an element, attribute, number or group is unknown, missing
-            or invalid.
-    """
+    """Read SRDF text; writing the result again loses nothing but comments."""
     root = parse_xml(data, origin)
     if root.tag != "robot":
         raise FormatError(f"{origin}: root element <{shortened(str(root.tag))}>; expected <robot>")

@@ -16,16 +16,8 @@ def convert_urdf(urdf: Path, folder: Path) -> Path:
     origin of its link, which the converter leaves out, is added, and massless bodies get the bounds
     of the MJCF (1e-12 kg, 1e-14 kg m^2), because USD takes a mass of zero for a missing one.
 
-    Args:
-        urdf: The robot's URDF, with its meshes beside it.
-        folder: The folder to write.
-
     Returns:
         The file to open, named after the robot.
-
-    Raises:
-        FormatError: If the converter refuses the URDF.
-        ModuleNotFoundError: If the converter is not installed.
     """
     import urdf_usd_converter
     from pxr import Gf, Tf, Usd, UsdPhysics

@@ -43,13 +43,6 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     Document type declarations are refused, because entities are defined there: they could expand
     without bound ("billion laughs") or include other files. Comments and processing instructions
     are dropped, so that the text around them is a single string.
-
-    Args:
-        data: The document's bytes; its own encoding declaration is respected.
-        origin: Name of the document in errors, usually its path.
-
-    Raises:
-        FormatError: The document is broken (``origin:line:column: reason``) or has a DOCTYPE.
     """
     parser = etree.XMLParser(
         resolve_entities=False,
@@ -80,15 +73,8 @@ def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[F
     meanings is refused: elements that are not closed, attributes that are repeated or without a
     value, a ``<`` in a text. A DOCTYPE is always refused, and entities are never expanded.
 
-    Args:
-        data: The document's bytes.
-        origin: Name of the document in errors, usually its path.
-
     Returns:
         The root element, and a warning for every kind of repair.
-
-    Raises:
-        FormatError: As ``parse_xml``.
     """
     try:
         return parse_xml(data, origin), ()
@@ -100,11 +86,7 @@ def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[F
 
 
 def root_tag(data: bytes) -> str | None:
-    """Return the tag of a document's root element, with its prefix; None if it has none.
-
-    Args:
-        data: The document, or a part that holds the start tag of its root element.
-    """
+    """Return the tag of a document's root element, with its prefix; None if it has none."""
     repair = _Repair("")
     with suppress(FormatError):
         repair.run(repair.decode(data), to_root=True)
@@ -171,11 +153,7 @@ class _Repair:
         return self.root is not None and self._end(text[position:])
 
     def result(self, fault: str) -> tuple[etree._Element, tuple[Finding, ...]]:
-        """Parse what was rewritten; return its root, and a finding for each kind of repair.
-
-        Args:
-            fault: Why the original is not valid, for a repair without a finding of its own.
-        """
+        """Parse what was rewritten; return its root, and a finding for each kind of repair."""
         undeclared = [name for name in self._prefixes if name not in self._declared]
         namespaces = "".join(f' xmlns:{name}="{_UNDECLARED}{name}"' for name in undeclared)
         self._pieces.insert(self._after_root_name, namespaces)

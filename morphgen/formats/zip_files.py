@@ -64,15 +64,7 @@ class ZipLimits:
 
 
 def write_zip(path: Path, files: Mapping[str, bytes | Path]) -> None:
-    """Write an archive in place of an earlier one; nothing half-written stays.
-
-    Args:
-        path: The archive.
-        files: Contents, or the files that hold them, by path in the archive.
-
-    Raises:
-        FormatError: If it cannot be written.
-    """
+    """Write an archive in place of an earlier one; nothing half-written stays."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing_file(path) as partial, partial.open("wb") as target:
@@ -97,12 +89,7 @@ def write_entries(target: IO[bytes], files: Mapping[str, bytes | Path]) -> None:
 
 
 def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
-    """Unpack an archive into an empty folder.
-
-    Raises:
-        FormatError: If it cannot be read, exceeds a limit, or names a file that is not safe; then
-            files may have been written to ``folder``, and nowhere else.
-    """
+    """Unpack an archive into an empty folder."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):  # a pipe may never end
@@ -129,9 +116,6 @@ def require_few_entries(file: IO[bytes], limits: ZipLimits) -> None:
 
     The entries are counted in the raw bytes, because ``zipfile`` reads a table of millions of them
     into memory.
-
-    Raises:
-        FormatError: If it holds too many files; the message does not name the archive.
     """
     count, end = 0, b""
     while chunk := file.read(_CHUNK):
@@ -143,12 +127,7 @@ def require_few_entries(file: IO[bytes], limits: ZipLimits) -> None:
 
 
 def safe_entries(archive: zipfile.ZipFile, limits: ZipLimits) -> list[tuple[zipfile.ZipInfo, str]]:
-    """Return the files of an archive with their paths, after checking its table of contents.
-
-    Raises:
-        FormatError: If it exceeds a limit, or a path is not safe; the message does not name the
-            archive.
-    """
+    """Return the files of an archive with their paths, after checking its table of contents."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > limits.max_files:
         raise FormatError(f"holds more than {limits.max_files} files")
@@ -225,25 +204,12 @@ MAX_BYTES = 2**30
 
 
 def read_npz(source: Path | IO[bytes], names: Sequence[str]) -> list[NDArray[Any]]:
-    """Return arrays of an archive by their names; see ``read_all``.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not such an archive, lacks an array, or is too large; with the reason.
-    """
+    """Return arrays of an archive by their names; see ``read_all``."""
     return [*_read(source, names).values()]
 
 
 def read_all(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
-    """Return all arrays of an archive.
-
-    Args:
-        source: The archive.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not such an archive, or is too large; with the reason.
-    """
+    """Return all arrays of an archive."""
     return _read(source, None)
 
 

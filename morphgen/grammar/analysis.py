@@ -49,12 +49,7 @@ def count_structures(grammar: Grammar) -> float:
 
 
 def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivation]:
-    """Yield every structure once, with typical values; the smallest first if they are infinite.
-
-    Raises:
-        GrammarError: If a structure cannot be derived, or ``MAX_SEARCH`` parts give no further
-            one (``SearchError``).
-    """
+    """Yield every structure once, with typical values; the smallest first if they are infinite."""
     digests: set[str] = set()
     is_infinite = count_structures(grammar) == math.inf
     wasted_parts = 0
@@ -219,11 +214,7 @@ def check_grammar(grammar: Grammar, library: Library) -> list[str]:
 
 
 def load_sound_grammar(name: str, library: Library) -> Grammar:
-    """Return a grammar by its name or file, and require that it has no faults.
-
-    Raises:
-        GrammarError: If the grammar is unknown or malformed, or ``check_grammar`` finds a fault.
-    """
+    """Return a grammar by its name or file, and require that it has no faults."""
     grammar = load_grammar(find_grammar(name, library.folders), library.folders)
     if faults := check_grammar(grammar, library):
         raise GrammarError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))

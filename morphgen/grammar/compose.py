@@ -96,14 +96,7 @@ class _Assembly:
     def attach(
         self, node: Derivation, parent: str | None, T_parent_port: Pose, *, owns_tool: bool
     ) -> None:
-        """Attach a part to a port of a link, then the node's children to the part.
-
-        Args:
-            node: The part's node of the derivation.
-            parent: Link of the port; None for the first part.
-            T_parent_port: Pose of the port in the link's frame.
-            owns_tool: Whether no part above has a tool.
-        """
+        """Attach a part to a port of a link, then the node's children to the part."""
         scoped = self._parts[node.label]
         part = scoped.part
         self._attach_root(scoped, parent, T_parent_port)
@@ -170,11 +163,7 @@ class _Assembly:
 
 
 def require_root(part: Part) -> None:
-    """Require that a part can be the first of a robot.
-
-    Raises:
-        CompositionError: If its mount is not its root, so that it needs a base.
-    """
+    """Require that a part can be the first of a robot."""
     if not part.T_root_mount.is_identity:
         raise CompositionError(f"{part.manifest.name!r} needs a base: its mount is not its root")
 
@@ -184,10 +173,6 @@ def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart
 
     Returns:
         The parts by label, parents before their children.
-
-    Raises:
-        CompositionError: If two parts have the same label, or the first part has a ``mount_yaw``.
-        PartError: If a parameter is unknown or out of range.
     """
     parts: dict[str, ScopedPart] = {}
     for node in derivation.walk():

@@ -64,16 +64,7 @@ class Derivation:
 
 
 def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
-    """Parse the text of a derivation.
-
-    Args:
-        text: The derivation, as ``str`` returns it.
-        origin: Name of the text in messages, usually its path.
-
-    Raises:
-        GrammarError: If the syntax is invalid, the text is too long, or the derivation has more
-            than ``MAX_PARTS`` parts.
-    """
+    """Parse the text of a derivation."""
     if len(text) > MAX_DERIVATION_TEXT:
         raise GrammarError(
             f"{origin}: a derivation of {len(text):,} characters; expected at most "

@@ -157,20 +157,7 @@ def derive(
     max_parts: int = MAX_PARTS,
     cache: DeriveCache | None = None,
 ) -> Derivation:
-    """Rewrite the start symbol of a grammar until only parts are left.
-
-    Args:
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        chooser: Selects alternatives, repetition counts and parameter values.
-        max_parts: Largest number of parts.
-        cache: Facts of earlier derivations with the same values of ``let``.
-
-    Raises:
-        GrammarError: If a name is unknown, a port is missing or taken, a value does not fit its
-            parameter, or the derivation has too many parts (``TooManyPartsError``); the message
-            names the location in the grammar.
-    """
+    """Rewrite the start symbol of a grammar until only parts are left."""
     run = _Run(grammar, library, chooser, max_parts, cache or DeriveCache())
     return run.root().derivation()
 
@@ -334,11 +321,7 @@ def count_fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> i
 
 
 def require_no_arguments(symbol: Item) -> None:
-    """Require that an item that names a symbol has no parameters.
-
-    Raises:
-        GrammarError: If it has.
-    """
+    """Require that an item that names a symbol has no parameters."""
     if symbol.arguments:
         raise GrammarError(
             f"{symbol.location}: {symbol.name!r} is a symbol and takes no parameters"
@@ -346,11 +329,7 @@ def require_no_arguments(symbol: Item) -> None:
 
 
 def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
-    """Return the manifest of an item that is not a symbol.
-
-    Raises:
-        GrammarError: If it is not a part either.
-    """
+    """Return the manifest of an item that is not a symbol."""
     if item.name not in library.paths:
         valid = [*(production.symbol for production in grammar.productions), *library.paths]
         raise GrammarError(
@@ -367,11 +346,7 @@ def argument(
     parameters: Mapping[str, Parameter],
     scope: Scope,
 ) -> float:
-    """Return the value of an item's argument in SI units.
-
-    Raises:
-        GrammarError: If the parameter is unknown, or the value has another unit or is out of range.
-    """
+    """Return the value of an item's argument in SI units."""
     if name not in parameters:
         raise GrammarError(
             f"{expression.location}: {item.name!r} has no parameter {name!r}"

@@ -73,15 +73,7 @@ def grammar_summary(name: str) -> str:
 
 
 def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
-    """Return the file of a grammar.
-
-    Args:
-        name: A path, or the name of a grammar in ``folders`` or of one that comes with morphgen.
-        folders: Folders of the library.
-
-    Raises:
-        GrammarError: If the grammar does not exist.
-    """
+    """Return the file of a grammar."""
     if name.endswith(SUFFIX) or "/" in name:
         path = Path(name)
         if not path.is_file():
@@ -100,25 +92,13 @@ def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:
     """Read a grammar with its includes.
 
     A file's symbols and values replace those of the same name in the files that it includes.
-
-    Args:
-        path: The file.
-        folders: Folders of the library, which includes may come from.
-
-    Raises:
-        GrammarError: If a file cannot be read or parsed, includes itself or a file outside of its
-            folder and the library, defines a symbol twice, or exceeds a limit.
     """
     reader = _Reader(path, tuple(folders))
     return _build(path.stem, str(path), reader.statements, reader.texts)
 
 
 def grammar_from_text(text: str, name: str) -> Grammar:
-    """Read a grammar from a text without includes, such as that of ``grammar_text``.
-
-    Raises:
-        GrammarError: If the text cannot be parsed, or includes another grammar.
-    """
+    """Read a grammar from a text without includes, such as that of ``grammar_text``."""
     statements = parse_grammar(text, name)
     for statement in statements:
         if isinstance(statement, Include):
@@ -130,11 +110,7 @@ def grammar_from_text(text: str, name: str) -> Grammar:
 
 
 def grammar_text(grammar: Grammar) -> str:
-    """Return the grammar with its includes as one text, the start symbol first.
-
-    Raises:
-        GrammarError: If the text is too long to be read again.
-    """
+    """Return the grammar with its includes as one text, the start symbol first."""
     ordered = sorted(grammar.productions, key=lambda p: p.symbol != grammar.start)
     lines = [f"let {let.name} = {let.expression}" for let in grammar.lets]
     for production in ordered:

@@ -31,11 +31,7 @@ class Library:
 
     @cached_property
     def paths(self) -> dict[str, Path]:
-        """The YAML file of every part, sorted by name.
-
-        Raises:
-            PartError: If a folder is missing or two files have the same name.
-        """
+        """The YAML file of every part, sorted by name."""
         paths: dict[str, Path] = {}
         for folder in self.folders:
             if not folder.is_dir():
@@ -48,15 +44,7 @@ class Library:
         return dict(sorted(paths.items()))
 
     def manifest(self, name: str, kind: PartKind | None = None) -> Manifest:
-        """Return the manifest of a part.
-
-        Args:
-            name: Name of the part.
-            kind: Required kind of the part; None for any.
-
-        Raises:
-            PartError: If the part does not exist or has another kind.
-        """
+        """Return the manifest of a part."""
         if name not in self.paths:
             valid = self.names(kind) if kind else self.paths
             raise PartError(f"unknown {kind or 'part'} {name!r}{nearest(name, valid)}")
@@ -81,22 +69,14 @@ class Library:
 
 
 def default_library(extra: LibraryFolders = ()) -> Library:
-    """Return the library of morphgen's parts and those of users.
-
-    Args:
-        extra: Folders of a user's own parts, in addition to those of ``MORPHGEN_LIBRARY``.
-    """
+    """Return the library of morphgen's parts and those of users."""
     entries = os.environ.get(LIBRARY_VARIABLE, "").split(os.pathsep)
     users = (*(Path(entry) for entry in entries if entry), *library_folders(extra))
     return Library(dict.fromkeys((*shipped_folders(), *(path.absolute() for path in users))))
 
 
 def library_folders(folders: LibraryFolders) -> tuple[Path, ...]:
-    """Return the folders of an argument ``library``.
-
-    Raises:
-        PartError: If it is neither a folder nor several.
-    """
+    """Return the folders of an argument ``library``."""
     several = [folders] if isinstance(folders, str | PathLike) else folders
     if not isinstance(several, Iterable):
         raise PartError(f"library {folders!r}: expected a folder, or several")

@@ -67,16 +67,8 @@ MOUNT_YAW_PARAMETER = Parameter(
 def parse_value(text: str, parameter: Parameter, where: str) -> float:
     """Parse a number with an optional unit, such as ``45deg`` or ``80mm``.
 
-    Args:
-        text: The user's text; a number without a unit is in SI units.
-        parameter: The parameter that the value is for.
-        where: The parameter's name as the user wrote it, for messages.
-
     Returns:
         The value in SI units.
-
-    Raises:
-        PartError: If the text is not a number, has the wrong unit, or is out of range.
     """
     match = _VALUE.fullmatch(text.strip())
     if match is None:
@@ -91,11 +83,7 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
 
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
-    """Return the value if it is in the parameter's range, to 12 digits.
-
-    Raises:
-        PartError: If it is not.
-    """
+    """Return the value if it is in the parameter's range, to 12 digits."""
     low = min(parameter.minimum, float(format_number(parameter.minimum)))
     high = max(parameter.maximum, float(format_number(parameter.maximum)))
     if not low <= value <= high:
@@ -108,11 +96,7 @@ def require_range(value: float, parameter: Parameter, where: str) -> float:
 def resolve_values(
     values: Mapping[str, float], parameters: Mapping[str, Parameter], where: str
 ) -> dict[str, float]:
-    """Complete values with defaults, in the order of the parameters.
-
-    Raises:
-        PartError: If a name is unknown or a value is out of range.
-    """
+    """Complete values with defaults, in the order of the parameters."""
     for name in values:
         if name not in parameters:
             raise PartError(f"{where} has no parameter {name!r}{nearest(name, parameters)}")
@@ -264,12 +248,7 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read a part's YAML. A key without a value is the same as no key.
-
-    Raises:
-        PartError: If the file is not valid YAML, lacks a key, has an unknown or a repeated key, or
-            a value of the wrong type; the message names the file, the line and the key.
-    """
+    """Read a part's YAML. A key without a value is the same as no key."""
     text, data = _load_yaml(path)
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if value is not None}

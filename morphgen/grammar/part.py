@@ -66,17 +66,7 @@ class Part:
 
 
 def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> Part:
-    """Load a part; the same manifest and values give the same object.
-
-    Args:
-        manifest: Description of the part.
-        values: Values of its parameters, SI units; missing ones have their defaults.
-
-    Raises:
-        PartError: If a parameter is unknown or out of range, or the manifest names a link or
-            joint that the source does not have.
-        FormatError: If the source cannot be read.
-    """
+    """Load a part; the same manifest and values give the same object."""
     complete = resolve_values(values or {}, manifest.parameters, manifest.name)
     return _load(_CacheKey(manifest, complete))
 
@@ -303,18 +293,6 @@ def part_manifest(
 
     The frame ``tool`` of the robot becomes the port ``flange`` of an arm, and the tool of an
     end-effector or a body. The part has the robot's home.
-
-    Args:
-        robot: The robot, as its bundle holds it.
-        description: The bundle's URDF.
-        kind: A key of ``PART_KINDS``.
-        folder: Folder of the library.
-        licence: Licence of the robot.
-
-    Raises:
-        CompositionError: If the robot has no frame ``tool``.
-        FormatError: If derivations cannot hold its name, morphgen has a part of this name,
-            ``folder`` is a file, or the manifest exists with other content.
     """
     if not _NAME.fullmatch(robot.name):
         raise FormatError(
@@ -358,16 +336,7 @@ def part_manifest(
 
 
 def write_part(path: Path, text: str) -> None:
-    """Write the manifest of a part whose bundle is written.
-
-    Args:
-        path: Path of ``part_manifest``.
-        text: Text of ``part_manifest``.
-
-    Raises:
-        FormatError: If the manifest cannot be written.
-        MorphgenError: If the robot cannot be a part.
-    """
+    """Write the manifest of a part whose bundle is written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, text)
     try:

@@ -30,15 +30,6 @@ def pin(grammar: Grammar, words: Sequence[str], library: Library) -> Grammar:
     ``symbol=name`` keeps the alternatives of a symbol that begin with a name; ``symbol=5`` fixes
     the count of its repetition; ``part.parameter=value`` fixes a parameter of every copy of a
     part; ``name=value`` fixes a value of ``let``.
-
-    Args:
-        grammar: The grammar.
-        words: ``key=value`` words, in any order.
-        library: Library of the grammar's parts.
-
-    Raises:
-        GrammarError: If a word is malformed or names nothing in the grammar.
-        PartError: If a value is not a number, has the wrong unit or is out of range.
     """
     for word in words:
         key, equals, value = word.partition("=")
@@ -164,9 +155,6 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     grammar and pinned choices (see ``morphgen.grammar.request.pin``), which give its first
     alternatives, smallest counts and typical values; or parts joined by dashes, each of which
     takes the slot of its kind: ``ur5-plane`` is ``arm=ur5 ee=plane``.
-
-    Raises:
-        MorphgenError: If the words name something that does not exist or does not fit.
     """
     if not words:
         raise CompositionError(
@@ -218,15 +206,6 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     ``base``, ``arm`` and ``ee`` choose parts; the base is ``fixed`` by default. A prefix names the
     port of a limb: ``left.arm=ur5``. Every other key is a parameter of a part: ``ee.size=80mm``,
     ``left.ee.mount_yaw=45deg``.
-
-    Args:
-        words: The words, in any order.
-        library: Library of the parts.
-
-    Raises:
-        CompositionError: If a word is malformed or given twice, a parameter belongs to no part,
-            a port does not exist, or nothing is attached to the base.
-        PartError: If a part or parameter is unknown, or a value is invalid.
     """
     slots = _parse_slots(words)
     base = slots.pop("base", _Slot("base", "", "fixed"))

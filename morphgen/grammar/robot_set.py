@@ -102,19 +102,7 @@ class SetReport:
 def make_set(
     config: SetConfig, n: int, work: SetWorker, progress: Callable[[int], None] = lambda done: None
 ) -> SetReport:
-    """Make the robots 0 to n - 1 of a set, except those that exist.
-
-    Args:
-        config: The set.
-        n: Number of robots of the complete set.
-        work: Makes robots, such as ``make_serially``.
-        progress: Called repeatedly with the number of existing robots.
-
-    Raises:
-        FormatError: If the folder holds a set with other settings or something else, or cannot be
-            written.
-        SamplingError: If a robot's conditions cannot be met.
-    """
+    """Make the robots 0 to n - 1 of a set, except those that exist."""
     _prepare(config)
     with locked_folder(config.folder):
         finished = _finished(config)
@@ -170,13 +158,6 @@ def remove_robots(folder: Path, names: Collection[str]) -> None:
     """Delete robots of a set: their lines of the index first, then their folders.
 
     ``make_set`` would draw the same robots again.
-
-    Args:
-        folder: A finished set.
-        names: Names of robots of the set; a robot whose folder is a link is refused.
-
-    Raises:
-        FormatError: If the folder is not a finished set, has no such robot, or cannot be written.
     """
     with locked_folder(folder):
         records = read_index(folder)
@@ -194,11 +175,7 @@ def remove_robots(folder: Path, names: Collection[str]) -> None:
 
 
 def read_index(folder: Path) -> list[Record]:
-    """Return the index of a set.
-
-    Raises:
-        FormatError: If the folder is not a finished set, or a line of the index is invalid.
-    """
+    """Return the index of a set."""
     path = folder / INDEX
     if not path.is_file():
         raise FormatError(f"{folder} is not a finished set: it has no {INDEX}")
@@ -213,11 +190,7 @@ def read_index(folder: Path) -> list[Record]:
 
 
 def read_settings(folder: Path) -> Record:
-    """Return the settings of a set, the content of its ``set.json``.
-
-    Raises:
-        FormatError: If the file is missing or invalid.
-    """
+    """Return the settings of a set, the content of its ``set.json``."""
     path = folder / SETTINGS
     try:
         settings = read_json(path)
@@ -393,9 +366,6 @@ def make_on_ray(address: str | None) -> SetWorker:
     """Return a worker that makes robots on the Ray cluster at an address, or on a local Ray.
 
     The machines of the cluster need morphgen and share the set's folder.
-
-    Raises:
-        MissingDependencyError: If ray is not installed.
     """
     ray = require_ray()
 

@@ -54,15 +54,6 @@ def find_robots(
     ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
     ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
     spaces is a request of its own. Each robot is returned once.
-
-    Args:
-        words: The words.
-        library: Library of the parts.
-        refuse: Called with a path that names no robot and the reason, which is then no error.
-
-    Raises:
-        CompositionError: If no robot is named.
-        FormatError: If a path does not exist, or a folder holds no robot.
     """
     sources: list[RobotSource] = []
     request: list[str] = []
@@ -96,12 +87,7 @@ def find_robots(
 
 
 def find_robot(text: str | PathLike[str]) -> RobotSource:
-    """Return the one robot that a text names; see ``find_robots``.
-
-    Raises:
-        CompositionError: If it names several robots, or is not a text.
-        FormatError: If a path does not exist, or holds no robot.
-    """
+    """Return the one robot that a text names; see ``find_robots``."""
     if not isinstance(text, str | PathLike):
         raise CompositionError(
             f"{text!r} is no robot; expected a Robot, a path, or a name such as ur5-plane"
@@ -122,16 +108,6 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
 
     A robot of a light set is composed from its derivation, since its URDF has no home. In a URDF,
     the frame ``tool`` is that of the link ``tool``, which is renamed ``tool_link``.
-
-    Args:
-        source: The robot, as ``find_robots`` returns it.
-        library: Library of the parts.
-        root: A folder that meshes, includes and YAML may come from, besides the description's own
-            folder and package.
-
-    Raises:
-        MorphgenError: If the file is broken, or the words name something that does not exist or
-            does not fit.
     """
     path = source.path
     if path is None:
@@ -161,22 +137,12 @@ def robot_list(robots: RobotLike | Iterable[RobotLike]) -> list[RobotLike]:
 
 
 def resolve_robot(robot: RobotLike, library: Library, root: Path | None = None) -> Robot:
-    """Return a robot that is given itself or by its name; see ``find_robot`` and ``read_source``.
-
-    Raises:
-        CompositionError: If it is neither, or names several robots.
-        MorphgenError: As ``read_source``.
-    """
+    """Return a robot, given itself or by its name; see ``find_robot`` and ``read_source``."""
     return robot if isinstance(robot, Robot) else read_source(find_robot(robot), library, root)
 
 
 def light_derivation(folder: Path) -> Derivation | None:
-    """Return the derivation of a robot of a light set; None for anything else.
-
-    Raises:
-        FormatError: If its file cannot be read.
-        GrammarError: If the derivation is malformed.
-    """
+    """Return the derivation of a robot of a light set; None for anything else."""
     path = folder / DERIVATION
     if not path.is_file() or (folder / CARD).is_file():
         return None
@@ -215,11 +181,7 @@ def holds_robots(folder: Path) -> bool:
 
 
 def robots_in(folder: Path) -> Iterator[Path]:
-    """Yield the robots of a folder: itself, those of a set by its index, or the bundles in it.
-
-    Raises:
-        FormatError: If it is a set that is unfinished or has an invalid index.
-    """
+    """Yield the robots of a folder: itself, those of a set by its index, or the bundles in it."""
     if is_robot_folder(folder):
         yield folder
     elif is_set_folder(folder):
@@ -266,25 +228,8 @@ def import_robot(
 ) -> Robot:
     """Read any robot description, and add what it lacks: a tool frame and ignored pairs.
 
-    Args:
-        path: A URDF, a xacro (by its suffix), or an MJCF (by its root element).
-        args: xacro arguments.
-        root: A folder that meshes, includes and YAML may come from, besides the description's own
-            folder and package.
-        root_link: Link that becomes the robot's root; by default the file's root. The rest of an
-            MJCF is not read, so that it may hold other bodies.
-        tool: Link whose frame becomes the frame ``tool``; by default the link ``tool`` if there is
-            one, else a URDF has none, and an MJCF the one that ``read_frames`` finds.
-        srdf: An SRDF of the robot; the pairs of links that it disables are ignored as well.
-        name: Name of the robot; by default the file's.
-        repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
-            loaders refuse the robot. The provenance lists them, and all that was corrected to read
-            the file.
-        skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out, with a
-            finding, instead of an error.
-
-    Raises:
-        FormatError: If a file cannot be read, or names a link that the description does not have.
+    skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out, with a
+        finding, instead of an error.
     """
     robot = read_description(
         path,

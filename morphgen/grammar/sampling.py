@@ -71,17 +71,6 @@ def sample_robots(
     """Draw robots one after the other.
 
     Robot i does not depend on n: its generator is child i of ``SeedSequence(seed)``.
-
-    Args:
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        n: Number of robots.
-        seed: Seed of all robots.
-        where: Conditions in addition to the grammar's own.
-
-    Raises:
-        GrammarError: If the grammar cannot be derived.
-        SamplingError: If a robot's conditions are not met in ``MAX_ATTEMPTS`` draws.
     """
     for index in range(n):
         yield sample_robot(grammar, library, index, seed=seed, where=where)
@@ -96,16 +85,7 @@ def sample_robot(
     where: Sequence[Expression] = (),
     name: str | None = None,
 ) -> Sample:
-    """Draw robot number ``index`` of a seed; see ``sample_robots``.
-
-    Args:
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        index: Number of the robot.
-        seed: Seed of all robots.
-        where: Conditions in addition to the grammar's own.
-        name: Name of the robot; by default ``<grammar>-<index>``.
-    """
+    """Draw robot number ``index`` of a seed; see ``sample_robots``."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     choosers = (RecordedChooser(RandomChooser(rng)) for _ in range(MAX_ATTEMPTS))
     result = _first_valid(
@@ -139,19 +119,6 @@ def mutate(
 
     Choices that only exist because of the new one, such as the parameters of another part, are
     drawn too; all other choices are kept.
-
-    Args:
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        choices: The robot's choices, as in ``Sample.choices``.
-        n: Number of neighbours.
-        seed: Seed; neighbour i does not depend on n.
-        name: Name of the robot; its neighbours are called ``<name>-m0000`` and so on.
-        where: Conditions in addition to the grammar's own.
-
-    Raises:
-        GrammarError: If the robot has no random choices.
-        SamplingError: If ``MAX_ATTEMPTS`` draws give no other valid neighbour.
     """
     random = RandomChooser(np.random.default_rng(seed))
     origin = derive(grammar, library, RecordedChooser(random, choices))
@@ -185,17 +152,6 @@ def cross(
     of both (arithmetic crossover). Choices that only one parent made are kept, and choices that
     neither made, because their robots have no such part, are drawn. ``MUTATED_SHARE`` of the
     children are mutated, too: similar parents have few other children.
-
-    Args:
-        grammar: The grammar of both robots.
-        library: Library of the grammar's parts.
-        parents: The robots' choices, as in ``Sample.choices``.
-        n: Number of children.
-        seed: Seed; child i does not depend on n.
-        name: Name of the children, which are called ``<name>-x0000`` and so on.
-
-    Raises:
-        SamplingError: If ``MAX_ATTEMPTS`` draws give no valid robot that differs from both parents.
     """
     random = RandomChooser(np.random.default_rng(seed))
     origins = tuple(
@@ -230,22 +186,7 @@ def _others(
     origins: tuple[Derivation, ...],
     what: str,
 ) -> Iterator[Sample]:
-    """Yield n valid robots other than ``origins``, the one of an index independent of n.
-
-    Args:
-        choosers_of: Returns endless choosers that draw with a generator.
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        where: Conditions of the robots.
-        n: Number of robots.
-        seed: Seed.
-        prefix: Names of the robots without their number.
-        origins: Derivations that do not count.
-        what: What is drawn, for the error.
-
-    Raises:
-        SamplingError: If ``MAX_ATTEMPTS`` draws give no such robot.
-    """
+    """Yield n valid robots other than ``origins``, the one of an index independent of n."""
     for index in range(n):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
         choosers = islice(choosers_of(rng), MAX_ATTEMPTS)

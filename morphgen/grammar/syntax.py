@@ -118,16 +118,7 @@ _TOKEN_NAMES = {
 
 
 def parse_tree(text: str, origin: str, start: str) -> Tree[Token]:
-    """Parse a text.
-
-    Args:
-        text: A grammar or a condition.
-        origin: Name of the text in messages, usually its path.
-        start: Rule of the syntax to apply: ``grammar``, or ``or_`` for a condition.
-
-    Raises:
-        GrammarError: If the text is too long or does not follow the rule.
-    """
+    """Parse a text."""
     if len(text) > MAX_TEXT:
         raise GrammarError(
             f"{origin}: a text of {len(text):,} characters; expected at most {MAX_TEXT:,}"
@@ -289,25 +280,12 @@ Statement = Production | Include | Let | Where
 
 
 def parse_grammar(text: str, origin: str) -> tuple[Statement, ...]:
-    """Parse the text of a grammar.
-
-    Args:
-        text: The grammar.
-        origin: Name of the text in messages, usually its path.
-
-    Raises:
-        GrammarError: If the syntax is invalid; the message names the location and what is
-            expected there.
-    """
+    """Parse the text of a grammar."""
     return tuple(_parse(text, origin, "grammar"))
 
 
 def parse_condition(text: str, origin: str = "--where") -> Expression:
-    """Parse a condition such as ``reach > 0.4 and dof >= 5``.
-
-    Raises:
-        GrammarError: If the syntax is invalid.
-    """
+    """Parse a condition such as ``reach > 0.4 and dof >= 5``."""
     condition: Expression = _parse(text, origin, "or_")
     return condition
 

@@ -64,12 +64,7 @@ class Distribution:
         return closest if math.isclose(closest, value, rel_tol=1e-11, abs_tol=1e-12) else None
 
     def draw(self, uniform: Callable[[], float], normal: Callable[[], float]) -> float:
-        """Draw a value.
-
-        Args:
-            uniform: Returns a uniform sample of [0, 1).
-            normal: Returns a sample of the standard normal distribution.
-        """
+        """Draw a value."""
         low, high = self.bounds
         match self.kind:
             case "uniform":
@@ -118,10 +113,6 @@ def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
 
     Returns:
         The value in SI units, and its unit: ``m``, ``rad``, ``kg`` or empty for a pure number.
-
-    Raises:
-        GrammarError: If a name, function or unit is unknown, units do not match, or the result is
-            not finite.
     """
     value, unit = _evaluate(expression, scope)
     if not math.isfinite(value):
@@ -130,11 +121,7 @@ def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
 
 
 def distribution_of(expression: Expression, scope: Scope) -> tuple[Distribution, str]:
-    """Return the distribution that a call expression names, and the unit of its values.
-
-    Raises:
-        GrammarError: If the distribution is unknown or its arguments are invalid.
-    """
+    """Return the distribution that a call expression names, and the unit of its values."""
     kind = expression.text
     if kind not in DISTRIBUTIONS:
         raise unknown("distribution", kind, expression.location, DISTRIBUTIONS)
@@ -332,15 +319,7 @@ def holds(condition: Expression, properties: RobotProperties) -> bool:
 
 
 def parse_conditions(texts: Iterable[str], origin: str) -> list[Expression]:
-    """Return the conditions that texts such as ``reach > 0.4`` contain.
-
-    Args:
-        texts: The texts.
-        origin: What contains them, for messages, such as ``--where``.
-
-    Raises:
-        GrammarError: If one is not a condition on known properties.
-    """
+    """Return the conditions that texts such as ``reach > 0.4`` contain."""
     conditions = [parse_condition(text, origin) for text in texts]
     for condition in conditions:
         require_condition(condition)
@@ -348,11 +327,7 @@ def parse_conditions(texts: Iterable[str], origin: str) -> list[Expression]:
 
 
 def require_condition(expression: Expression) -> None:
-    """Require that an expression is a condition on known properties.
-
-    Raises:
-        GrammarError: If it is not; the message names the location of the fault.
-    """
+    """Require that an expression is a condition on known properties."""
     if expression.operator in ("and", "or", "not"):
         for operand in expression.operands:
             require_condition(operand)

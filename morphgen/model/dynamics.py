@@ -64,9 +64,7 @@ class Actuation:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Return the joint-space inertia of the independent joints at one configuration.
 
-    Args:
-        robot: The robot, its root fixed in the world.
-        q: Independent joint positions, shape (dof,) [rad or m].
+    q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
         Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
@@ -80,9 +78,7 @@ def movable_mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1.
 
-    Args:
-        robot: The robot, its root fixed in the world.
-        q: Independent joint positions, shape (dof,) [rad or m].
+    q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
         Symmetric matrix, shape (n_movable, n_movable).
@@ -107,9 +103,7 @@ def gravity_load(robot: Robot, q: ArrayLike) -> Array:
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.3.
 
-    Args:
-        robot: The robot, its root fixed in the world.
-        q: Independent joint positions, shape (dof,) [rad or m].
+    q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
         Force of every movable joint, shape (n_movable,) [N m or N]; mimic joints have their own.

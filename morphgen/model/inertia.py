@@ -71,15 +71,11 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     Primitives use closed forms. A closed mesh counts as its volume, an open one as its convex hull.
     The overlap of shapes is measured on their tessellations by exact booleans.
 
-    Args:
-        shapes: The solids, at their poses on the link.
-        density: Density [kg/m^3].
+    shapes: The solids, at their poses on the link.
+    density: Density [kg/m^3].
 
     Returns:
         Mass, centre of mass and inertia; zero mass if there are no shapes.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     integrals = union_integrals(shapes)
     if integrals.volume <= 0:
@@ -98,11 +94,7 @@ def with_inertia(link: Link, density: float) -> Link:
 
 
 def inertial_from_mass(link: Link, mass: float) -> Inertial:
-    """Return the mass properties of a link's shapes with uniform density and a given mass [kg].
-
-    Raises:
-        RobotError: If the link's shapes have no volume.
-    """
+    """Return the mass properties of a link's shapes with uniform density and a given mass [kg]."""
     unit = inertial_from_density(link.collisions or link.visuals, 1.0)
     if unit.mass <= 0:
         raise RobotError(f"link {link.name!r} has no volume to give {mass:g} kg an inertia")
@@ -177,9 +169,8 @@ def bounding_box(shapes: Sequence[Shape]) -> Array:
 def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
     """Return the corners of an axis-aligned box, shape (8, 3) [m].
 
-    Args:
-        low: Lowest corner, shape (3,) [m].
-        high: Highest corner, shape (3,) [m].
+    low: Lowest corner, shape (3,) [m].
+    high: Highest corner, shape (3,) [m].
     """
     sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
     return np.array(np.meshgrid(*sides)).reshape(3, -1).T

@@ -30,10 +30,8 @@ def dls_step(J: Array, error: Array, damping: float) -> Array:
     Wampler, Manipulator inverse kinematic solutions based on vector formulations and damped
     least-squares methods, 1986.
 
-    Args:
-        J: Jacobians, shape (..., m, dof).
-        error: Task-space errors, shape (..., m).
-        damping: Damping, in units of the singular values of ``J``.
+    J: Jacobians, shape (..., m, dof).
+    error: Task-space errors, shape (..., m).
 
     Returns:
         Changes of the joint positions, shape (..., dof).
@@ -55,20 +53,13 @@ def solve_position_ik(
 ) -> tuple[Array, Array]:
     """Move tools to positions by damped least squares, within the joint limits.
 
-    Args:
-        robot: The robot, with a tool.
-        q: Initial configurations, shape (n, dof) [rad or m].
-        positions: Goal positions of the tools in the root frame, shape (n, 3) [m].
-        iterations: Number of iterations.
-        damping: See ``dls_step``.
-        max_step: Largest change of a joint position in one iteration [rad or m].
-        tolerance: Distance at which a tool has arrived and its row iterates no more [m].
+    q: Initial configurations, shape (n, dof) [rad or m].
+    positions: Goal positions of the tools in the root frame, shape (n, 3) [m].
+    max_step: Largest change of a joint position in one iteration [rad or m].
+    tolerance: Distance at which a tool has arrived and its row iterates no more [m].
 
     Returns:
         Configurations, shape (n, dof), and the remaining position errors, shape (n, 3) [m].
-
-    Raises:
-        RobotError: If the robot has no tool.
     """
     low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
@@ -96,18 +87,12 @@ def solve_pose_ik(
 
     Joints at a limit that a step would move beyond it are excluded from the step.
 
-    Args:
-        robot: The robot.
-        T_root_goal: Goal pose of the frame in the root frame, shape (4, 4).
-        q: Initial configuration, shape (dof,) [rad or m].
-        rotation_weight: Weight of the rotation error [m/rad]; 0 leaves the orientation free.
-        frame: Name of the frame.
+    T_root_goal: Goal pose of the frame in the root frame, shape (4, 4).
+    q: Initial configuration, shape (dof,) [rad or m].
+    rotation_weight: Weight of the rotation error [m/rad]; 0 leaves the orientation free.
 
     Returns:
         The best configuration found, shape (dof,), within the joint limits.
-
-    Raises:
-        RobotError: If the frame is unknown.
     """
     low, high = joint_limits(robot).T
     current = best = np.clip(np.asarray(q, dtype=np.float64), low, high)

@@ -27,10 +27,8 @@ _ROTATION_SHARES = (0.25, 0.5, 0.75, 1.0)
 def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tensor:
     """Return the damped least-squares step; see ``inverse_kinematics.dls_step``.
 
-    Args:
-        J: Jacobians, shape (..., m, J).
-        error: Task-space errors, shape (..., m).
-        damping: Damping, in units of the singular values of ``J``.
+    J: Jacobians, shape (..., m, J).
+    error: Task-space errors, shape (..., m).
 
     Returns:
         Changes of the joint positions, shape (..., J).
@@ -54,15 +52,11 @@ def solve_position_ik(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Move tools to positions by damped least squares, within the joint limits.
 
-    Args:
-        chain: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        q: Initial configurations, shape (n, J) [rad or m].
-        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
-        limits: Lower and upper joint limits, each (n, J) [rad or m].
-        iterations: Number of iterations.
-        damping: See ``dls_step``.
-        max_step: Largest change of a joint position in one iteration [rad or m].
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    q: Initial configurations, shape (n, J) [rad or m].
+    positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+    limits: Lower and upper joint limits, each (n, J) [rad or m].
+    max_step: Largest change of a joint position in one iteration [rad or m].
 
     Returns:
         Configurations, shape (n, J), and the remaining position errors, shape (n, 3) [m].
@@ -84,12 +78,11 @@ def pose_task(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the Jacobians and errors of pose tasks, with weighted rotations.
 
-    Args:
-        T_root_tool: Poses of the tools, shape (n, 4, 4).
-        J_root_tool: Their Jacobians, shape (n, 6, J); see ``frame_jacobian``.
-        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
-        rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
-        rotation_weight: Weight of the rotation errors [m/rad].
+    T_root_tool: Poses of the tools, shape (n, 4, 4).
+    J_root_tool: Their Jacobians, shape (n, 6, J); see ``frame_jacobian``.
+    positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+    rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
+    rotation_weight: Weight of the rotation errors [m/rad].
 
     Returns:
         Jacobians, shape (n, 6, J), and errors, shape (n, 6) [m].
@@ -118,17 +111,13 @@ def solve_pose_ik(
     Position and rotation have the same priority. From random starts this finds more solutions than
     repeating ``pose_ik_step``, which is made for paths that start near their goals.
 
-    Args:
-        chain: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        q: Initial configurations, shape (n, J) [rad or m].
-        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
-        rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
-        limits: Lower and upper joint limits, each (n, J) [rad or m].
-        rotation_weight: Weight of the rotation errors [m/rad].
-        iterations: Number of iterations.
-        damping: See ``dls_step``.
-        max_step: Largest change of a joint position in one iteration [rad or m].
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    q: Initial configurations, shape (n, J) [rad or m].
+    positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+    rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
+    limits: Lower and upper joint limits, each (n, J) [rad or m].
+    rotation_weight: Weight of the rotation errors [m/rad].
+    max_step: Largest change of a joint position in one iteration [rad or m].
 
     Returns:
         Configurations, shape (n, J), and the remaining errors of ``pose_task``, shape (n, 6) [m].
@@ -154,15 +143,12 @@ def solve_from_starts(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Move tools to positions or poses from several starts each; see ``solve_position_ik``.
 
-    Args:
-        chain: Compiled robots.
-        robot_index: Compiled robot of each goal, shape (n,), int64.
-        starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
-        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
-        rotations: Goal rotations, shape (n, 3, 3); None if only positions matter.
-        limits: Lower and upper joint limits, each (n, J) [rad or m].
-        rotation_weight: Weight of the rotation errors [m/rad].
-        iterations: Number of iterations.
+    robot_index: Compiled robot of each goal, shape (n,), int64.
+    starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
+    positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+    rotations: Goal rotations, shape (n, 3, 3); None if only positions matter.
+    limits: Lower and upper joint limits, each (n, J) [rad or m].
+    rotation_weight: Weight of the rotation errors [m/rad].
 
     Returns:
         Configurations, shape (S, n, J), and the remaining errors, shape (S, n, 3) or, for poses as
@@ -208,15 +194,13 @@ def pose_ik_step(
     and Yoshikawa, Task-priority based redundancy control of robot manipulators, 1987). Joints that
     would leave their limits do not move.
 
-    Args:
-        chain: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        q: Joint positions, shape (n, J) [rad or m].
-        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
-        rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
-        limits: Lower and upper joint limits, each (n, J) [rad or m].
-        rotation_budget: Largest change of each joint position, shape (n, J). The rotation step is
-            shortened until no joint exceeds it. Unlimited by default.
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    q: Joint positions, shape (n, J) [rad or m].
+    positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+    rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
+    limits: Lower and upper joint limits, each (n, J) [rad or m].
+    rotation_budget: Largest change of each joint position, shape (n, J). The rotation step is
+        shortened until no joint exceeds it. Unlimited by default.
 
     Returns:
         Joint positions within the limits, shape (n, J).
@@ -254,13 +238,10 @@ def _solve(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Repeat steps of damped least squares; return configurations and the remaining errors.
 
-    Args:
-        task: Function from configurations (n, J) to Jacobians (n, m, J) and errors (n, m).
-        q: Initial configurations, shape (n, J) [rad or m].
-        limits: Lower and upper joint limits, each (n, J) [rad or m].
-        iterations: Number of iterations.
-        damping: See ``dls_step``.
-        max_step: Largest change of a joint position in one iteration [rad or m].
+    task: Function from configurations (n, J) to Jacobians (n, m, J) and errors (n, m).
+    q: Initial configurations, shape (n, J) [rad or m].
+    limits: Lower and upper joint limits, each (n, J) [rad or m].
+    max_step: Largest change of a joint position in one iteration [rad or m].
     """
     q = torch.clamp(q, *limits)
     for _ in range(iterations):

@@ -36,12 +36,7 @@ def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Arr
 
 
 def driving_joints(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
-    """Return the columns of ``q``, 0 to dof - 1, that move any of the given joints.
-
-    Args:
-        robot: The robot.
-        joints: Indices into ``robot.joints``; a mimic joint is moved by its leader.
-    """
+    """Return the columns of ``q``, 0 to dof - 1, that move any of the given joints."""
     matrix, _ = robot.mimic_map
     rows = [i for i, k in enumerate(robot.movable_joints) if k in joints]
     return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
@@ -62,10 +57,8 @@ def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
 
     A joint beyond its limits from where no turn leads within them stays.
 
-    Args:
-        robot: The robot.
-        q_reference: Reference configuration, shape (dof,).
-        q: Configurations, shape (..., dof).
+    q_reference: Reference configuration, shape (dof,).
+    q: Configurations, shape (..., dof).
 
     Returns:
         Configurations that give the same poses of all links, in the shape of ``q``; within the
@@ -82,15 +75,10 @@ def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:
     """Return the positions of all movable joints, mimic joints following their leaders.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (..., dof).
+    q: Independent joint positions, shape (..., dof).
 
     Returns:
         Positions in the order of ``robot.movable_joints``, shape (..., n_movable) [rad or m].
-
-    Raises:
-        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (robot.dof,):
@@ -102,15 +90,10 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     """Return the pose of every link in the root frame.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (..., dof).
+    q: Independent joint positions, shape (..., dof).
 
     Returns:
         ``T_root_link``, shape (..., n_links, 4, 4).
-
-    Raises:
-        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
     positions = movable_positions(robot, q)
     batch = positions.shape[:-1]
@@ -126,11 +109,7 @@ def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
 
 
 def frame_pose(robot: Robot, q: ArrayLike, frame: str = TOOL) -> Array:
-    """Return ``T_root_frame``, the pose of a named frame in the root frame, shape (..., 4, 4).
-
-    Raises:
-        RobotError: If the frame is unknown.
-    """
+    """Return ``T_root_frame``, the pose of a named frame in the root frame, shape (..., 4, 4)."""
     target = robot.frame(frame)
     T_root_link = forward_kinematics(robot, q)[..., robot.link_index[target.link], :, :]
     return np.asarray(T_root_link @ target.T_link_frame.matrix)
@@ -139,9 +118,7 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = TOOL) -> Array:
 def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
     """Return a point and the direction of each link's joint axis, in the root frame.
 
-    Args:
-        robot: The robot.
-        T_root_link: Poses of all links, shape (..., n_links, 4, 4).
+    T_root_link: Poses of all links, shape (..., n_links, 4, 4).
 
     Returns:
         Points on the axes [m] and unit axes, both (..., n_links, 3); zeros for the root and for
@@ -160,18 +137,12 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
     joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, shape (..., dof).
-        frame: Name of the frame.
+    q: Independent joint positions, shape (..., dof).
 
     Returns:
         ``T_root_frame``, shape (..., 4, 4), and ``J_root_frame``, shape (..., 6, dof): linear
         velocity of the frame's origin, then angular velocity; mimic joints are folded into their
         leaders.
-
-    Raises:
-        RobotError: If the frame is unknown.
     """
     target, positions = robot.frame(frame), movable_positions(robot, q)
     row = {k: i for i, k in enumerate(robot.movable_joints)}
@@ -217,9 +188,7 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
     Spatial: the linear velocity is that of the link's point that coincides with the root's origin
     (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 2.2).
 
-    Args:
-        robot: The robot.
-        T_root_link: Poses of all links, shape (..., n_links, 4, 4).
+    T_root_link: Poses of all links, shape (..., n_links, 4, 4).
 
     Returns:
         ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity per unit
@@ -245,15 +214,6 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
     Random search: the best of random configurations are improved by random steps of decreasing
     size. The seed is fixed, so that the result is a property of the robot. The travel of a
     prismatic base counts.
-
-    Args:
-        robot: The robot.
-        frame: Name of the frame.
-        samples: Number of initial configurations.
-        rounds: Rounds of improvement.
-
-    Raises:
-        RobotError: If the frame is unknown.
     """
     rng = np.random.default_rng(0)
     lower, upper = joint_limits(robot).T
@@ -278,9 +238,6 @@ def arm_reach(robot: Robot) -> float:
     """Return the largest distance between the tool and the origin of the first joint that moves it.
 
     Unlike ``reach``, it does not depend on where the robot is mounted [m].
-
-    Raises:
-        RobotError: If the robot has no tool.
     """
     T_root_joint = IDENTITY
     for k in robot.joint_chain(robot.frame(TOOL).link):
@@ -346,10 +303,9 @@ def _joint_motion(kind: str, axis: Vec3, position: Array) -> Array:
 def _joint_motions(slides: NDArray[np.bool_], axes: Array, positions: Array) -> Array:
     """Return transforms of joints.
 
-    Args:
-        slides: Whether each of k joints is prismatic, shape (k,).
-        axes: Their unit axes, shape (k, 3).
-        positions: Their positions, shape (..., k) [rad or m].
+    slides: Whether each of k joints is prismatic, shape (k,).
+    axes: Their unit axes, shape (k, 3).
+    positions: Their positions, shape (..., k) [rad or m].
 
     Returns:
         Shape (..., k, 4, 4).
@@ -415,16 +371,10 @@ def _displacement(joint: Joint, position: float) -> Pose:
 def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
     """Return positions of a named frame in the root frame.
 
-    Args:
-        robot: The robot.
-        q: Independent joint positions, a row per joint, shape (dof, n).
-        frame: Name of the frame.
+    q: Independent joint positions, a row per joint, shape (dof, n).
 
     Returns:
         Positions, shape (3, n) [m].
-
-    Raises:
-        RobotError: If the frame is unknown.
     """
     points = np.zeros((3, q.shape[1]))
     joints, T_root_next = _aligned_joints(robot, frame)
@@ -446,11 +396,7 @@ class FramePosition:
     """
 
     def __init__(self, robot: Robot, frame: str = TOOL) -> None:
-        """Compile the joints.
-
-        Raises:
-            RobotError: If the frame is unknown.
-        """
+        """Compile the joints."""
         joints, T_root_next = _aligned_joints(robot, frame)
         self._joints = [
             (joint.leader, joint.gain, joint.offset, joint.slides, _rows(joint.T_joint_next))

@@ -182,17 +182,7 @@ def compile_tree(
     dtype: torch.dtype = torch.float32,
     device: Device = "cpu",
 ) -> KinematicTree:
-    """Compile robots for ``forward_kinematics``.
-
-    Args:
-        robots: At least one robot.
-        max_links: L; by default the number of links of the largest robot.
-        dtype: Type of the floating-point tensors.
-        device: Device of all tensors.
-
-    Raises:
-        ValueError: If a robot has more than ``max_links`` links.
-    """
+    """Compile robots for ``forward_kinematics``."""
     most = max(len(robot.links) for robot in robots)
     if max_links is not None and max_links < most:
         raise ValueError(f"max_links is {max_links}; expected at least {most}")
@@ -234,17 +224,7 @@ def compile_chain(
     dtype: torch.dtype = torch.float32,
     device: Device = "cpu",
 ) -> FrameChain:
-    """Compile robots for ``frame_jacobian``, ``frame_pose`` and ``FramePositions``.
-
-    Args:
-        robots: At least one robot; each has the frame.
-        frame: Name of the frame.
-        dtype: Type of the floating-point tensors.
-        device: Device of all tensors.
-
-    Raises:
-        RobotError: If a robot does not have the frame.
-    """
+    """Compile robots for ``frame_jacobian``, ``frame_pose`` and ``FramePositions``."""
     rows, ends = [], []
     for robot in robots:
         target = robot.frame(frame)
@@ -266,10 +246,8 @@ def forward_kinematics(
 ) -> torch.Tensor:
     """Return the pose of every link in its robot's root frame.
 
-    Args:
-        tree: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        q: Independent joint positions, shape (n, J) [rad or m].
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    q: Independent joint positions, shape (n, J) [rad or m].
 
     Returns:
         ``T_root_link``, shape (n, L, 4, 4); the identity for padding.
@@ -289,10 +267,8 @@ def joint_axes(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return a point and the direction of each link's joint axis, in the root frame.
 
-    Args:
-        tree: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        T_root_link: Poses of all links, shape (n, L, 4, 4).
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    T_root_link: Poses of all links, shape (n, L, 4, 4).
 
     Returns:
         Points on the axes [m] and unit axes, both (n, L, 3); zeros where the joint is fixed.
@@ -315,10 +291,8 @@ def frame_jacobian(
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
     joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
 
-    Args:
-        chain: Compiled robots.
-        robot_index: Compiled robot of each row, shape (n,), int64.
-        q: Independent joint positions, shape (n, J) [rad or m].
+    robot_index: Compiled robot of each row, shape (n,), int64.
+    q: Independent joint positions, shape (n, J) [rad or m].
 
     Returns:
         ``T_root_frame``, shape (n, 4, 4), and ``J_root_frame``, shape (n, 6, J): linear velocity of
@@ -396,16 +370,7 @@ def _joint_tensors(
     *,
     pad_front: bool,
 ) -> JointTensors:
-    """Stack and pad the joints of all robots.
-
-    Args:
-        robots: R robots.
-        rows: For each robot, indices into ``robot.joints`` (None: fixed) with ``T_parent_joint``.
-        length: K.
-        dtype: Type of the floating-point tensors.
-        device: Device of all tensors.
-        pad_front: Whether padding precedes the joints instead of following them.
-    """
+    """Stack and pad the joints of all robots."""
     size = len(robots), length
     T = np.tile(np.eye(4), (*size, 1, 1))
     axis, prismatic = np.tile((0.0, 0.0, 1.0), (*size, 1)), np.zeros(size, dtype=np.bool_)

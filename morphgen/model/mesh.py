@@ -50,40 +50,22 @@ def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
     Coincident vertices are merged, triangles without area are removed, and a mirroring scale keeps
     the normals pointing outwards. The result is cached until the file changes; treat it as
     read-only.
-
-    Args:
-        mesh: The file, its scale and, with ``part``, the index of one of its ``mesh_parts``.
-
-    Raises:
-        MeshError: If the file is missing, unreadable, empty or not finite, or the part is unknown.
     """
     return _scaled(str(mesh.path.absolute()), _stamp(mesh.path), mesh.scale, mesh.part)
 
 
 def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
-    """Return the colour groups of a mesh file, in the order of their first triangles.
-
-    Raises:
-        MeshError: If the file is missing, unreadable, empty or not finite.
-    """
+    """Return the colour groups of a mesh file, in the order of their first triangles."""
     return tuple(group.part for group in _content(str(path.absolute()), _stamp(path))[0])
 
 
 def left_out(path: Path) -> tuple[str, ...]:
-    """Return what a mesh file holds beside its triangles and was left out, each as a phrase.
-
-    Raises:
-        MeshError: If the file is missing, unreadable, empty or not finite.
-    """
+    """Return what a mesh file holds beside its triangles and was left out, each as a phrase."""
     return _content(str(path.absolute()), _stamp(path))[1]
 
 
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
-    """Return the convex hull of a mesh [m]; cached, so treat it as read-only.
-
-    Raises:
-        MeshError: As ``load_mesh``, or if the mesh is flat.
-    """
+    """Return the convex hull of a mesh [m]; cached, so treat it as read-only."""
     return _hull(str(mesh.path.absolute()), _stamp(mesh.path), mesh.scale, mesh.part)
 
 

@@ -50,15 +50,6 @@ def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
     Nothing is allocated before the counts agree with the file's size. Normals and texture
     coordinates are left out. Without triangles, the faces are those of the convex hull, as in
     MuJoCo.
-
-    Args:
-        data: Content of the file.
-
-    Raises:
-        ValueError: If the counts are invalid or disagree with the file's size, a triangle has a
-            vertex that does not exist, a vertex is not finite, or there are no triangles and the
-            vertices are flat or too many.
-        scipy.spatial.QhullError: If there are no triangles, and the hull cannot be computed.
     """
     if len(data) < _HEADER:
         raise ValueError(f"{len(data)} bytes; expected a header of {_HEADER}")
@@ -114,11 +105,7 @@ class MeshContent:
 
 
 def read_mesh_file(path: Path) -> MeshContent:
-    """Return the coloured triangles of a mesh file, and what was left out.
-
-    Raises:
-        MeshError: If the file is unreadable, too large, without triangles or not finite.
-    """
+    """Return the coloured triangles of a mesh file, and what was left out."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         valid = ", ".join(MESH_SUFFIXES)

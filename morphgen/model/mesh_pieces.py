@@ -64,11 +64,7 @@ Piece = tuple[Rgba | None, tuple[Array, NDArray[np.int64]]]
 
 
 def read_picture(source: bytes | Path) -> Image.Image:
-    """Return the decoded first frame of a picture.
-
-    Raises:
-        ValueError: If it is not a picture, broken, or larger than ``MAX_PIXELS``.
-    """
+    """Return the decoded first frame of a picture."""
     try:
         with warnings.catch_warnings():  # Pillow warns on the terminal; the bound is here
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -105,12 +101,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         """Content that was not read, each a phrase."""
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file.
-
-        Raises:
-            OSError: If it is missing.
-            ValueError: If it is outside the folder, not a regular file or too large.
-        """
+        """Return the content of a file."""
         if name in self.written:
             return self.written[name]
         path = (self._folder / str(name).strip().replace("\\", "/")).resolve()
@@ -127,12 +118,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return path.read_bytes()
 
     def has_picture(self, name: str, read: Callable[[], bytes] | None = None) -> bool:
-        """Return whether a texture can be read; if not, note it as left out.
-
-        Args:
-            name: Name of the texture.
-            read: Returns its content; by default, that of the file with the name.
-        """
+        """Return whether a texture can be read; if not, note it as left out."""
         try:
             if self._pixels_left >= 0:  # otherwise not even decoded
                 width, height = read_picture(read() if read else self.get(name)).size
@@ -157,41 +143,25 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return self
 
     def write(self, name: str, data: bytes) -> None:
-        """Refuse to write.
-
-        Raises:
-            ValueError: Always.
-        """
+        """Refuse to write."""
         del data
         raise ValueError(f"{name!r} is not written")
 
 
 def require_faces(count: int) -> None:
-    """Require at most ``MAX_FACES`` triangles.
-
-    Raises:
-        ValueError: If there are more.
-    """
+    """Require at most ``MAX_FACES`` triangles."""
     if count > MAX_FACES:
         raise ValueError(f"{count} triangles; at most {MAX_FACES} are read")
 
 
 def require_sets(count: int) -> None:
-    """Require at most ``MAX_SETS`` sets of triangles.
-
-    Raises:
-        ValueError: If there are more.
-    """
+    """Require at most ``MAX_SETS`` sets of triangles."""
     if count > MAX_SETS:
         raise ValueError(f"{count} sets of triangles; at most {MAX_SETS} are read")
 
 
 def parse_numbers(text: bytes | str, dtype: type = np.float64) -> NDArray[Any]:
-    """Return the numbers in a text, separated by white space.
-
-    Raises:
-        ValueError: If a word is not a number.
-    """
+    """Return the numbers in a text, separated by white space."""
     with warnings.catch_warnings():  # NumPy warns and returns what it has read so far
         warnings.simplefilter("error", DeprecationWarning)
         try:
@@ -201,11 +171,7 @@ def parse_numbers(text: bytes | str, dtype: type = np.float64) -> NDArray[Any]:
 
 
 def scene_pieces(scene: trimesh.Scene) -> list[Piece]:
-    """Return the colour and the triangles of every geometry of a scene, in the scene frame.
-
-    Raises:
-        ValueError: If a vertex does not exist, is not finite or beyond ``MAX_COORDINATE``.
-    """
+    """Return the colour and the triangles of every geometry of a scene, in the scene frame."""
     return [
         (_colour(geometry), _in_scene(geometry, T_scene_node))
         for T_scene_node, name in (scene.graph[node] for node in scene.graph.nodes_geometry)

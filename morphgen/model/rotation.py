@@ -13,11 +13,7 @@ _GIMBAL, _NEAR_GIMBAL = 1e-12, 1e-3
 
 
 def normalize(q: Quat) -> Quat:
-    """Scale to unit length and choose the sign with w >= 0 (first non-zero entry positive).
-
-    Raises:
-        ValueError: If the quaternion is zero or not finite.
-    """
+    """Scale to unit length and choose the sign with w >= 0 (first non-zero entry positive)."""
     w, x, y, z = q
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not math.isfinite(norm) or norm < 1e-12:

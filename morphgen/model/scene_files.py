@@ -62,11 +62,7 @@ _GLTF_MODES = {0: "point sets", 1: "line sets", 2: "line loops", 3: "line strips
 
 
 def read_glb(data: bytes, files: FolderResolver) -> list[Piece]:
-    """Read a binary glTF file as ``read_gltf`` reads a document.
-
-    Raises:
-        ValueError: As ``read_gltf``, or if the chunks are malformed.
-    """
+    """Read a binary glTF file as ``read_gltf`` reads a document."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ValueError("does not begin as a binary glTF file")
     version, size, length = struct.unpack_from("<III", data, 4)
@@ -84,16 +80,7 @@ def read_glb(data: bytes, files: FolderResolver) -> list[Piece]:
 
 
 def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -> list[Piece]:
-    """Read a glTF document by trimesh, reduced to triangles whose bytes exist.
-
-    Args:
-        text: The document.
-        files: The files that it may name.
-        binary: The bytes of the buffer without a file, in a binary glTF file.
-
-    Raises:
-        ValueError: If a count exceeds its bytes or a bound, or something required is not read.
-    """
+    """Read a glTF document by trimesh, reduced to triangles whose bytes exist."""
     if sum(text.count(mark) for mark in b",:[{") > _MAX_MARKUP:
         raise ValueError(f"more than {_MAX_MARKUP} JSON values")
     document = json.loads(text)
@@ -324,11 +311,7 @@ _COLLADA_LOST = {
 
 
 def read_dae(data: bytes, files: FolderResolver) -> list[Piece]:
-    """Read a COLLADA file by trimesh, with skins as plain geometries and readable textures only.
-
-    Raises:
-        ValueError: If a count exceeds a bound, or the scene holds no triangle.
-    """
+    """Read a COLLADA file by trimesh, with skins as plain geometries and readable textures only."""
     root = _collada(data)
     _place_skins(root, files)
     for element in [*root]:

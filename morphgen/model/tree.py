@@ -14,16 +14,8 @@ from morphgen.model.rotation import Vec3, rotate
 def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
     """Cut out the part of a robot below a link.
 
-    Args:
-        robot: The robot.
-        root: The link that becomes the root of the part.
-        without: Links to leave out, each with all links below it.
-
     Returns:
         ``root`` and the links below it, with the joints, home, frames and ignore pairs among them.
-
-    Raises:
-        RobotError: If a link is unknown, or a joint of the part mimics one outside it.
     """
     for name in (root, *without):
         robot.link(name)
@@ -106,14 +98,8 @@ def scale_links(
     coincides with that of the scaled parent. If the contact point is on the joint's axis, the joint
     frame only slides along the axis, which does not change its motion.
 
-    Args:
-        robot: The robot.
-        factors: Scale factor by link name; other links keep their size.
-        faces: Contact point of a link with its parent before scaling, in the link's frame [m], by
-            link name; by default the origin.
-
-    Raises:
-        RobotError: If a link is unknown.
+    faces: Contact point of a link with its parent before scaling, in the link's frame [m], by
+        link name; by default the origin.
     """
     faces = faces or {}
     for name in (*factors, *faces):

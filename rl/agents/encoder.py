@@ -144,12 +144,7 @@ class Entities(nn.Module):
 
 
 def smooth_position_code(layer: nn.Module, first: int) -> None:
-    """Scale the initial weights of a layer's inputs that are the code of joint positions.
-
-    Args:
-        layer: A linear layer.
-        first: Number of the first of these inputs.
-    """
+    """Scale the initial weights of a layer's inputs that are the code of joint positions."""
     scale = torch.from_numpy(FREQUENCIES[0] / FREQUENCIES).float().repeat(2)
     with torch.no_grad():
         next(layer.parameters())[:, first : first + POSITION.size].mul_(scale)

@@ -48,11 +48,7 @@ class Config(NetworkConfig):
     """Hidden width of a layer's feedforward part and of the head."""
 
     def __post_init__(self) -> None:
-        """Check the sizes.
-
-        Raises:
-            TaskError: If a size is out of its range.
-        """
+        """Check the sizes."""
         super().__post_init__()
         if self.graph_features % self.graph_heads:
             raise TaskError(
@@ -135,9 +131,7 @@ class Network(encoder.Network):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the encoded descriptions and states of joints, both (n, K, features).
 
-        Args:
-            observation: The observation.
-            links: Link of each joint, shape (n, K), int64.
+        links: Link of each joint, shape (n, K), int64.
         """
         extra = [observation[name][..., None] for name in self.channels]
         extra += [observation[name] for name in self.vectors]

@@ -38,11 +38,7 @@ class Config(NetworkConfig):
     much more. The MLP learns less with it and has none."""
 
     def __post_init__(self) -> None:
-        """Check the sizes.
-
-        Raises:
-            TaskError: If a size is out of its range.
-        """
+        """Check the sizes."""
         super().__post_init__()
         if self.features % self.heads:
             raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")
@@ -127,11 +123,10 @@ class Block(nn.Module):
 def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Return the attention (Vaswani et al. 2017, equation 1) to the tokens of a mask.
 
-    Args:
-        q: Queries, shape (n, heads, T, features of a head).
-        k: Keys, of the same shape.
-        v: Values, of the same shape.
-        mask: Tokens that are attended to, shape (n, T), bool; at least one.
+    q: Queries, shape (n, heads, T, features of a head).
+    k: Keys, of the same shape.
+    v: Values, of the same shape.
+    mask: Tokens that are attended to, shape (n, T), bool; at least one.
     """
     if q.device.type == "cpu":
         return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None])

@@ -53,9 +53,8 @@ def column_steps(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
 
     It is the projection of the error on the joint's column; 0 for columns below ``MIN_COLUMN``.
 
-    Args:
-        J: Jacobians, shape (n, m, J).
-        error: Task-space errors, shape (n, m).
+    J: Jacobians, shape (n, m, J).
+    error: Task-space errors, shape (n, m).
     """
     squares = J.square().sum(dim=1)
     steps = (J * error[..., None]).sum(dim=1) / squares.clamp(min=MIN_COLUMN**2)

@@ -121,14 +121,10 @@ def rrt_connect(
 
     RRT-Connect (Kuffner and LaValle 2000). Without goals, the tree of the start grows alone.
 
-    Args:
-        start: Configuration, shape (dof,).
-        goals: Configurations, shape (n, dof); n may be 0.
-        limits: Limits of the joints, shape (dof, 2).
-        step: Largest change of every joint in a control step, shape (dof,).
-        free_fraction: Collision test of a straight line.
-        rng: Source of random configurations.
-        iterations: Number of random configurations.
+    start: Configuration, shape (dof,).
+    goals: Configurations, shape (n, dof); n may be 0.
+    limits: Limits of the joints, shape (dof, 2).
+    step: Largest change of every joint in a control step, shape (dof,).
 
     Returns:
         Waypoints from the start to a goal, None if the trees did not meet; and the tree of the
@@ -171,11 +167,8 @@ class PathPlanner:
     ) -> None:
         """Set up the planner.
 
-        Args:
-            space: Collision test of configurations.
-            step: Largest change of every joint in a control step, shape (dof,).
-            seed: Seed of random configurations.
-            movable: Joints that a path may move, shape (dof,); by default all.
+        step: Largest change of every joint in a control step, shape (dof,).
+        movable: Joints that a path may move, shape (dof,); by default all.
         """
         self.space, self._step, self._seed = space, step, seed
         self._limits = joint_limits(space.scene.robot)
@@ -202,15 +195,10 @@ class PathPlanner:
     ) -> Path | None:
         """Return the cheapest free path that goes straight to a goal, or by way of its via.
 
-        Args:
-            start: Configuration, shape (dof,).
-            goals: Configurations, shape (n, dof).
-            vias: A configuration from which each goal may be approached, shape (n, dof).
-            cost: Cost of paths; by default their lengths.
-            block: Pose of the block, shape (7,); None for a scene without block.
-            tree: Tree from the start. A path follows it to the node nearest to the goal, goes
-                straight from there, and is shortened. Of the first ``COMPARED`` free paths the
-                cheapest after shortening is returned.
+        start: Configuration, shape (dof,).
+        goals: Configurations, shape (n, dof).
+        vias: A configuration from which each goal may be approached, shape (n, dof).
+        block: Pose of the block, shape (7,); None for a scene without block.
 
         Returns:
             None if no path is free.
@@ -251,12 +239,9 @@ class PathPlanner:
     ) -> tuple[Path | None, Tree]:
         """Plan by RRT-Connect to any of several goals; see ``rrt_connect``.
 
-        Args:
-            start: Configuration, shape (dof,).
-            goals: Configurations, shape (n, dof); n may be 0.
-            block: Pose of the block, shape (7,); None for a scene without block.
-            attempt: Selects the random configurations, together with the planner's seed.
-            iterations: Number of random configurations.
+        start: Configuration, shape (dof,).
+        goals: Configurations, shape (n, dof); n may be 0.
+        block: Pose of the block, shape (7,); None for a scene without block.
 
         Returns:
             The shortened path, None if the search failed; and the tree of the start.

@@ -43,11 +43,9 @@ class PreContact:
 def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
     """Return those configurations that touch the block if they move along y.
 
-    Args:
-        space: Collision test with the block.
-        q: Configurations free of the block, shape (n, dof).
-        block: Pose of the block, shape (7,).
-        edge: Edge length of the block [m].
+    q: Configurations free of the block, shape (n, dof).
+    block: Pose of the block, shape (7,).
+    edge: Edge length of the block [m].
     """
     gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
     touching = np.isfinite(gap)
@@ -68,11 +66,9 @@ def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
     it touches it below, from 0 to 1 edges. With overhang, a push presses the block to the ground or
     tips it over.
 
-    Args:
-        space: Collision test with the block.
-        q: Configurations free of the block, shape (n, dof).
-        blocks: Pose of the block for each of them, shape (n, 7).
-        edge: Edge length of the block [m].
+    q: Configurations free of the block, shape (n, dof).
+    blocks: Pose of the block for each of them, shape (n, 7).
+    edge: Edge length of the block [m].
 
     Returns:
         Overhangs, shape (n,) [edges].
@@ -89,13 +85,10 @@ def touches(
 ) -> NDArray[np.bool_]:
     """Return whether configurations touch the shifted block, shape (n, k).
 
-    Args:
-        space: Collision test with the block.
-        q: Configurations, shape (n, dof).
-        block: Pose of the block, shape (7,), or one for each configuration, (n, 7).
-        dx: Shifts along x, of a shape that broadcasts to (n, k) [m].
-        dy: Shifts along y, likewise.
-        dz: Shift along z [m].
+    q: Configurations, shape (n, dof).
+    block: Pose of the block, shape (7,), or one for each configuration, (n, 7).
+    dx: Shifts along x, of a shape that broadcasts to (n, k) [m].
+    dz: Shift along z [m].
     """
     n, k = len(q), max(dx.shape[-1], dy.shape[-1])
     blocks = np.broadcast_to(block.reshape(-1, 1, 7), (n, k, 7)).copy()

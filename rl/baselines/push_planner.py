@@ -126,11 +126,9 @@ class ToolKinematics:
     def move_towards(self, q: Array, position: Array, rotation: Array, iterations: int) -> Array:
         """Return configurations after some iterations of ``pose_ik_step``, shape (n, dof).
 
-        Args:
-            q: Configurations to start from, shape (n, dof).
-            position: Goal positions of the tool, shape (n, 3) [m].
-            rotation: Goal rotations of the tool, shape (n, 3, 3).
-            iterations: Number of iterations.
+        q: Configurations to start from, shape (n, dof).
+        position: Goal positions of the tool, shape (n, 3) [m].
+        rotation: Goal rotations of the tool, shape (n, 3, 3).
         """
         robots, rows = self._rows(q)
         goals = torch.from_numpy(position).to(rows)
@@ -160,18 +158,7 @@ class PushPlanner:
         robot: int,
         rng: np.random.Generator,
     ) -> None:
-        """Collect free configurations with a low tool in the region of the push.
-
-        Args:
-            spec: Robot and starts of the task push.
-            scene: Scene of the robot, with the obstacles of an episode.
-            tables: Kinematics of the robots of a batch.
-            robot: Index of the robot in the batch.
-            rng: Source of random configurations.
-
-        Raises:
-            ValueError: If the environment's task is not push.
-        """
+        """Collect free configurations with a low tool in the region of the push."""
         starts, self._robot = spec.goals, spec.robot
         if not isinstance(starts, PushStartSet):
             raise ValueError(f"{self._robot.name} does not push")
@@ -197,11 +184,8 @@ class PushPlanner:
     ) -> Plan | None:
         """Return the cheapest plan of a push.
 
-        Args:
-            q: Configuration of the robot, shape (dof,).
-            block: Pose of the block, shape (7,).
-            attempt: Number of earlier plans in this episode; selects random configurations.
-            steps_left: Control steps until the episode ends. Plans that take longer cost more.
+        q: Configuration of the robot, shape (dof,).
+        block: Pose of the block, shape (7,).
 
         Returns:
             None if there is no plan, or too little time to push the block across the line.
@@ -279,11 +263,9 @@ class PushPlanner:
     ) -> tuple[Array, Array]:
         """Return starts of inverse kinematics (n, dof) and goals of the tool behind the block.
 
-        Args:
-            q: Configurations to choose from, shape (k, dof).
-            tools: Positions of their tools, shape (k, 3) [m].
-            block: Pose of the block, shape (7,).
-            also: Indices of configurations to use for every goal, besides those near it.
+        q: Configurations to choose from, shape (k, dof).
+        tools: Positions of their tools, shape (k, 3) [m].
+        block: Pose of the block, shape (7,).
         """
         edge, yaw = self._edge, 2 * np.arctan2(block[6], block[3])
         hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
@@ -301,10 +283,9 @@ class PushPlanner:
     def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
         """Return collision-free solutions of inverse kinematics, shape (k, dof), k <= n.
 
-        Args:
-            starts: Configurations to start from, shape (n, dof).
-            goals: Positions of the tool, shape (n, 3) [m].
-            block: Pose of the block, shape (7,).
+        starts: Configurations to start from, shape (n, dof).
+        goals: Positions of the tool, shape (n, 3) [m].
+        block: Pose of the block, shape (7,).
         """
         q, error = solve_position_ik(self._robot, starts, goals)
         solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)

@@ -53,11 +53,7 @@ class AgentSpec:
 
 
 def parse_agent(text: str) -> AgentSpec:
-    """Read ``me-tf+discrete-symlog``: an agent, and switches that are on (+) or off (-).
-
-    Raises:
-        TaskError: If the agent or a switch is unknown, or a switch is named twice.
-    """
+    """Read ``me-tf+discrete-symlog``: an agent, and switches that are on (+) or off (-)."""
     agent = next((name for name in AGENTS if re.match(rf"{re.escape(name)}([+-]|$)", text)), None)
     if agent is None:
         AGENTS[text.partition("+")[0]]  # raises
@@ -77,16 +73,7 @@ def parse_agent(text: str) -> AgentSpec:
 
 
 def parse_agents(text: str) -> list[tuple[str, AgentSpec, Side]]:
-    """Read the agents of a study: their labels, their specs, and the side they are trained on.
-
-    Args:
-        text: Specs separated by commas, or ``ablation``. An agent of single robots may end in
-            ``@test``: it is trained on the test robots themselves, to compare with zero-shot
-            transfer, as in the paper.
-
-    Raises:
-        TaskError: If a spec is invalid, or there twice.
-    """
+    """Read the agents of a study: their labels, their specs, and the side they are trained on."""
     agents: dict[str, tuple[AgentSpec, Side]] = {}
     for part in ABLATION if text == "ablation" else text.split(","):
         name, at, side = part.partition("@")
@@ -107,16 +94,6 @@ def configs_of(
     """Return the policy and the algorithm of a spec.
 
     Actions are discrete if all tasks prefer it (reach, in the paper), unless the spec says so.
-
-    Args:
-        spec: The agent.
-        tasks: Tasks of its robots.
-        changes: Values of ``PolicyConfig``, ``PPOConfig`` and the networks' config by name; sizes
-            of other agents' networks have no effect.
-        total_timesteps: Control steps of all environments together.
-
-    Raises:
-        TaskError: If a value is out of its range.
     """
     network = AGENTS[spec.agent].config
     values = dict(changes)
@@ -146,9 +123,6 @@ def parse_constants(texts: Sequence[str]) -> dict[str, Any]:
     """Read ``name=value`` for numbers of ``PPOConfig`` and of the networks of any agent.
 
     Earlier names are read, too; see ``morphgen.rl.aliases``.
-
-    Raises:
-        TaskError: If there is no such number, or the value is not a number of its type.
     """
     valid = {**{name: default for name, default, _ in network_fields()}, **NUMBERS}
     values: dict[str, Any] = {}

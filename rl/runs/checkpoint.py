@@ -51,15 +51,7 @@ _KINDS: Mapping[str, type | tuple[type, ...]] = {
 
 
 def require_learner(learner: object, where: str) -> None:
-    """Require that the state of a learner is complete, and its weights have the right shapes.
-
-    Args:
-        learner: The state, as a checkpoint has it.
-        where: The checkpoint, for messages.
-
-    Raises:
-        TaskError: If an entry is missing, or of another type, shape or number format.
-    """
+    """Require that the state of a learner is complete, and its weights have the right shapes."""
     if not isinstance(learner, dict):
         raise TaskError(f"{where}: {shown(learner)}: expected a learner")
     for name, kind in _KINDS.items():
@@ -160,11 +152,7 @@ allocate as much as a file asks for, such as ``bytearray``."""
 
 
 def packed(content: Mapping[str, Any], where: str) -> bytes:
-    """Return the bytes of a checkpoint's file, with its hash.
-
-    Raises:
-        TaskError: If a number of the content is not finite, or it is beyond a limit.
-    """
+    """Return the bytes of a checkpoint's file, with its hash."""
     _require_plain(content, where)
     file = io.BytesIO()
     torch.save({**content, HASH: _digest(content)}, file)
@@ -172,12 +160,7 @@ def packed(content: Mapping[str, Any], where: str) -> bytes:
 
 
 def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
-    """Return the content of a checkpoint's file without its hash, and whether it has one.
-
-    Raises:
-        TaskError: If the file is not a checkpoint, is damaged or beyond a limit, or a number in it
-            is not finite.
-    """
+    """Return the content of a checkpoint's file without its hash, and whether it has one."""
     try:
         _require_container(file)
         # Mapped, a storage that claims more than its record has cannot reach beyond the file.
@@ -252,11 +235,7 @@ def _require_container(file: Path) -> None:
 
 
 def _require_plain(content: object, where: str) -> None:
-    """Require that the content has plain containers, finite numbers and dense tensors only.
-
-    Raises:
-        TaskError: If it has others, or is beyond a limit.
-    """
+    """Require that the content has plain containers, finite numbers and dense tensors only."""
     total = 0
     for count, (path, value) in enumerate(_walked(content, where)):
         if count > MAX_VALUES:
@@ -370,13 +349,7 @@ class Interface:
 
 
 def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) -> Interface:
-    """Return the interface of a policy.
-
-    Args:
-        policy: Agent and networks.
-        max_links: Links that its observations are padded to, if it needs a fixed number.
-        obstacles: Minimum number of obstacle rows.
-    """
+    """Return the interface of a policy."""
     channels = observation_config(policy.channels, obstacles=obstacles)
     channels = replace(channels, tool=channels.tool or policy.tool_position)
     any_size = AGENTS[policy.agent].any_size
@@ -423,11 +396,7 @@ class RunConfig:
         return tuple(replace(task, num_goals=type(task)().num_goals) for task in self.tasks)
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            TaskError: If a number is out of its range, or the simulator is unknown.
-        """
+        """Check the numbers."""
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
         if self.num_envs < 1:
@@ -462,10 +431,6 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
     """Create the folder of a run, or check that an existing one has the same run.
 
     A run without a checkpoint is overwritten: it has nothing to continue from.
-
-    Raises:
-        TaskError: If the folder has another run, or a run that is not to be resumed.
-        FormatError: If the config cannot be written.
     """
     require_open(folder, config, resume=resume)
     path = folder / CONFIG
@@ -480,11 +445,7 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
 
 
 def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Require that ``open_run`` can create or resume a run in a folder; write nothing.
-
-    Raises:
-        TaskError: If the folder has a run that is not to be resumed, another run, or other files.
-    """
+    """Require that ``open_run`` can create or resume a run in a folder; write nothing."""
     path = folder / CONFIG
     if _has_checkpoint(folder):
         if not resume:
@@ -508,11 +469,7 @@ def _has_checkpoint(folder: Path) -> bool:
 
 
 def read_config(folder: Path) -> RunConfig:
-    """Return the config of a run.
-
-    Raises:
-        TaskError: If the folder has no config, or an invalid one.
-    """
+    """Return the config of a run."""
     path = folder / CONFIG
     try:
         data = read_json(path)
@@ -528,11 +485,7 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def config_from(data: object) -> RunConfig:
-    """Return the run config of a JSON file or a checkpoint; earlier names of keys are read, too.
-
-    Raises:
-        TaskError: If an entry is missing, unknown, of another type or out of its range.
-    """
+    """Return the run config of a JSON file or a checkpoint; earlier names of keys are read, too."""
     if not isinstance(data, Mapping):
         raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
     entries = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
@@ -565,12 +518,7 @@ def config_from(data: object) -> RunConfig:
 
 
 def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
-    """Write the checkpoint of a run, in place of its last one.
-
-    Raises:
-        FormatError: If the file cannot be written.
-        TaskError: If a number is not finite; the last checkpoint is kept.
-    """
+    """Write the checkpoint of a run, in place of its last one."""
     path = folder / CHECKPOINT
     data = {"format": FORMAT, "run": config.as_data(), "learner": dict(learner)}
     content = packed(data, f"{path} is not replaced")
@@ -581,15 +529,7 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
 
 
 def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the run config and the learner's state of a checkpoint; nothing in it is executed.
-
-    Args:
-        path: The checkpoint, or the folder of its run.
-
-    Raises:
-        TaskError: If there is no checkpoint, or it is damaged, incomplete or beyond a limit, or a
-            number in it is not finite.
-    """
+    """Return the run config and the learner's state of a checkpoint; nothing in it is executed."""
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
         raise TaskError(f"{file}: no such checkpoint")
@@ -618,11 +558,7 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def require_same_run(folder: Path, config: RunConfig) -> None:
-    """Require that a folder has a run with this config.
-
-    Raises:
-        TaskError: If the run in the folder has another config; the message lists the differences.
-    """
+    """Require that a folder has a run with this config."""
     theirs, ours = _flat(read_config(folder)), _flat(config)
     differences = [
         f"{name} {_short(theirs.get(name))}, not {_short(value)}"

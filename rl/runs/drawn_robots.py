@@ -87,22 +87,7 @@ def drawn_source(
     goal_seed: int = 0,
     library: Sequence[Path] = (),
 ) -> RobotSource:
-    """Return robots of grammars as a source; ``draw`` draws them.
-
-    Args:
-        request: Grammars and the number of robots of each, such as ``arm3:300,chain:300``.
-        task: Task of all robots.
-        seed: Seed of the robots.
-        held_out: Names or files of splits whose test robots are not drawn, besides the splits that
-            morphgen ships.
-        obstacles: Whether the robots are among obstacles.
-        goal_seed: Seed of goals, starts and obstacles.
-        library: Folders of your own parts.
-
-    Raises:
-        TaskError: If the request is malformed, or names a grammar twice.
-        MorphgenError: If a grammar or a split is unknown or faulty.
-    """
+    """Return robots of grammars as a source; ``draw`` draws them."""
     folders = tuple(library)
     grammars = [
         (load_sound_grammar(name, default_library(folders)).name, _portable(name), count)
@@ -140,17 +125,6 @@ def draw(
     """Return the robots of a source, which are drawn once per process.
 
     Goal sets are kept in the cache, so that an interrupted call continues.
-
-    Args:
-        source: Grammars with the number of robots of each.
-        config: Constants of the tasks; the seed is the source's.
-        jobs: Number of processes.
-        progress: Called with the number of robots that are ready, and their total.
-
-    Raises:
-        TaskError: If a grammar gives too few robots that can do the task, or the robots have
-            another hash than the source says.
-        MorphgenError: If a grammar is unknown, or a robot cannot be drawn.
     """
     key = replace(source, drawn_hash=""), config
     if key not in _drawn:
@@ -184,21 +158,8 @@ def fresh_source(
 ) -> tuple[RobotSource, str]:
     """Draw robots to evaluate a run of drawn robots on, other ones than it was trained on.
 
-    Args:
-        folder: Folder of the run, with its list of robots.
-        source: Grammars of the run, with the number of robots of each; at most ``MAX_FRESH`` of
-            each are drawn.
-        config: Constants of the tasks.
-        seed: Seed of the evaluation, from which that of the robots follows.
-        jobs: Number of processes.
-        progress: Called with the number of robots that are ready, and their total.
-
     Returns:
         The robots as the test side of a split, and a line that describes them.
-
-    Raises:
-        TaskError: If the run has no list of its robots, or too few others can be drawn.
-        MorphgenError: As ``draw``.
     """
     trained = read_drawn(folder)
     draw_seed = int(np.random.SeedSequence([_FRESH, source.draw_seed, seed]).generate_state(1)[0])
@@ -220,11 +181,7 @@ def fresh_source(
 
 
 def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
-    """Write the list of drawn robots into the folder of a run; the same robots give the same bytes.
-
-    Raises:
-        TaskError: If it cannot be written.
-    """
+    """Write the list of drawn robots into a run's folder; the same robots give the same bytes."""
     head = {
         "format": FORMAT,
         "robots": source.name,
@@ -243,11 +200,7 @@ def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
 
 
 def read_drawn(folder: Path) -> tuple[Member, ...]:
-    """Return the drawn robots that the folder of a run lists.
-
-    Raises:
-        TaskError: If there is no list, or it is malformed.
-    """
+    """Return the drawn robots that the folder of a run lists."""
     path = folder / FILE
     try:
         data = read_json(path)
@@ -265,15 +218,7 @@ def read_drawn(folder: Path) -> tuple[Member, ...]:
 
 
 def trained_on(folder: Path, source: RobotSource) -> list[str]:
-    """Return the names of a source's robots that are among the drawn robots of a run.
-
-    Args:
-        folder: Folder of the run.
-        source: Robots to evaluate: a side of a split, or one robot.
-
-    Raises:
-        TaskError: As ``read_drawn``.
-    """
+    """Return the names of a source's robots that are among the drawn robots of a run."""
     hashes = {member.robot_hash for member in read_drawn(folder)}
     robots = {member.name: member.robot_hash for member in source_members(source)}
     robots = robots or {source.name: source.robot_hash}
@@ -381,11 +326,7 @@ class _Drawer:
         return RobotFactory(self.folders, max_links=LARGEST_MAX_LINKS)
 
     def __call__(self, recipe: SampledRecipe) -> _Draw:
-        """Draw a robot.
-
-        Raises:
-            SamplingError: If the grammar gives no valid robot.
-        """
+        """Draw a robot."""
         candidate = self._factory(recipe)
         (member,) = factory_members((candidate,), (self.task,), self.obstacles)
         if member.robot_hash in self.held_out:

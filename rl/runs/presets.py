@@ -53,11 +53,7 @@ PRESETS: Mapping[str, Preset] = {"fast": FAST, "paper": PAPER}
 
 
 def preset_of(name: str | None, agent: str) -> Preset:
-    """Return a preset by its name, or the one that an agent has by default.
-
-    Raises:
-        TaskError: If the preset is unknown.
-    """
+    """Return a preset by its name, or the one that an agent has by default."""
     if name is None:
         name = AGENTS[agent].preset
     if name not in PRESETS:

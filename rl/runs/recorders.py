@@ -37,9 +37,6 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """Return the recorded metrics of a run, a dictionary per update, oldest first.
 
     An unfinished last line of a killed run is ignored.
-
-    Raises:
-        FormatError: If a line is not the report of an update.
     """
     path = folder / METRICS
     if not path.is_file():
@@ -81,11 +78,7 @@ class TensorBoard:
     """Events for ``tensorboard --logdir``."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Continue after an update.
-
-        Raises:
-            MissingDependencyError: If tensorboard is not installed.
-        """
+        """Continue after an update."""
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
@@ -108,12 +101,7 @@ class WeightsAndBiases:
     """A run of Weights & Biases."""
 
     def __init__(self, folder: Path, config: RunConfig) -> None:
-        """Begin, or continue the run of this folder.
-
-        Raises:
-            MissingDependencyError: If wandb is not installed.
-            TaskError: If it refuses, for example without a login.
-        """
+        """Begin, or continue the run of this folder."""
         wandb = require_wandb()
         try:
             self._run = wandb.init(
@@ -137,11 +125,7 @@ class WeightsAndBiases:
 
 
 def require_wandb() -> ModuleType:
-    """Return the module of Weights & Biases.
-
-    Raises:
-        MissingDependencyError: If wandb is not installed.
-    """
+    """Return the module of Weights & Biases."""
     try:
         return import_module("wandb")
     except ImportError as error:

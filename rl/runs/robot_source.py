@@ -84,11 +84,7 @@ def robot_source(
     goal_seed: int = 0,
     library: tuple[Path, ...] = (),
 ) -> RobotSource:
-    """Return one robot, named in any way that ``morphgen.tasks.scenes.env_specs.load_robot`` reads.
-
-    Raises:
-        MorphgenError: As ``load_robot``.
-    """
+    """Return one robot, named in any way that ``load_robot`` of ``env_specs`` reads."""
     return RobotSource(
         str(Path(robot).resolve()) if is_robot_file(robot) else robot,
         task=task,
@@ -100,20 +96,12 @@ def robot_source(
 
 
 def split_of(source: RobotSource) -> Split:
-    """Return the split of a source that has one.
-
-    Raises:
-        BenchmarkError: If the text of the split is malformed.
-    """
+    """Return the split of a source that has one."""
     return parse_split(source.split, Path(source.name)).split
 
 
 def members(source: RobotSource) -> tuple[Member, ...]:
-    """Return the members of the split that are meant; none for one robot.
-
-    Raises:
-        BenchmarkError: If the split has no such member, or its text is malformed.
-    """
+    """Return the members of the split that are meant; none for one robot."""
     if not source.split:
         return ()
     side = split_of(source).side(source.side)
@@ -132,9 +120,6 @@ def identity(source: RobotSource) -> dict[str, Any]:
     """Return the entries of a source that results depend on: of a split its id, not its text.
 
     The text also has the version of morphgen that wrote it.
-
-    Raises:
-        BenchmarkError: If the text of the split is malformed.
     """
     text = source.split and split_id(split_of(source))
     return asdict(source) | {"split": text}
@@ -154,11 +139,7 @@ def single_members(source: RobotSource) -> Iterator[RobotSource]:
 
 
 def other_side(source: RobotSource, side: Side) -> RobotSource:
-    """Return a whole side of the same split.
-
-    Raises:
-        TaskError: If it is no split, and so has no other side.
-    """
+    """Return a whole side of the same split."""
     if source.split:
         return replace(source, side=side, member=None)
     if side == "test" and source.grammars:
@@ -170,12 +151,7 @@ def other_side(source: RobotSource, side: Side) -> RobotSource:
 
 @lru_cache(maxsize=64)
 def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
-    """Return the largest number of obstacles of any robot, on both sides of the split.
-
-    Args:
-        source: One robot, or a split.
-        config: Constants of the tasks.
-    """
+    """Return the largest number of obstacles of any robot, on both sides of the split."""
     if source.task is not None:
         return config.task_config(source.task).obstacles if source.obstacles else 0
     sides: tuple[Side, ...] = ("train", "test")
@@ -187,12 +163,7 @@ def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
 
 
 def require_links(source: RobotSource, max_links: int) -> None:
-    """Require that a policy can be tested on the other side of a split, or on held-out robots.
-
-    Raises:
-        BenchmarkError: If a robot there has more links than ``max_links``.
-        MorphgenError: If a robot cannot be built.
-    """
+    """Require that a policy can be tested on the other side of a split, or on held-out robots."""
     side: Side = "test" if source.side == "train" else "train"
     others = members(other_side(source, side)) if source.split else ()
     held_out = (member for name in source.held_out for member in read_split(name).test)
@@ -205,18 +176,7 @@ def require_links(source: RobotSource, max_links: int) -> None:
 def specs_of(
     source: RobotSource, config: GoalConfig, progress: Progress = no_progress
 ) -> list[EnvSpec]:
-    """Return the robots with their tasks and scenes; each is built once per process.
-
-    Args:
-        source: The robots.
-        config: Constants of the tasks; the seed is the source's.
-        progress: Called with the number of robots whose goal set is ready, and their total.
-
-    Raises:
-        TaskError: If the robots are drawn from grammars.
-        MorphgenError: If a robot cannot be built, has another hash than in the split, or cannot do
-            its task.
-    """
+    """Return the robots with their tasks and scenes; each is built once per process."""
     if source.grammars:
         raise _without_sides(source)
     config = replace(config, seed=source.goal_seed)

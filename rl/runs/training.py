@@ -87,9 +87,6 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
     """Continue where a learner of the same batch, configuration and device stopped.
 
     All environments begin new episodes.
-
-    Raises:
-        TaskError: If these are not the same; nothing is changed then.
     """
     _require_networks(learner, state)
     ours = {
@@ -130,9 +127,6 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
     """Load the networks of a learner's state and nothing else of it, to fine-tune them.
 
     With a ``desired_kl``, the actor's learning rate begins at ``FINETUNING_ACTOR_LR_SCALE``.
-
-    Raises:
-        TaskError: If they are other networks, or for other observations.
     """
     _require_networks(learner, state)
     for name, network in _networks(learner).items():
@@ -142,11 +136,7 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
 
 
 def use_batch(learner: Learner, batch: TaskBatch) -> None:
-    """Continue with other environments; all of them begin new episodes.
-
-    Raises:
-        TaskError: If there are more or fewer environments, or their actions or observations differ.
-    """
+    """Continue with other environments; all of them begin new episodes."""
     observation = batch.observe()
     require_layout(learner.layout, layout_of(observation), "the learner")
     if (batch.num_envs, batch.action_kind) != (learner.batch.num_envs, learner.policy.kind):
@@ -202,14 +192,7 @@ def num_slices(config: RunConfig) -> int:
 
 
 def slice_of(num_robots: int, size: int, number: int, seed: int) -> list[int]:
-    """Return the indices of the robots in a slice.
-
-    Args:
-        num_robots: Number of robots of the source.
-        size: Robots per slice, at most ``num_robots``.
-        number: Number of the slice, from 0.
-        seed: Seed of the order.
-    """
+    """Return the indices of the robots in a slice."""
     first, last = number * size, (number + 1) * size - 1
     passes = range(first // num_robots, last // num_robots + 1)
     order = np.concatenate(
@@ -245,19 +228,7 @@ class TrainingBatches:
         workers: int = 1,
         progress: Progress = no_progress,
     ) -> None:
-        """Build the robots and their goal sets.
-
-        Args:
-            config: Config of the run.
-            envs: Numbers of the environments of this process; by default all.
-            device: Device of this process; by default that of the config.
-            workers: Number of processes of PyBullet, or of threads of MuJoCo.
-            progress: Called with the number of robots whose goal set is ready, and their total.
-
-        Raises:
-            BenchmarkError: If a robot has more links than the config's ``max_links``.
-            MorphgenError: If a robot cannot be built or cannot do its task.
-        """
+        """Build the robots and their goal sets."""
         self._config, self._workers = config, workers
         self._envs = range(config.num_envs) if envs is None else envs
         self._device = batch_device(config.sim, device or config.device)
@@ -281,10 +252,6 @@ class TrainingBatches:
         """Return a new batch, with which the run continues after so many updates.
 
         The last batch is closed.
-
-        Raises:
-            SimulationError: If the simulator cannot hold a scene.
-            MissingDependencyError: If the simulator is not installed.
         """
         self.close()
         config, interface = self._config, self._config.interface
@@ -323,10 +290,6 @@ class TrainingBatches:
         """Return the scores to record after an update: those of robots, or means of grammars.
 
         Thousands of drawn robots would fill the records, and a slice has others than the last.
-
-        Args:
-            scores: Mean score of each robot of the batch.
-            update: Number of updates so far, the one of the scores included.
         """
         if self.drawn is None:
             return tuple(scores)
@@ -367,12 +330,6 @@ def finetuning_config(
     """Return the config of a run that begins with the networks of another run.
 
     Agent and hyperparameters are those of the other run, besides ``CONSTANTS`` and ``NUM_ENVS``.
-
-    Args:
-        initial: Config of the other run.
-        source: The robots to train on.
-        checkpoint: Path of the other run's checkpoint; relative to the folder of the new run.
-        changes: Hyperparameters of PPO that differ, such as ``total_timesteps``.
     """
     return replace(
         initial,
@@ -411,12 +368,7 @@ class ExecutionConfig:
     """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            TaskError: If the number of workers is below 1.
-            MissingDependencyError: If ``wandb`` is set and the package is not installed.
-        """
+        """Check the values."""
         if self.wandb:
             require_wandb()
         if self.workers < 1:
@@ -472,24 +424,9 @@ def train(
     the same weights as an uninterrupted one; one that was stopped does not, since all its episodes
     begin anew at another update. Nothing is written before all robots and networks are built.
 
-    Args:
-        folder: Folder of the run.
-        config: Config of the run.
-        resume: Whether to continue a run that is already in the folder.
-        execution: How the run is executed.
-        show: Called at the start of every part; returns the callback for its updates.
-        prepare: Called with the number of robots whose goal set is ready, and their total.
-        hold: Context manager that locks the folder against other runs.
-
     Returns:
         The parts, of which the last are unfinished or not begun after ``minutes``; none in
         processes of ``torchrun`` other than the first, which alone writes files.
-
-    Raises:
-        TaskError: If the folder has another run, or a metric is not finite.
-        FormatError: If another process writes to the folder.
-        MorphgenError: If a robot or simulator cannot be built.
-        KeyboardInterrupt: If it was stopped by SIGINT.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
@@ -534,10 +471,6 @@ def require_runnable(config: RunConfig) -> None:
     """Require timesteps for at least one update, and an environment for every robot.
 
     Drawn robots may have environments one after another; see ``RunConfig.slice_updates``.
-
-    Raises:
-        TaskError: If there are fewer, or a rollout cannot be split into equal minibatches, or the
-            agent is for single robots and the robots are drawn.
     """
     robots = len(members(config.source)) or num_drawn(config.source)
     if config.source.grammars and AGENTS[config.policy.agent].per_robot:
@@ -568,14 +501,7 @@ def require_runnable(config: RunConfig) -> None:
 
 
 def checkpoint_files(path: Path) -> Iterator[Path]:
-    """Yield the checkpoint files of a run.
-
-    Args:
-        path: A checkpoint file, or the folder of a run.
-
-    Raises:
-        TaskError: If there is no checkpoint, or some robots of the run have none yet.
-    """
+    """Yield the checkpoint files of a run."""
     if path.is_file() or (path / CHECKPOINT).is_file():
         yield path if path.is_file() else path / CHECKPOINT
         return
@@ -643,14 +569,6 @@ def _learn(
     stop: _StopRequest,
 ) -> bool:
     """Make the remaining updates of a part; record their metrics and write its checkpoints.
-
-    Args:
-        learner: The learner.
-        batches: Its batches.
-        part: The part.
-        execution: How the run is executed; None in a process that writes no files.
-        show: Called after every update.
-        stop: Request to stop before the last update.
 
     Returns:
         Whether it has stopped early.

@@ -103,16 +103,7 @@ class Row(Record, frozen=True):
 def score_submission(
     submission: Submission, random: RandomScores | None = None, source: Source = "submission"
 ) -> Row:
-    """Compute the scores of a submission that was checked.
-
-    Args:
-        submission: The submission.
-        random: Scores of the random policy; by default those in the submission.
-        source: Source of the row.
-
-    Raises:
-        BenchmarkError: If ``random`` lacks a robot of the submission.
-    """
+    """Compute the scores of a submission that was checked."""
     groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
     for side in SIDES:
         for outcomes in submission.robots:
@@ -146,15 +137,7 @@ def random_scores(submission: Submission) -> RandomScores:
 
 
 def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None) -> Array:
-    """Return the score of each episode, relative to the random policy where the task wants it.
-
-    Args:
-        outcomes: The episodes of a robot.
-        random: Scores of the random policy; None for those in ``outcomes``.
-
-    Raises:
-        BenchmarkError: If ``random`` lacks the robot.
-    """
+    """Return the score of each episode, relative to the random policy where the task wants it."""
     scores = np.array(outcomes.score)
     if not TASKS[outcomes.task].relative_to_random:
         return scores

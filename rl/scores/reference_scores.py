@@ -97,18 +97,7 @@ def collect_references(
     *,
     jobs: int = 1,
 ) -> References:
-    """Read the reference scores of a new release from files, and check them.
-
-    Args:
-        paths: Submissions, files ``scores.json`` of studies, and folders of such files.
-        split: The split.
-        protocol: Rules of the evaluation, which all scores must follow.
-        library: The library of parts.
-        jobs: Number of processes.
-
-    Raises:
-        BenchmarkError: If a file is malformed, breaks a rule, or nothing there is of this split.
-    """
+    """Read the reference scores of a new release from files, and check them."""
     submissions: dict[str, Submission] = {}
     cells: list[_Cell] = []
     expected = None
@@ -157,11 +146,7 @@ def reference_files(references: References) -> dict[str, bytes]:
 
 
 def read_references(folder: Path) -> References:
-    """Read the reference scores of a release; they were checked when it was made.
-
-    Raises:
-        BenchmarkError: If a file is malformed.
-    """
+    """Read the reference scores of a release; they were checked when it was made."""
     path = folder / SCORES_FILE
     if not path.is_file():
         return References()
@@ -276,11 +261,7 @@ def _path(submission: Submission) -> str:
 
 
 def submitted_results(references: References) -> BaselineResults:
-    """Return the results of the baselines with a submission, in the order of ``BASELINES``.
-
-    Args:
-        references: Reference scores of a release.
-    """
+    """Return the results of the baselines with a submission, in the order of ``BASELINES``."""
     random = random_scores(references.random) if references.random else None
     submissions = {name: references.baseline(name) for name in BASELINES}
     return {
@@ -296,16 +277,7 @@ def submitted_results(references: References) -> BaselineResults:
 
 
 def study_results(folder: Path, split: Split) -> BaselineResults:
-    """Return the results of the baselines of a study, in the order of ``BASELINES``.
-
-    Args:
-        folder: Output folder of the study; the cells of the split are in ``folder/SPLIT/BASELINE``.
-        split: The split.
-
-    Raises:
-        BenchmarkError: If there is no cell of a baseline on this split, a cell is malformed, of
-            other robots, or of another evaluation than the others.
-    """
+    """Return the results of the baselines of a study, in the order of ``BASELINES``."""
     cells: dict[str, StoredCell] = {}
     results: dict[str, dict[tuple[Side, str], BaselineResult]] = {}
     for name, file in _cell_files(folder, split):

@@ -146,11 +146,7 @@ def rows(results: Results) -> list[Row]:
 
 
 def write_tables(folder: Path, results: Results) -> list[Path]:
-    """Write Markdown, JSON, CSV and curves; return their paths.
-
-    Raises:
-        FormatError: If one cannot be written.
-    """
+    """Write Markdown, JSON, CSV and curves; return their paths."""
     table = rows(results)
     write_file(folder / TABLE, table_text(table))
     cells = [
@@ -342,11 +338,7 @@ class ResultRow:
 
 
 def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
-    """Return the submissions in files and below folders, by the path of their file.
-
-    Raises:
-        BenchmarkError: If a file is missing or malformed, or a folder has no submission.
-    """
+    """Return the submissions in files and below folders, by the path of their file."""
     found: dict[str, Submission] = {}
     for path in paths:
         before = len(found)
@@ -373,16 +365,7 @@ def cells_without_episodes(paths: Sequence[Path], submissions: Mapping[str, Subm
 
 
 def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
-    """Return a row for every split, task, method, mode, training and amount of fine-tuning.
-
-    Args:
-        submissions: Submissions by the name of their file.
-
-    Raises:
-        BenchmarkError: If two of them are of the same run, or of one split with other robots, rules
-            or scores of the random policy; or if robots differ from those of the split that comes
-            with morphgen.
-    """
+    """Return a row for every split, task, method, mode, training and amount of fine-tuning."""
     by_split: dict[str, dict[str, Submission]] = {}
     for where, each in submissions.items():
         by_split.setdefault(each.split.name, {})[where] = each
@@ -439,11 +422,7 @@ def _key(submission: Submission) -> _Key:
 
 
 def _require_comparable(split: str, submissions: Mapping[str, Submission]) -> None:
-    """Require one set of robots and one set of rules, and robots of a split of morphgen as it is.
-
-    Raises:
-        BenchmarkError: If a submission differs.
-    """
+    """Require one set of robots and rules, and robots of a split of morphgen as it is."""
     (first, other), *rest = submissions.items()
     for where, each in rest:
         for name, own, theirs in (
@@ -531,12 +510,7 @@ def _difference(
 
 
 def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
-    """Return a table for every split and task, under its name.
-
-    Args:
-        rows: The rows.
-        style: One of tabulate's; ``github`` makes the names Markdown headings.
-    """
+    """Return a table for every split and task, under its name."""
     parts = []
     for split, task in dict.fromkeys((row.split, row.task) for row in rows):
         own = [row for row in rows if (row.split, row.task) == (split, task)]

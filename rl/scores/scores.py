@@ -53,11 +53,7 @@ class Interval:
 def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
     """Return the mean of the strata's means, with a bootstrap that resamples every stratum.
 
-    Args:
-        strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
-
-    Raises:
-        ValueError: If there is no stratum, or one has no samples.
+    strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
     """
     tables = tuple(_table(samples, 1) for samples in strata)
     mean = float(np.mean([table.mean() for table in tables]))
@@ -77,10 +73,9 @@ def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
     It has a width at 0 and 1, too. It is that of one rate for all strata: strata of different rates
     make it too wide, never too narrow.
 
-    Args:
-        rates: Success rate of each stratum, such as the episodes of a robot and seed, shape (k,);
-            or that of all, a number.
-        trials: Number of trials of each stratum, at least 1, shape (k,) or a number.
+    rates: Success rate of each stratum, such as the episodes of a robot and seed, shape (k,);
+        or that of all, a number.
+    trials: Number of trials of each stratum, at least 1, shape (k,) or a number.
     """
     rates, trials = np.broadcast_arrays(np.asarray(rates, dtype=np.float64), trials)
     mean = float(rates.mean())
@@ -98,13 +93,8 @@ def episode_interval(
     Its interval is ``success_interval`` if the score of an episode is its success, as that of push;
     else ``stratified_mean_interval``.
 
-    Args:
-        scores: Scores of the episodes of each robot, shape (k,).
-        successes: Whether each of these episodes was a success, shape (k,).
-        relative: Whether the scores are relative to the random policy, and so no successes.
-
-    Raises:
-        ValueError: If there is no robot, or one has no episodes.
+    scores: Scores of the episodes of each robot, shape (k,).
+    successes: Whether each of these episodes was a success, shape (k,).
     """
     if not relative and all(map(np.array_equal, scores, successes)):
         tables = [_table(each, 1) for each in successes]
@@ -117,13 +107,7 @@ def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
 
     Robots are the strata: every resample has as many scores of each robot as the original.
 
-    Args:
-        scores: Scores of every seed on every robot, shape (seeds, robots).
-        together: Resample whole seeds, as the scores of a seed come from one policy; otherwise
-            resample the scores of each robot independently.
-
-    Raises:
-        ValueError: If there are no scores.
+    scores: Scores of every seed on every robot, shape (seeds, robots).
     """
     table = _table(scores, 2)
     iqm = float(trim_mean(table.ravel(), TRIM))
@@ -243,21 +227,12 @@ def finite_or_none(value: Any) -> Any:  # noqa: ANN401
 
 
 def score_decimals(scores: Iterable[float]) -> int:
-    """Return the number of decimals with which scores of a task are shown, at least three digits.
-
-    Args:
-        scores: All scores of a column; those of push are from 0 to 1, those of reach up to 300.
-    """
+    """Return the number of decimals of a task's scores in tables, for at least three digits."""
     return 1 if any(abs(score) >= 10 for score in scores) else 2
 
 
 def score_from_json(data: Mapping[str, Any]) -> Score:
-    """Return the score that ``scores_to_json`` made a dictionary of.
-
-    Raises:
-        TypeError: If a field is missing or unknown.
-        ValueError: If a field is of another type, or score or success is not finite.
-    """
+    """Return the score that ``scores_to_json`` made a dictionary of."""
     values: dict[str, Any] = {
         key: math.nan if value is None else value
         for key, value in data.items()
@@ -311,12 +286,7 @@ def summary(scores_by_mode: Scores) -> str:
 
 
 def require_table(path: Path) -> None:
-    """Require that a table can be written to a path.
-
-    Raises:
-        TaskError: If its suffix is unknown.
-        FormatError: If its folder is missing or cannot be written.
-    """
+    """Require that a table can be written to a path."""
     if path.suffix not in SUFFIXES:
         raise TaskError(
             f"{path}: no name of a table ends in {path.suffix!r}{nearest(path.suffix, SUFFIXES)}"
@@ -325,12 +295,7 @@ def require_table(path: Path) -> None:
 
 
 def write_scores(path: Path, scores_by_mode: Scores) -> None:
-    """Write CSV, JSON or Markdown, by the suffix of the path.
-
-    Raises:
-        TaskError: If the suffix is another one.
-        FormatError: If it cannot be written.
-    """
+    """Write CSV, JSON or Markdown, by the suffix of the path."""
     require_table(path)
     data = {mode: scores_to_json(scores) for mode, scores in scores_by_mode.items()}
     if path.suffix == ".json":

@@ -73,15 +73,7 @@ class StoredCell:
 
 
 def stored_split(file: Path, data: object) -> str:
-    """Return the id of the split that a cell's scores are of; empty if they are of no split.
-
-    Args:
-        file: Path of the file, for messages.
-        data: Its content.
-
-    Raises:
-        BenchmarkError: If the content is malformed.
-    """
+    """Return the id of the split that a cell's scores are of; empty if they are of no split."""
     try:
         text = _source(data).split
         return text and split_id(parse_split(text, file).split)
@@ -90,15 +82,7 @@ def stored_split(file: Path, data: object) -> str:
 
 
 def stored_cell(file: Path, data: object) -> StoredCell:
-    """Return the scores of a cell and the configuration of their evaluation.
-
-    Args:
-        file: Path of the file, for messages.
-        data: Its content.
-
-    Raises:
-        BenchmarkError: If the content is malformed.
-    """
+    """Return the scores of a cell and the configuration of their evaluation."""
     try:
         table: dict[str, Any] = renamed("scores", data)
         rules = table["eval"]
@@ -132,26 +116,13 @@ def tuned_name(steps: int) -> str:
 
 
 def acting(name: str) -> tuple[str, int]:
-    """Return how a policy acts, and the transitions of its fine-tuning.
-
-    Args:
-        name: Name of a mode of a cell, such as ``stochastic``, or one of ``tuned_name``.
-    """
+    """Return how a policy acts, and the transitions of its fine-tuning."""
     match = _FINE_TUNED.fullmatch(name)
     return (MODES[0], int(match[1].replace(",", ""))) if match else (name, 0)
 
 
 def require_all_robots(scores: Sequence[Score], split: Split, file: Path) -> None:
-    """Require a score of every robot of a side with a task: means of fewer do not compare.
-
-    Args:
-        scores: Scores of one mode.
-        split: The split.
-        file: Path of their file, for messages.
-
-    Raises:
-        BenchmarkError: If a robot is missing, there twice or unknown.
-    """
+    """Require a score of every robot of a side with a task: means of fewer do not compare."""
     for side, task in {(score.side, score.task): None for score in scores}:
         found = sorted(s.robot for s in scores if (s.side, s.task) == (side, task))
         expected = sorted(each.name for each in split.side(side) if each.task == task)
@@ -230,17 +201,7 @@ def agent_cell(
     eval_config: EvalConfig,
     finetune: Sequence[int] = (),
 ) -> Cell:
-    """Return the cell of a run.
-
-    Args:
-        folder: Output folder of the study.
-        agent: Label of the agent.
-        config: Config of the run.
-        eval_config: Configuration of the evaluation.
-        finetune: Numbers of transitions to fine-tune with on the test robots. Agents of single
-            robots and runs on test robots are not fine-tuned: they have no policy of train robots
-            that one could start from.
-    """
+    """Return the cell of a run."""
     source, eval_config = config.source, replace(eval_config, workers=1)
     run_folder = folder / source.name / agent / f"seed{config.seed}"
     if AGENTS[config.policy.agent].per_robot or source.side == "test":
@@ -265,12 +226,7 @@ def matched_budget(config: RunConfig) -> RunConfig:
 
 
 def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
-    """Return the scores of a cell by mode, or by the baseline's name; None if it is not done.
-
-    Raises:
-        TaskError: If the scores are of another evaluation, or of other robots or goals.
-        FormatError: If the file is malformed.
-    """
+    """Return the scores of a cell by mode, or by the baseline's name; None if it is not done."""
     path = cell.folder / SCORES
     if not path.is_file():
         return None
@@ -306,12 +262,7 @@ def _plain(values: Sequence[object]) -> list[Any]:
 
 
 def require_cells(cells: Sequence[Cell]) -> None:
-    """Require that the folders of cells have no other runs or scores; write nothing.
-
-    Raises:
-        TaskError: If a cell's folder has another run or evaluation.
-        FormatError: If scores are malformed.
-    """
+    """Require that the folders of cells have no other runs or scores; write nothing."""
     for cell in cells:
         if cell.config is not None:
             require_open(cell.folder, cell.config, resume=True)
@@ -331,9 +282,6 @@ def do_cell(
 
     The scores and the episodes of a mode are written when it is evaluated. Policies are evaluated
     on the CPU, so that a machine without the GPU of the training gives the same scores.
-
-    Raises:
-        MorphgenError: As ``train`` and ``evaluate``.
     """
     scores = read_scores(cell) or {}
     if scores.keys() >= cell.modes.keys():
@@ -382,13 +330,7 @@ def do_cell(
 
 
 def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
-    """Return the config of a cell's fine-tuning: on a CPU, in a simulator that CPUs run.
-
-    Args:
-        cell: The cell.
-        config: Config of its run.
-        steps: Transitions of the fine-tuning.
-    """
+    """Return the config of a cell's fine-tuning: on a CPU, in a simulator that CPUs run."""
     tuned = finetuning_config(
         config,
         other_side(cell.source, "test"),
@@ -484,13 +426,6 @@ def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
     """Return a function that does cells as tasks of a Ray cluster.
 
     Its machines have morphgen installed and share the study's folder.
-
-    Args:
-        address: Address of the cluster; None for a local one.
-        gpus: GPUs per cell; a fraction if below 1.
-
-    Raises:
-        MissingDependencyError: If ray is not installed.
     """
     ray = require_ray()
 

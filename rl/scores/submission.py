@@ -150,11 +150,7 @@ class SubmissionRecorder:
         evaluation: dict[str, Any],
         training: Training | None = None,
     ) -> Submission:
-        """Return the submission of the recorded episodes; for the arguments see ``Submission``.
-
-        Raises:
-            BenchmarkError: If the method has no valid name.
-        """
+        """Return the submission of the recorded episodes; for the arguments see ``Submission``."""
         data = {
             "kind": KIND,
             "format": FORMAT,
@@ -186,24 +182,12 @@ def submission_text(submission: Submission) -> str:
 
 
 def write_submission(path: Path, submission: Submission) -> None:
-    """Write a submission.
-
-    Raises:
-        FormatError: If it cannot be written; then nothing is left behind.
-    """
+    """Write a submission."""
     write_file(path, submission_text(submission))
 
 
 def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
-    """Yield a JSON file with its content, or those of a folder in the order of their paths.
-
-    Args:
-        path: The file or folder.
-        patterns: Patterns of the files in the folder.
-
-    Raises:
-        BenchmarkError: If there is no such file or folder, or a file is no JSON.
-    """
+    """Yield a JSON file with its content, or those of a folder in the order of their paths."""
     if path.is_dir():
         files = sorted({file for pattern in patterns for file in path.glob(pattern)})
     elif path.is_file():
@@ -226,11 +210,7 @@ def is_submission(data: object) -> bool:
 
 
 def read_submission(path: Path) -> Submission:
-    """Read a submission and check its form, not what it claims.
-
-    Raises:
-        BenchmarkError: If it is missing or malformed; the message names robot and field.
-    """
+    """Read a submission and check its form, not what it claims."""
     try:
         data = read_json(path)
     except FileNotFoundError as error:
@@ -248,11 +228,7 @@ def read_submission(path: Path) -> Submission:
 
 
 def submission_from(data: object, path: Path) -> Submission:
-    """Return the submission of a JSON file's content, and check its form.
-
-    Raises:
-        BenchmarkError: If it is malformed; the message names file, robot and field.
-    """
+    """Return the submission of a JSON file's content, and check its form."""
     return read_record(data, Submission, str(path), BenchmarkError)
 
 
@@ -280,19 +256,7 @@ def check_submission(
     expected: Sequence[ExpectedRobot],
     version: str,
 ) -> None:
-    """Check all that a submission claims.
-
-    Args:
-        submission: The submission.
-        where: Its file, for messages.
-        split: The split.
-        protocol: Rules of the evaluation.
-        expected: What it must hold for every member, see ``expected_robots``.
-        version: Version of morphgen that it must come from, up to the last number.
-
-    Raises:
-        BenchmarkError: At the first fault; the message names robot and field.
-    """
+    """Check all that a submission claims."""
     _check_head(submission, where, split, protocol, version)
     wanted = {(each.side, each.member.name): each for each in expected}
     require_each_once(submission, where)
@@ -312,11 +276,7 @@ def check_submission(
 
 
 def require_each_once(submission: Submission, where: str) -> None:
-    """Require that a submission has no robot of a side twice.
-
-    Raises:
-        BenchmarkError: If it has; the message names ``where``, its file.
-    """
+    """Require that a submission has no robot of a side twice."""
     seen: set[tuple[str, str]] = set()
     for outcomes in submission.robots:
         if (outcomes.side, outcomes.robot) in seen:
@@ -330,12 +290,6 @@ def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:
 
     Episodes of a test robot are the same if there are as many. Those of a train robot may be
     others: policies of single robots are evaluated robot by robot, and so is the random policy.
-
-    Args:
-        submissions: File and content of submissions that were checked.
-
-    Raises:
-        BenchmarkError: If two disagree about a robot whose score is relative to the random policy.
     """
     first: dict[tuple[str, str], tuple[str, RobotOutcomes]] = {}
     for where, submission in submissions:
@@ -366,16 +320,7 @@ def _random_tolerance(outcomes: RobotOutcomes, other: RobotOutcomes) -> float:
 
 
 def require_rules(found: Mapping[str, Any], rules: Mapping[str, Any], where: str) -> None:
-    """Require that an evaluation followed the rules of a protocol.
-
-    Args:
-        found: Rules of the evaluation, see ``EvalProtocol.as_data``.
-        rules: Those that it must follow; it may have more episodes.
-        where: The file, for messages.
-
-    Raises:
-        BenchmarkError: If a rule differs.
-    """
+    """Require that an evaluation followed the rules of a protocol."""
     for key in ("simulator", "seed", "goal_seed"):
         if found.get(key) != rules[key]:
             raise BenchmarkError(
@@ -411,11 +356,7 @@ def _check_head(
 
 
 def require_series(found: str, expected: str, where: str) -> None:
-    """Require that two versions of morphgen have scores that compare: the first numbers are equal.
-
-    Raises:
-        BenchmarkError: If they have not.
-    """
+    """Require two versions of morphgen whose scores compare: their first numbers are equal."""
     if _series(found) != _series(expected):
         raise BenchmarkError(
             f"{where}: morphgen: {found}; scores are compared with those of version "
@@ -455,15 +396,7 @@ def _check_robot(
 
 
 def require_full_lists(outcomes: RobotOutcomes, at: str) -> None:
-    """Require an entry for every episode in the lists of a robot, and one episode or more.
-
-    Args:
-        outcomes: The episodes of the robot.
-        at: Its place, for the message.
-
-    Raises:
-        BenchmarkError: If a list is shorter or longer than the others.
-    """
+    """Require an entry for every episode in the lists of a robot, and one episode or more."""
     count, random_count = len(outcomes.score), len(outcomes.random_score)
     if not count:
         raise BenchmarkError(f"{at}: score: no episodes; expected one or more")

@@ -41,11 +41,7 @@ class EvalProtocol:
     """Seed of the goals, and constants of the tasks."""
 
     def __post_init__(self) -> None:
-        """Check the simulator and the numbers.
-
-        Raises:
-            BenchmarkError: If the simulator is unknown or has no contacts, or a number is invalid.
-        """
+        """Check the simulator and the numbers."""
         valid = [name for name in SIMULATORS.builtin if name not in ("kinematic", "warp")]
         if self.simulator not in valid:
             raise BenchmarkError(
@@ -86,15 +82,7 @@ class ExpectedRobot:
 
 
 def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:
-    """Read what ``EvalProtocol.as_data`` returned.
-
-    Args:
-        data: The rules.
-        where: The file, for messages.
-
-    Raises:
-        BenchmarkError: If a rule is missing, unknown or invalid.
-    """
+    """Read what ``EvalProtocol.as_data`` returned."""
     try:
         rules = dict(data)
         constants = rules.pop("constants")
@@ -119,18 +107,7 @@ def expected_robots(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> list[ExpectedRobot]:
-    """Return what a submission must hold for every member, train robots first.
-
-    Args:
-        split: The split.
-        protocol: Rules of the evaluation.
-        library: The library of parts.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all.
-
-    Raises:
-        MorphgenError: If a robot cannot be composed, or differs from the split's.
-    """
+    """Return what a submission must hold for every member, train robots first."""
     expect = _Expect(library.folders, protocol.goals)
     members = [(side, member) for side in SIDES for member in split.side(side)]
     return list(parallel_map(expect, members, jobs, progress))

@@ -76,16 +76,7 @@ def goals_to_audit(
     seed: int | None,
     sample: Callable[[GoalConfig], Sequence[GoalResult]] | None,
 ) -> SplitGoals | None:
-    """Return the goal sets that an audit of a split tests; None if it tests none.
-
-    Args:
-        folder: Folder where the split is built, or None; goal sets that it ships come first.
-        seed: Seed that the sets must have; by default the one that they are shipped with, else 0.
-        sample: Samples the sets of a split that ships none; None to test shipped sets only.
-
-    Raises:
-        BenchmarkError: If a shipped file is broken.
-    """
+    """Return the goal sets that an audit of a split tests; None if it tests none."""
     if folder is not None and has_goals(folder):
         goals = read_split_goals(folder)
         return goals if seed is None else replace(goals, config=replace(goals.config, seed=seed))
@@ -112,16 +103,6 @@ def audit_goals(
     (differs from the set sampled anew), ``goals-unproven`` (out of reach or in collision),
     ``goals-shared`` (by train and test, see the module). Warning: ``goals-repeated`` (within a
     set).
-
-    Args:
-        split: The split.
-        goals: Its goal sets, with the config that made them.
-        library: Library of its parts.
-        jobs: Number of processes.
-        progress: Called with the number of finished robots and their total.
-
-    Raises:
-        MorphgenError: If ``jobs`` is below 1, or a process died.
     """
     members = sided_members(split)
     examiner = _MemberExaminer(library.folders, goals)
@@ -137,12 +118,6 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
     """Return an audit with findings about goals added, those that the split accepts as accepted.
 
     A task that is unknown here is found, too: error ``task-unknown``.
-
-    Args:
-        audit: Audit of the robots.
-        split: The audited split.
-        findings: Findings about goals; None if goals were not audited, so that acceptances of
-            goal findings do not count as unused.
     """
     codes = CODES if findings is None else {finding.code for finding in findings}
     unknown = [

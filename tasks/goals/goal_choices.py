@@ -17,13 +17,7 @@ class GoalChoices:
     def __init__(self, sets: Sequence[GoalSet], fewest: int, env_spec_index: torch.Tensor) -> None:
         """Gather the tables.
 
-        Args:
-            sets: Goal set of each specification.
-            fewest: Number of goals that every layout must leave possible.
-            env_spec_index: Index in ``sets`` of each environment, shape (k,), int64.
-
-        Raises:
-            TaskError: If a set or a layout has fewer goals.
+        env_spec_index: Index in ``sets`` of each environment, shape (k,), int64.
         """
         # Row 0 of a set is for environments without obstacles; row l + 1 is for layout l.
         usable = [
@@ -47,18 +41,15 @@ class GoalChoices:
     def count(self, layout: torch.Tensor | None) -> torch.Tensor:
         """Return the number of possible goals, shape (k,), int64.
 
-        Args:
-            layout: Layout of the obstacles in each environment, shape (k,), -1 without obstacles;
-                None if no environment has any.
+        layout: Layout of the obstacles in each environment, shape (k,), -1 without obstacles;
+            None if no environment has any.
         """
         return self._count[self._row(layout)]
 
     def goals(self, layout: torch.Tensor | None, numbers: torch.Tensor) -> torch.Tensor:
         """Return goals by their numbers among the possible ones.
 
-        Args:
-            layout: As of ``count``.
-            numbers: Numbers below the count, shape (k, m), int64.
+        numbers: Numbers below the count, shape (k, m), int64.
 
         Returns:
             Indices of goals, shape (k, m), int64.

@@ -48,11 +48,7 @@ def packaged_index() -> Mapping[str, Mapping[str, Any]]:
 
 
 def packaged_set(key: str) -> bytes | None:
-    """Return the content of the packaged set with a key, as ``set_npz`` returns it, or None.
-
-    Raises:
-        TaskError: If the file is missing, or is not the one that the index lists.
-    """
+    """Return the content of the packaged set with a key, as ``set_npz`` returns it, or None."""
     record = packaged_index().get(key)
     if record is None:
         return None
@@ -85,22 +81,7 @@ def goal_set(
 
     A set depends on what ``goal_set_key`` says. A smaller set is the beginning of a larger one.
 
-    Args:
-        robot: The robot, with a tool.
-        task: The task.
-        config: Constants of the task, such as the number of goals.
-        obstacles: Whether there are obstacles.
-        seed: Seed of all random numbers, at least 0.
-        ground: Height of the ground in the root frame [m].
-        cache: Folder of stored goal sets; by default one in the user's cache.
-        shipped: Goal set that came with a split; it must be the one that would be sampled.
-        anew: Whether to sample the set even if it is packaged or cached; it is not stored then.
-
-    Raises:
-        BenchmarkError: If a number is invalid, or the robot cannot have such a set.
-        TaskError: If the robot cannot have such a set, its file is broken, or ``shipped`` is
-            another set.
-        MeshError: If a mesh cannot be read.
+    ground: Height of the ground in the root frame [m].
     """
     if seed < 0 or config.num_goals < 1:
         raise BenchmarkError(
@@ -175,11 +156,7 @@ def set_npz(goals: GoalSet) -> bytes:
 
 
 def set_from_npz(content: bytes, kind: type[G]) -> G:
-    """Read what ``set_npz`` wrote.
-
-    Raises:
-        ValueError: If it is not such a set; with the reason.
-    """
+    """Read what ``set_npz`` wrote."""
     names = [field.name for field in fields(kind)]
     arrays = read_npz(io.BytesIO(content), names)
     return kind(**{name: _value(name, array) for name, array in zip(names, arrays, strict=True)})
@@ -191,17 +168,7 @@ def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:
 
 
 def goals_from_npz(content: bytes, task: str, path: Path) -> GoalSet:
-    """Read a set that came with a split.
-
-    Args:
-        content: Content of the file.
-        task: Name of the task that the set is for.
-        path: Path of the file, for messages.
-
-    Raises:
-        BenchmarkError: If it is not such a set.
-        TaskError: If the task is unknown.
-    """
+    """Read a set that came with a split."""
     kind: type[GoalSet] = TASKS[task].goal_set_type
     try:
         goals = set_from_npz(content, kind)
@@ -219,9 +186,6 @@ def _cached(kind: type[G], path: Path, robot: str, sample: Callable[[], G]) -> G
     """Return a goal set from the cache, or sample and store it.
 
     Warns if it cannot be stored. The name of the file is the set's key.
-
-    Raises:
-        TaskError: If the file is broken, or of another set.
     """
     if path.is_file():
         try:

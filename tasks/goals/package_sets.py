@@ -50,16 +50,7 @@ def _members(name: str) -> Iterator[Member]:
 
 
 def write_sets(folder: Path = FOLDER, jobs: int = 1, progress: Progress = no_progress) -> None:
-    """Sample and certify the sets of all shipped splits, and write them with their index.
-
-    Args:
-        folder: Folder to write into; sets of other keys are deleted from it.
-        jobs: Number of processes.
-        progress: Called with the number of finished sets and their total.
-
-    Raises:
-        BenchmarkError: If a set cannot be sampled, or a goal has a fault.
-    """
+    """Sample and certify the sets of all shipped splits, and write them with their index."""
     members = list(shipped_members().values())
     sampler = _Sampler(default_library(()).folders)
     records: dict[str, dict[str, object]] = {}

@@ -130,13 +130,7 @@ def sample_robot_goals(
 ) -> GoalResult:
     """Sample a robot's goal set, or take it from the cache; a failure becomes ``error``.
 
-    Args:
-        robot: The robot with its final collision shapes.
-        task: Name of the task.
-        config: Seed and constants; by default those of the benchmark.
-        obstacles: Whether there are obstacles.
-        certified: Whether to test every goal.
-        cache: Folder of stored goal sets; by default one in the user's cache.
+    robot: The robot with its final collision shapes.
     """
     result = GoalResult(robot.name, None, task, obstacles)
     try:
@@ -165,18 +159,6 @@ def sample_split_goals(
 
     A robot without a goal set does not stop the others. An interrupted run continues from the sets
     in the cache.
-
-    Args:
-        split: The split.
-        library: Library of its parts.
-        config: Seed and constants; by default those of the benchmark.
-        jobs: Number of processes.
-        certified: Whether to test every goal.
-        cache: Folder of stored goal sets; by default one in the user's cache.
-        progress: Called with the number of finished robots and their total.
-
-    Raises:
-        MorphgenError: If ``jobs`` is below 1, or a process died.
     """
     sampler = _MemberSampler(library.folders, config or GoalConfig(), certified, cache)
     return list(parallel_map(sampler, sided_members(split), jobs, progress, chunk=1))
@@ -217,17 +199,8 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
 
     The same sets give the same bytes. Earlier sets are replaced.
 
-    Args:
-        home: Folder of the built split.
-        results: A goal set for every member.
-        config: Seed and constants that they were made with.
-
     Returns:
         The folder of the sets.
-
-    Raises:
-        BenchmarkError: If a member has no set, or the folder is not built or cannot be written.
-        FormatError: If another run writes to it.
     """
     require_goal_sets(results)
     folder = home / GOALS
@@ -255,11 +228,7 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
 
 
 def require_goal_sets(results: Sequence[GoalResult]) -> None:
-    """Require that every robot has a goal set.
-
-    Raises:
-        BenchmarkError: If not; with the reason of the first and the names of the others.
-    """
+    """Require that every robot has a goal set."""
     failed = [result for result in results if result.goals is None]
     if failed:
         first, *rest = failed
@@ -275,16 +244,7 @@ def has_goals(folder: Path) -> bool:
 
 
 def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
-    """Return the goal sets of one side of a built split, by the names of its members.
-
-    Args:
-        folder: The built split, such as ``data/extrapolation/arms/reach``.
-        side: ``train`` or ``test``; a name may be on both, at different tasks.
-
-    Raises:
-        BenchmarkError: If it was built without goals, or a file is broken; the message names it. If
-            there is no such side.
-    """
+    """Return the goal sets of one side of a built split, by the names of its members."""
     require_side(side)
     sets = read_split_goals(folder).sets
     return {
@@ -297,11 +257,7 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
 def shipped_goal_set(
     sets: Mapping[str, GoalSet] | None, robot: str, folder: str | Path | None
 ) -> GoalSet | None:
-    """Return a robot's goal set among those that a folder ships; None if ``sets`` is None.
-
-    Raises:
-        BenchmarkError: If the folder ships none: it is of another split, or of the other side.
-    """
+    """Return a robot's goal set among those that a folder ships; None if ``sets`` is None."""
     if sets is None:
         return None
     if robot not in sets:

@@ -70,23 +70,7 @@ def build_with_goals(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> BuildReport:
-    """Write a split, all its robots and, if there are any, its goal sets; see ``build_split``.
-
-    Args:
-        split: The split.
-        folder: Parent folder, such as ``data``.
-        library: The library of parts.
-        settings: Settings of the build.
-        goals: Goal sets of all members; empty to ship none.
-        config: Seed and constants that they were made with.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all.
-
-    Raises:
-        BenchmarkError: As ``build_split``; or if a member has no goal set; or if there are no goal
-            sets, but some of an earlier build.
-        MorphgenError: If a robot cannot be composed.
-    """
+    """Write a split, all its robots and, if there are any, its goal sets; see ``build_split``."""
     require_goal_sets(goals)
     built = split_folder_path(split, folder)
     if not goals and built.is_dir() and has_goals(built):
@@ -152,23 +136,7 @@ def release_split(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> ReleaseReport:
-    """Write the archive of a release into a folder.
-
-    Args:
-        split: The split; it must pass its audit.
-        out: Folder of the archive.
-        library: The library of parts.
-        request: Version, licences and contents.
-        extra: Further files by path, such as reference scores.
-        results: Results of baselines, for the columns of the difficulty.
-        jobs: Number of processes.
-        progress: Receives the number of robots that are finished, and of all, in each stage.
-
-    Raises:
-        BenchmarkError: If a part's licence is not allowed, the split fails its audit, a robot has
-            no goal set, or the release exists with another content.
-        MorphgenError: If a robot cannot be composed, or the archive cannot be written.
-    """
+    """Write the archive of a release into a folder."""
     parts = licenced_parts(split, library)
     require_allowed(split, parts, request.allowed_licences)
     release = _release(split, request, {})
@@ -219,11 +187,7 @@ def release_split(
 
 
 def require_passed(result: Audit) -> None:
-    """Require that a split has passed its audit.
-
-    Raises:
-        BenchmarkError: If not; with the first finding.
-    """
+    """Require that a split has passed its audit."""
     if not result.passed():
         first = next(each for each in result.findings if each.severity == "error")
         raise BenchmarkError(

@@ -109,35 +109,10 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     ) -> None:
         """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
-        Args:
-            task: Name of a task, such as ``reach`` or ``push``.
-            robot: A robot, or a name that ``load_robot`` accepts: ``ur5-plane``, words of
-                ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
-                fitted primitives.
-            sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
-                ``DEFAULT_SIMULATOR``.
-            obstacles: Whether there are obstacles.
-            layouts: Layouts of obstacles that episodes draw from: those of training or of
-                evaluation.
-            kind: Actions are ``continuous`` or ``discrete``.
-            observe: Optional entries of observations.
-            contacts: Pairs of things that collide; by default everything.
-            config: Constants of the task. Like ``observe`` and ``contacts`` it may be a dictionary,
-                as in the JSON of ``spec.to_json()``.
-            goal_seed: Seed of goals, starts and obstacles.
-            cache: Folder of stored goal sets; by default one in the user's cache.
-            library: Folders of your own parts.
-            max_links: Number that link indices in tokens are relative to; by default the paper's
-                23, or the links of the robot if it has more.
-            progress: Called with the number of robots whose goal set is ready, and their total.
-            render_mode: ``rgb_array`` or None.
-            size: Width and height of rendered pictures [pixels].
-            goal_env: Whether observations and rewards have the form for hindsight replay.
-
-        Raises:
-            TaskError: If an argument is invalid, or ``gym.make`` was given a ``max_episode_steps``
-                beyond the task's.
-            MorphgenError: As ``make_batch``.
+        robot: A robot, or a name that ``load_robot`` accepts: ``ur5-plane``, words of
+            ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
+            fitted primitives.
+        size: Width and height of rendered pictures [pixels].
         """
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         sim = sim or DEFAULT_SIMULATOR
@@ -206,15 +181,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     ) -> tuple[NumpyObservation, dict[str, Any]]:
         """Begin an episode: the next one, or with a seed the first; the very first is random.
 
-        Args:
-            seed: Seed of the episodes from now on.
-            options: Where this episode begins: joint positions ``q``, for reach a ``goal`` of the
-                tool (a position, or a pose with a quaternion wxyz), for push the position or pose
-                of the ``block``; all in the root frame. The rest is drawn as always.
-
-        Raises:
-            TaskError: If the seed is out of range, or an option is unknown, malformed, out of
-                limits or reach, or collides.
+        options: Where this episode begins: joint positions ``q``, for reach a ``goal`` of the
+            tool (a position, or a pose with a quaternion wxyz), for push the position or pose
+            of the ``block``; all in the root frame. The rest is drawn as always.
         """
         self._require_open()
         super().reset(seed=seed)
@@ -234,12 +203,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     def step(
         self, action: NDArray[Any]
     ) -> tuple[NumpyObservation, float, bool, bool, dict[str, Any]]:
-        """Act for one control step.
-
-        Raises:
-            TaskError: If the action is invalid, or no episode is running.
-            SimulationError: If the simulator failed.
-        """
+        """Act for one control step."""
         self._require_open()
         if not self._running:
             raise TaskError("no episode is running; call reset()")
@@ -259,16 +223,11 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     ) -> NDArray[np.float32]:
         """Return the reward of achieving a goal while another is desired, with ``goal_env=True``.
 
-        Args:
-            achieved_goal: Goals, shape (g,) or (..., g).
-            desired_goal: Goals of the same shape.
-            info: Unused: the reward depends on nothing else.
+        achieved_goal: Goals, shape (g,) or (..., g).
+        desired_goal: Goals of the same shape.
 
         Returns:
             Rewards, shape () or (...), such as those of ``step``.
-
-        Raises:
-            TaskError: If the shapes differ.
         """
         achieved, desired = (
             np.ascontiguousarray(goals, np.float32) for goals in (achieved_goal, desired_goal)
@@ -293,11 +252,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         self._spec = text_spec(spec, self.env_spec.config.max_episode_steps)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which makes stepper and renderer anew.
-
-        Raises:
-            TaskError: If the environment is closed.
-        """
+        """Return the state for a copy, which makes stepper and renderer anew."""
         self._require_open()
         return vars(self) | {"_stepper": None, "_renderer": None}
 

@@ -38,10 +38,6 @@ def numpy_stepper(
 ) -> NumpyStepper | None:
     """Return the stepper of a batch of one environment.
 
-    Args:
-        batch: The batch.
-        unpadded: Function that returns the environment's entries of a batch's observation.
-
     Returns:
         None if the batch is not on the CPU, or if its task has no formulas in NumPy: its
         ``TaskEnvs`` has no ``numpy_row``, or is of a class that changes ``evaluate`` or ``observe``
@@ -79,13 +75,7 @@ class NumpyStepper:
         row: NumpyRow,
         unpadded: Callable[[Observation], NumpyObservation],
     ) -> None:
-        """Take views of the batch's tensors; ``begin`` must follow.
-
-        Args:
-            batch: The batch, on the CPU.
-            row: The task's formulas.
-            unpadded: Function that returns the environment's entries of a batch's observation.
-        """
+        """Take views of the batch's tensors; ``begin`` must follow."""
         self._batch, self._row, self._unpadded = batch, row, unpadded
         tables = batch.robot_tables
         self._discrete = batch.action_kind == "discrete"
@@ -106,11 +96,7 @@ class NumpyStepper:
         self._requested: Callable[[], NumpyObservation] = dict
 
     def begin(self, observation: NumpyObservation) -> None:
-        """Begin an episode that the batch has begun.
-
-        Args:
-            observation: The environment's first observation in it.
-        """
+        """Begin an episode that the batch has begun."""
         requested = self._unpadded(self._batch.requested_entries()).keys()
         changing = {"tokens", *self._row.observe(self._block_pose), *requested}
         self._constant = {k: v.copy() for k, v in observation.items() if k not in changing}
@@ -125,15 +111,7 @@ class NumpyStepper:
             self._requested = lambda: self._unpadded(self._batch.requested_entries())
 
     def step(self, action: NDArray[Any]) -> EnvStep:
-        """Act for one control step.
-
-        Args:
-            action: A number for each joint that the task controls.
-
-        Raises:
-            TaskError: If the action is invalid.
-            SimulationError: If the simulator failed.
-        """
+        """Act for one control step."""
         self._previous_action[self._links] = self._normalized(action)
         change = self._previous_action[self._link_of_joint] * self._max_step
         np.minimum(np.maximum(self._targets + change, self._lower), self._upper, out=self._targets)

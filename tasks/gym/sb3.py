@@ -90,11 +90,7 @@ class SB3Vector(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:  # noqa: ANN401
-        """Set an attribute of the ``TaskVector``.
-
-        Raises:
-            TaskError: If ``indices`` leaves some environments out.
-        """
+        """Set an attribute of the ``TaskVector``."""
         self._require_all(attr_name, indices)
         setattr(self.vector, attr_name, value)
 
@@ -105,11 +101,7 @@ class SB3Vector(VecEnv):
         indices: Indices = None,
         **method_kwargs: Any,  # noqa: ANN401
     ) -> list[Any]:
-        """Call a method of the ``TaskVector`` once, for all environments.
-
-        Raises:
-            TaskError: If ``indices`` leaves some environments out.
-        """
+        """Call a method of the ``TaskVector`` once, for all environments."""
         self._require_all(method_name, indices)
         result = getattr(self.vector, method_name)(*method_args, **method_kwargs)
         return [result] * self.num_envs

@@ -65,12 +65,7 @@ def numpy_observation(observation: Observation) -> NumpyObservation:
 def observation_space(
     observation: NumpyObservation, fields: Iterable[ObservationField]
 ) -> spaces.Dict:
-    """Return the space of one environment from an observation of a batch: boxes, and masks.
-
-    Args:
-        observation: Observation of n environments.
-        fields: Observation fields of the tasks, which declare the bounds of their entries.
-    """
+    """Return the space of one environment from an observation of a batch: boxes, and masks."""
     bounds = {field.name: (field.low, field.high) for field in fields}
     entries: dict[str, spaces.Space[Any]] = {}
     for name, values in sorted(observation.items()):
@@ -91,11 +86,7 @@ def action_space(kind: str, actions: int) -> spaces.Box | spaces.MultiDiscrete:
 
 
 def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[int, int]:
-    """Return a valid size of pictures [pixels].
-
-    Raises:
-        TaskError: If the mode is unknown, or the size is none.
-    """
+    """Return a valid size of pictures [pixels]."""
     if render_mode is not None and render_mode not in RENDER_MODES:
         hint = nearest(render_mode, RENDER_MODES)
         raise TaskError(f"unknown render mode {render_mode!r}{hint}")
@@ -107,11 +98,7 @@ def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[in
 
 
 def require_limit(given: int | None, limit: int) -> None:
-    """Require a ``max_episode_steps`` of ``gym.make`` that the task's own limit leaves an effect.
-
-    Raises:
-        TaskError: If it is beyond that limit.
-    """
+    """Require a ``max_episode_steps`` of ``gym.make`` below the task's own limit."""
     if given is not None and given > limit:
         raise TaskError(
             f"max_episode_steps {given}: episodes end after {limit} control steps; for longer ones "
@@ -122,11 +109,7 @@ def require_limit(given: int | None, limit: int) -> None:
 def from_mapping(
     name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
 ) -> T | None:
-    """Return an argument that may be a dictionary, as in JSON, as the object that it describes.
-
-    Raises:
-        TaskError: If the dictionary has an unknown key.
-    """
+    """Return an argument that may be a dictionary, as in JSON, as the object that it describes."""
     if not isinstance(value, Mapping):
         return value
     try:
@@ -217,15 +200,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     ) -> None:
         """Wrap a batch; ``reset`` begins new episodes.
 
-        Args:
-            batch: The batch.
-            autoreset_mode: ``SAME_STEP`` or ``NEXT_STEP``, or their values, ``SameStep`` and
-                ``NextStep``.
-            render_mode: ``rgb_array`` or None.
-            size: Width and height of rendered pictures [pixels].
-
-        Raises:
-            TaskError: If an argument is invalid.
+        size: Width and height of rendered pictures [pixels].
         """
         self.batch, self.num_envs = batch, batch.num_envs
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
@@ -254,18 +229,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[NumpyObservation, dict[str, Any]]:
-        """Begin an episode everywhere.
-
-        Args:
-            seed: Seed of all episodes from now on, as in ``make_batch``; by default the random
-                streams continue. With a list, environment i has the episodes of ``TaskEnv`` with
-                its seed; one that is None is drawn.
-            options: Where these episodes begin, a vector for all environments or one for each; see
-                ``TaskEnv.reset``.
-
-        Raises:
-            TaskError: If a seed or an option is invalid.
-        """
+        """Begin an episode everywhere."""
         self._require_open()
         super().reset(seed=seed if isinstance(seed, int) else None)
         seeds: int | list[int] | None = None
@@ -284,12 +248,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         return observation, {}
 
     def step(self, actions: Array) -> tuple[NumpyObservation, Array, Array, Array, dict[str, Any]]:
-        """Act for one control step.
-
-        Raises:
-            TaskError: If the actions are invalid, or no episode is running.
-            SimulationError: If the simulator failed.
-        """
+        """Act for one control step."""
         self._require_open()
         if not self._running:
             raise TaskError("no episode is running; call reset()")
@@ -357,11 +316,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
             renderer.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which makes renderers anew.
-
-        Raises:
-            TaskError: If the environments are closed.
-        """
+        """Return the state for a copy, which makes renderers anew."""
         self._require_open()
         return vars(self) | {"_renderers": {}}
 
@@ -390,13 +345,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
 
 
 def final_state(before: RenderState, step: Step, env: int = 0) -> RenderState:
-    """Return the last state of an episode: a batch has begun the next when a step returns.
-
-    Args:
-        before: State before the step, with the goals and obstacles of the episode.
-        step: Result of the last step.
-        env: The environment.
-    """
+    """Return the last state of an episode: a batch has begun the next when a step returns."""
     block = None if before.block is None else step.block_pose[env].cpu().numpy()
     return replace(before, q=step.q[env, : len(before.q)].cpu().numpy(), block=block)
 
@@ -414,24 +363,7 @@ def task_vector(
     size: tuple[int, int] = SIZE,
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
-    """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``.
-
-    Args:
-        num_envs: Number of environments.
-        task: Name of the task.
-        robot: The robot of all environments, if ``robots`` is empty.
-        robots: Robots; environment i has robot i modulo their number.
-        config: Constants of the task, instead of ``configs``. Like ``observe`` and ``contacts`` it
-            may be a dictionary, as in the JSON of ``spec.to_json()``.
-        max_episode_steps: Time limit of episodes [control steps], at most the task's.
-        autoreset_mode: As of ``TaskVector``, like the next two.
-        render_mode: Whether ``render`` returns pictures.
-        size: Size of pictures.
-        **options: Arguments of ``make_batch``. Without a ``seed`` there is a random one.
-
-    Raises:
-        TaskError: If an argument is invalid.
-    """
+    """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``."""
     for name in options:
         if name not in (valid := _batch_options()):
             raise TaskError(f"vector environments: unknown option {name!r}{nearest(name, valid)}")
@@ -463,11 +395,7 @@ def _batch_options() -> set[str]:
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return a mode of ``TaskVector``.
-
-    Raises:
-        TaskError: If it is another one.
-    """
+    """Return a mode of ``TaskVector``."""
     for known in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
         if mode in (known, known.value):
             return known

@@ -59,11 +59,7 @@ class PushConfig:
     part of the score."""
 
     def __post_init__(self) -> None:
-        """Require constants that describe a push.
-
-        Raises:
-            TaskError: If a constant is out of its range.
-        """
+        """Require constants that describe a push."""
         require_task_config(self)
         low, high = self.block_size
         if self.curriculum_steps < 1:

@@ -134,10 +134,7 @@ class PushEnvs(TaskEnvs):
 def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> StepResult:
     """Compare blocks with their lines.
 
-    Args:
-        config: Weights.
-        line: y that each block must cross, shape (k,) [m].
-        state: State after the step.
+    line: y that each block must cross, shape (k,) [m].
     """
     y = state.block_pose[..., 1]
     to_go = positive_part(line - y)
@@ -161,12 +158,10 @@ def push_terms(
 ) -> dict[str, torch.Tensor]:
     """Return the reward terms of push (paper, tables of reward terms).
 
-    Args:
-        config: Weights.
-        to_go: Distance of the block from the line, 0 beyond it, shape (k,) [m].
-        approach: Distance between tool and block, shape (k,) [m].
-        limit_violation: See ``TaskState``, shape (k,).
-        success: Whether the block is across, shape (k,), bool.
+    to_go: Distance of the block from the line, 0 beyond it, shape (k,) [m].
+    approach: Distance between tool and block, shape (k,) [m].
+    limit_violation: See ``TaskState``, shape (k,).
+    success: Whether the block is across, shape (k,), bool.
     """
     return {
         "joint_limits": -config.joint_limit_weight * limit_violation,
@@ -184,13 +179,7 @@ def goal_terms(config: PushConfig, y: torch.Tensor, line: torch.Tensor) -> torch
 
 
 def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
-    """Return the position of the line in a curriculum, shape as ``line``.
-
-    Args:
-        config: The curriculum.
-        line: Final position.
-        progress: Progress of the training, 0 to 1; the line is at its end from 0.5 on.
-    """
+    """Return the position of the line in a curriculum, shape as ``line``."""
     steps = config.curriculum_steps
     reached = min(math.floor(2 * progress * steps + 1e-9), steps) / steps
     return line * (config.curriculum_start + (1 - config.curriculum_start) * reached)

@@ -73,15 +73,7 @@ def push_region(
     slides along one direction only it is divided by the square root of 2, since the tool has to
     swing around the block.
 
-    Args:
-        robot: The robot, with a tool.
-        config: Constants of the task.
-        ground: Height of the ground in the root frame [m].
-        rng: Source of the random edge length.
-
-    Raises:
-        TaskError: If the tool cannot get down to the block, or cannot move along y.
-        BenchmarkError: If the robot has no tool that moves.
+    ground: Height of the ground in the root frame [m].
     """
     shoulder, arm_reach = tool_reach(robot)  # refuses a robot whose tool does not move
     tool_positions = _tool_positions(robot)
@@ -112,11 +104,7 @@ def push_region(
 def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator) -> Array:
     """Draw poses of blocks that stand on the ground, uniform in the region and turned at random.
 
-    Args:
-        region: Region of the blocks.
-        ground: Height of the ground [m].
-        n: Number of poses; fewer are the beginning of more.
-        rng: Source of random numbers.
+    ground: Height of the ground [m].
 
     Returns:
         Shape (n, 7).
@@ -143,10 +131,8 @@ def effective_reach(reach: float, height: float, size: float) -> float:
     The block's edge is ``size`` times this effective reach e, so its centre is size e / 2 above the
     ground, and by Pythagoras e^2 + (height - size e / 2)^2 = reach^2; e is the larger root.
 
-    Args:
-        reach: Largest distance of the tool from the shoulder [m].
-        height: Height of the shoulder above the ground [m].
-        size: Edge length of the block, relative to e.
+    reach: Largest distance of the tool from the shoulder [m].
+    height: Height of the shoulder above the ground [m].
 
     Returns:
         The effective reach; 0 if the tool cannot get down to the block.
@@ -230,13 +216,7 @@ class FeasibilityTest:
     """Finds certificates of pushes, by inverse kinematics from sampled free configurations."""
 
     def __init__(self, space: FreeSpace, region: Region, rng: np.random.Generator) -> None:
-        """Sample free configurations whose tools are low and near the blocks.
-
-        Args:
-            space: The robot with its obstacles and block.
-            region: Region of the blocks.
-            rng: Source of random configurations.
-        """
+        """Sample free configurations whose tools are low and near the blocks."""
         self._space, self._region = space, region
         self._robot: Robot = space.scene.robot
         self._ground = space.scene.ground or 0.0
@@ -248,8 +228,7 @@ class FeasibilityTest:
     def __call__(self, blocks: Array) -> Feasibility:
         """Find certificates for blocks.
 
-        Args:
-            blocks: Poses of blocks that stand on the ground, shape (n, 7).
+        blocks: Poses of blocks that stand on the ground, shape (n, 7).
         """
         n, edge = len(blocks), self._region.edge
         clear = path_is_clear(self._space, self._region.line, blocks)
@@ -294,10 +273,9 @@ class FeasibilityTest:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Solve inverse kinematics for goals (m, 2) from k configurations of the bank each.
 
-        Args:
-            start: Indices of configurations, shape (m, k).
-            tool_xy: Positions of the tool on the ground plane, shape (m, 2) [m].
-            blocks: Poses of the block, shape (m, 7), or None.
+        start: Indices of configurations, shape (m, k).
+        tool_xy: Positions of the tool on the ground plane, shape (m, 2) [m].
+        blocks: Poses of the block, shape (m, 7), or None.
 
         Returns:
             Configurations, shape (m, k, dof), and which of them are free and bring the tool to its
@@ -324,10 +302,8 @@ class FeasibilityTest:
 def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bool_]:
     """Return whether the paths of blocks are clear of obstacles and base, even if they turn.
 
-    Args:
-        space: The robot with its obstacles and block.
-        line: y where the paths end [m].
-        blocks: Poses at the start, shape (n, 7).
+    line: y where the paths end [m].
+    blocks: Poses at the start, shape (n, 7).
 
     Returns:
         Shape (n,).
@@ -350,11 +326,7 @@ def sample_tools_in_box(
 ) -> tuple[Array, Array]:
     """Sample free configurations whose tools are in a box.
 
-    Args:
-        space: The robot with its obstacles, without a block.
-        low: Lowest corner of the box in the root frame, shape (3,) [m].
-        high: Highest corner of the box.
-        rng: Source of random configurations.
+    low: Lowest corner of the box in the root frame, shape (3,) [m].
 
     Returns:
         Configurations, shape (n, dof), and tool positions, shape (n, 3) [m]; at most ``_BANK``, and
@@ -376,11 +348,8 @@ def sample_tools_in_box(
 def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Array, Indices]:
     """Return tools of the first configurations, and which of these are in a box: ``_BANK`` at most.
 
-    Args:
-        robot: The robot.
-        q: Configurations, shape (n, dof).
-        low: Lowest corner of the box in the root frame, shape (3,) [m].
-        high: Highest corner of the box.
+    q: Configurations, shape (n, dof).
+    low: Lowest corner of the box in the root frame, shape (3,) [m].
 
     Returns:
         Tool positions, shape (m, 3) [m], where m <= n, and increasing indices below m.
@@ -398,10 +367,8 @@ def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Arra
 def _nearest(goals: Array, points: Array, count: int) -> Indices:
     """Return the indices of the nearest points of each goal, in order, shape (n, at most count).
 
-    Args:
-        goals: Positions, shape (n, 2).
-        points: Positions, shape (m, 2).
-        count: Number of points for each goal.
+    goals: Positions, shape (n, 2).
+    points: Positions, shape (m, 2).
     """
     count = min(count, len(points))
     x, y = (goals[:, i, None] - points[:, i] for i in range(2))
@@ -491,12 +458,6 @@ def sample_starts(
     of the block. Start configurations are uniform within the joint limits; those that collide, also
     with the block, are drawn again. Obstacles do not matter: each of their layouts leaves some of
     the starts feasible.
-
-    Raises:
-        TaskError: If the robot cannot push, or too few poses are feasible.
-        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration, or
-            obstacles block most starts.
-        MeshError: If a mesh cannot be read.
     """
     region_seeds, test_seeds, block_seeds, start_seeds, obstacle_seeds = seeds.spawn(5)
     region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
@@ -583,14 +544,8 @@ def _feasible(
 def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
     """Require a pose of the block from which the robot can push it, as ``sample_starts`` does.
 
-    Args:
-        space: The robot with its obstacles and block.
-        block: Pose of the block, shape (7,).
-        line: y that the block's centre must cross [m].
-
-    Raises:
-        TaskError: If it does not stand upright on the ground before the line, something is in its
-            way, or no configurations are found that push it.
+    block: Pose of the block, shape (7,).
+    line: y that the block's centre must cross [m].
     """
     assert space.scene.block is not None
     edge, ground = space.scene.block.size[0], space.scene.ground or 0.0
@@ -617,13 +572,11 @@ def _feasible_starts(
 ) -> NDArray[np.bool_]:
     """Return which starts the obstacles leave feasible, by their certificates, shape (n,).
 
-    Args:
-        space: The robot with its obstacles and block.
-        line: y that the block's centre must cross [m].
-        q: Configurations at the start, shape (n, dof).
-        blocks: Poses of the block at the start, shape (n, 7).
-        behind: Configurations with the tool behind the block, shape (n, dof).
-        across: Configurations with the tool on the line, shape (n, dof).
+    line: y that the block's centre must cross [m].
+    q: Configurations at the start, shape (n, dof).
+    blocks: Poses of the block at the start, shape (n, 7).
+    behind: Configurations with the tool behind the block, shape (n, dof).
+    across: Configurations with the tool on the line, shape (n, dof).
     """
     feasible = path_is_clear(space, line, blocks)
     for configurations, poses in ((q, blocks), (behind, blocks), (across, None)):
@@ -655,20 +608,11 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
 
     Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
 
-    Args:
-        pushes: The set.
-        robot: The robot.
-        scene: Ground and obstacles; the block is the set's.
-
     Returns:
         Faults, a line each: a block that does not stand on the ground, is past the line or in the
         base; a configuration out of limits or in collision; a certificate whose tool is not behind
         the block, or not on the line; a set of another robot or other obstacles; see also
         ``layout_faults``.
-
-    Raises:
-        FormatError: If MJCF cannot express the robot.
-        MeshError: If a mesh cannot be read.
     """
     n = len(pushes.blocks)
     configurations = {

@@ -58,11 +58,7 @@ class ReachConfig:
         return self.near / self.near_angle
 
     def __post_init__(self) -> None:
-        """Require constants that describe a reach.
-
-        Raises:
-            TaskError: If a constant is out of its range.
-        """
+        """Require constants that describe a reach."""
         require_task_config(self)
         if not self.near > 0:
             raise TaskError(f"near {self.near:g}: expected a positive distance [m]")

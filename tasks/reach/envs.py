@@ -32,11 +32,7 @@ class ReachEnvs(TaskEnvs):
     def __init__(
         self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
     ) -> None:
-        """Set up; arguments as of ``Task.make_envs``.
-
-        Raises:
-            TaskError: If a robot has fewer than two goals.
-        """
+        """Set up; arguments as of ``Task.make_envs``."""
         self._config: ReachConfig = specs[0].config  # type: ignore[assignment]  # its own type
         self._env_spec_index = env_spec_index
         sets = [spec.goals for spec in specs]
@@ -145,11 +141,8 @@ def evaluate_reach(
 ) -> StepResult:
     """Compare tools with their goals.
 
-    Args:
-        config: Weights, and the tolerances of success.
-        goal: Goal poses of the tools, shape (k, 7).
-        state: State after the step.
-        angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
+    goal: Goal poses of the tools, shape (k, 7).
+    angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
     """
     distance = row_norms(state.tool - goal[..., :3])
     return StepResult(
@@ -167,10 +160,8 @@ def is_near(
 ) -> torch.Tensor:
     """Return whether tools are at their goals, shape (k,), bool.
 
-    Args:
-        config: Tolerances of success.
-        distance: Distance between tool and goal, shape (k,) [m].
-        angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
+    distance: Distance between tool and goal, shape (k,) [m].
+    angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
     """
     near = distance < config.near
     return near if angle is None else near & (angle < config.near_angle)
@@ -185,12 +176,9 @@ def reach_terms(
 ) -> dict[str, torch.Tensor]:
     """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours).
 
-    Args:
-        config: Weights, and the tolerances of success.
-        distance: Distance between tool and goal, shape (k,) [m].
-        limit_violation: See ``TaskState``, shape (k,).
-        acceleration: See ``TaskState``, shape (k,).
-        angle: See ``is_near``; without it there is no term ``rotation``.
+    distance: Distance between tool and goal, shape (k,) [m].
+    limit_violation: See ``TaskState``, shape (k,).
+    acceleration: See ``TaskState``, shape (k,).
     """
     terms = {
         "joint_limits": -config.joint_limit_weight * limit_violation,

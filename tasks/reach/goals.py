@@ -85,12 +85,6 @@ def sample_goals(
     Configurations are uniform within the joint limits. Those that collide, also with the ground,
     and those outside of the main component of free C-space (``free_space``) are drawn again.
     Obstacles do not matter: each of their layouts leaves some of the configurations free.
-
-    Raises:
-        TaskError: If the tool is as good as still, so that every start is at every goal.
-        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration, or
-            obstacles block most goals.
-        MeshError: If a mesh cannot be read.
     """
     goals_seeds, obstacle_seeds = seeds.spawn(2)
     goals_rng = np.random.default_rng(goals_seeds)
@@ -137,11 +131,8 @@ def reachable_configuration(
 ) -> Array | None:
     """Return a free configuration that brings the tool to a goal, or None if none was found.
 
-    Args:
-        space: The robot in its scene.
-        goal: Position, shape (3,), or pose, shape (7,).
-        starts: Configurations from which inverse kinematics starts, shape (n, dof).
-        with_rotation: Whether the tool needs the orientation of the goal.
+    goal: Position, shape (3,), or pose, shape (7,).
+    starts: Configurations from which inverse kinematics starts, shape (n, dof).
     """
     robot = space.scene.robot
     tools = frame_pose(robot, starts, TOOL)[:, :3, 3]
@@ -165,19 +156,10 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
 
     Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
 
-    Args:
-        goals: The set.
-        robot: The robot.
-        scene: Pose of its root, ground and obstacles.
-
     Returns:
         Faults, a line each: a configuration out of limits, in collision, in another component of
         C-space, or whose tool is not at the goal; a set of another robot or other obstacles; see
         also ``layout_faults``.
-
-    Raises:
-        FormatError: If MJCF cannot express the robot.
-        MeshError: If a mesh cannot be read.
     """
     if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
         return [

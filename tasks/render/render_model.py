@@ -55,14 +55,9 @@ def render_model(
 ) -> RenderModel:
     """Compile a scene whose robot stands at the origin for rendering.
 
-    Args:
-        scene: Robot, ground, obstacles and block.
-        markers: Shapes that show a goal.
-        configurations: Joint positions at which the robot must be in view, shape (n, dof).
-        points: Further points that must be in view, shape (m, 3) [m].
-
-    Raises:
-        MeshError: If a mesh cannot be read.
+    markers: Shapes that show a goal.
+    configurations: Joint positions at which the robot must be in view, shape (n, dof).
+    points: Further points that must be in view, shape (m, 3) [m].
     """
     robot = scene.robot
     points = np.concatenate(

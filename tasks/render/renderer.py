@@ -84,16 +84,10 @@ class Renderer:
     ) -> None:
         """Compile the scene and place the camera.
 
-        Args:
-            scene: Scene of a robot that stands at the origin.
-            markers: Shapes that show a goal.
-            configurations: Joint positions at which the robot must be in view, shape (n, dof).
-            points: Further points that must be in view, shape (m, 3) [m].
-            size: Width and height of frames [pixels].
-
-        Raises:
-            MeshError: If a mesh cannot be read.
-            MissingDependencyError: If offscreen OpenGL is missing.
+        markers: Shapes that show a goal.
+        configurations: Joint positions at which the robot must be in view, shape (n, dof).
+        points: Further points that must be in view, shape (m, 3) [m].
+        size: Width and height of frames [pixels].
         """
         self.size, self._robot = size, scene.robot
         self._model = render_model(scene, markers, configurations, points)
@@ -133,16 +127,11 @@ class Renderer:
     def frame(self, state: RenderState, turn: float = 0.0) -> Frame:
         """Render a state.
 
-        Args:
-            state: The state.
-            turn: Angle by which the camera and the light have gone around the middle of the points
-                in view [degrees]: the scene is on a turntable in front of a fixed camera.
+        turn: Angle by which the camera and the light have gone around the middle of the points
+            in view [degrees]: the scene is on a turntable in front of a fixed camera.
 
         Returns:
             Shape (height, width, 3).
-
-        Raises:
-            ValueError: If the renderer is closed, or ``q`` has another shape.
         """
         if self._closed:
             raise ValueError("this renderer is closed")
@@ -211,11 +200,7 @@ def _copied(values: torch.Tensor) -> NDArray[np.float32]:
 
 
 def require_video_path(path: Path) -> None:
-    """Require that a video can be written to a path, before anything is rendered.
-
-    Raises:
-        FormatError: If the suffix is not one of ``SUFFIXES``, or as ``require_writable_file``.
-    """
+    """Require that a video can be written to a path, before anything is rendered."""
     if path.suffix not in SUFFIXES:
         raise FormatError(f"{path}: the name of a video ends in {' or '.join(SUFFIXES)}")
     require_writable_file(path)
@@ -226,14 +211,7 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
 
     The file appears when it is complete. The same frames give the same bytes.
 
-    Args:
-        frames: At least one frame, shape (height, width, 3) each; even sizes for ``.mp4``.
-        path: Path of the video.
-        fps: Frames per second.
-
-    Raises:
-        FormatError: If it cannot be written, or ffmpeg is missing, fails or is killed; then no file
-            is left.
+    frames: At least one frame, shape (height, width, 3) each; even sizes for ``.mp4``.
     """
     require_video_path(path)
     written = 0
@@ -278,11 +256,7 @@ def _append(
 
 
 def _require_complete(video: Path, frames: int) -> None:
-    """Require that a video has all frames: imageio does not report ffmpeg's exit code.
-
-    Raises:
-        VideoError: If frames are missing, as on a full disk.
-    """
+    """Require that a video has all frames: imageio does not report ffmpeg's exit code."""
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
     except RuntimeError as error:

@@ -20,11 +20,7 @@ from morphgen.tasks.sim.base import COLLISION_GEOMETRIES, CollisionGeometry, Sce
 
 
 def require_geometry(geometry: str) -> None:
-    """Require the name of a collision geometry.
-
-    Raises:
-        TaskError: If it is unknown.
-    """
+    """Require the name of a collision geometry."""
     if geometry not in COLLISION_GEOMETRIES:
         raise TaskError(
             f"unknown collision geometry {geometry!r}{nearest(geometry, COLLISION_GEOMETRIES)}"
@@ -39,18 +35,6 @@ def with_geometry(
 
     Masses and joints stay. Pairs of links that overlap with the new shapes wherever the
     joints are, or at the home pose, do not collide.
-
-    Args:
-        scenes: The scenes; a robot that several share is converted once.
-        geometry: The geometry.
-        folders: Folders of parts, for their stored fits.
-
-    Raises:
-        FitError: If a mesh has no convex pieces.
-        FormatError: If a stored fit is malformed.
-        MeshError: If a mesh cannot be read.
-        MissingDependencyError: If convex pieces are wanted and the extra ``convex`` is missing.
-        TaskError: If they are wanted for a robot whose meshes are not known any more.
     """
     if geometry == "primitive":
         return list(scenes)

@@ -40,11 +40,7 @@ class GoalConfig:
     """Constants of tasks, at most one config of a type; other tasks have their defaults."""
 
     def __post_init__(self) -> None:
-        """Check the types.
-
-        Raises:
-            TaskError: If the seed is no whole number, 0 or more, or a config is none of a task.
-        """
+        """Check the types."""
         if not isinstance(self.tasks, Sequence):
             raise TaskError(f"configs {self.tasks!r}: expected a list")
         object.__setattr__(self, "tasks", tuple(self.tasks))
@@ -55,20 +51,12 @@ class GoalConfig:
                 raise TaskError(f"config {what} is unknown{nearest(str(task), TASKS)}")
 
     def task_config(self, task: str) -> TaskConfig:
-        """Return the constants of a task.
-
-        Raises:
-            TaskError: If the task is unknown.
-        """
+        """Return the constants of a task."""
         default: TaskConfig = TASKS[task].config_type()
         return next((config for config in self.tasks if config.task == task), default)
 
     def as_data(self, used: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
-        """Return the constants by task as JSON data, which ``task_configs`` reads.
-
-        Args:
-            used: Tasks to include besides morphgen's own and those of ``tasks``.
-        """
+        """Return the constants by task as JSON data, which ``task_configs`` reads."""
         data = {}
         for name in dict.fromkeys((*TASKS.builtin, *(c.task for c in self.tasks), *used)):
             config = self.task_config(name)
@@ -90,12 +78,7 @@ def _file_keys(config: TaskConfig | type[TaskConfig]) -> dict[str, str]:
 
 
 def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...]:
-    """Read the JSON data of ``GoalConfig.as_data``.
-
-    Raises:
-        TaskError: If a task is unknown or a constant invalid.
-        TypeError: If a constant is unknown.
-    """
+    """Read the JSON data of ``GoalConfig.as_data``."""
     configs = []
     for name, constants in data.items():
         values = config_fields(name, constants)
@@ -119,16 +102,7 @@ def load_robot(
     A robot has the same goals and scores whether it is named by words, by its bundle, by the
     bundle's URDF, or passed as ``morphgen.compose`` or ``morphgen.read`` returns it.
 
-    Args:
-        source: The robot, or its name: a file, a bundle, words of ``morphgen compose`` or parts
-            joined by dashes; see ``morphgen.grammar.robot_source``.
-        geometry: Collision shapes: fitted boxes, cylinders and spheres, or the original ones.
-        library: Folders of your own parts.
-
-    Raises:
-        CompositionError: If the name is unknown, or the parts do not fit together.
-        FormatError: If the file is broken.
-        MorphgenError: If the words name something unknown.
+    geometry: Collision shapes: fitted boxes, cylinders and spheres, or the original ones.
     """
     parts = default_library(library)
     robot = resolve_robot(source, parts)
@@ -136,11 +110,7 @@ def load_robot(
 
 
 def member_with_primitives(member: Member, library: Library) -> Robot:
-    """Return the robot of a split's member with fitted primitives as its collision shapes.
-
-    Raises:
-        MorphgenError: If it cannot be composed, differs from the split's, or has an unfitted link.
-    """
+    """Return the robot of a split's member with fitted primitives as its collision shapes."""
     return as_primitives(compose_member(member, library), library.folders)
 
 
@@ -169,21 +139,7 @@ def env_spec(
     shipped: GoalSet | None = None,
     anew: bool = False,
 ) -> EnvSpec:
-    """Return the specification of a robot at a task, whose goal set is sampled if not stored.
-
-    Args:
-        robot: The robot, with a tool.
-        task: Name of the task.
-        config: Seed and constants of the goal set; by default those of the benchmark.
-        obstacles: Whether there are obstacles.
-        cache: Folder of stored goal sets; by default one in the user's cache.
-        shipped: Goal set that came with a split.
-        anew: Whether to sample the goal set even if it is packaged or cached.
-
-    Raises:
-        TaskError: If the task is unknown, or ``shipped`` is of another robot, task or config.
-        MorphgenError: As ``goal_set``.
-    """
+    """Return the specification of a robot at a task, whose goal set is sampled if not stored."""
     config = config or GoalConfig()
     obstacles = truth("obstacles", obstacles, TaskError)
     kind, constants, ground = TASKS[task], config.task_config(task), ground_under(robot)

@@ -35,14 +35,7 @@ class EpisodeLayouts:
     ) -> None:
         """Begin with the first layout of every environment.
 
-        Args:
-            specs: Specifications of environments.
-            env_robot_index: Index of each environment's specification, shape (n,), int64.
-            side: Layouts to draw from.
-            observe: Whether obstacles are observed, and the minimum number of their rows.
-
-        Raises:
-            TaskError: If the side is unknown.
+        env_robot_index: Index of each environment's specification, shape (n,), int64.
         """
         device = env_robot_index.device
         self._specs = [specs[i] for i in env_robot_index.tolist()]
@@ -71,9 +64,7 @@ class EpisodeLayouts:
     def draw(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
         """Draw the layouts of new episodes.
 
-        Args:
-            mask: Environments whose episodes begin, shape (n,), bool.
-            random: Random numbers of the episodes.
+        mask: Environments whose episodes begin, shape (n,), bool.
         """
         if self.any:
             layout = self._first + random.integers(Stream.LAYOUT, self._count)

@@ -176,31 +176,9 @@ def batch_from_specs(
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
 
-    Args:
-        specs: Specifications; environment i has specification i modulo their number.
-        num_envs: Number of environments, n.
-        sim: Name of a simulator: ``pybullet``, ``mujoco``, ``warp`` (on a GPU), ``kinematic``
-            (no contacts) or another of ``SIMULATORS``; by default ``DEFAULT_SIMULATOR``.
-        seed: Seed of the episodes.
-        kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
-        workers: Number of processes of PyBullet, or of threads of MuJoCo.
-        contacts: Pairs of things that collide; by default everything.
-        observe: Optional entries of observations.
-        max_links: Number of links, L, that observations and actions are padded to; by default the
-            paper's 23, or the links of the largest robot if it has more.
-        first: Number of the first environment, where a batch is made in parts.
-        layouts: Layouts of obstacles that episodes draw from: those of training or of evaluation.
-        device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
-        geometry: Collision shapes of the simulated robots: all (``primitive``), one for each link
-            (``light``), or convex pieces of the meshes (``convex``). Observations and goals do not
-            depend on it.
-        library: Folders of your own parts.
-
-    Raises:
-        TaskError: If an argument is invalid.
-        BenchmarkError: If a robot has more links than ``max_links``.
-        SimulationError: If the simulator cannot hold a scene.
-        MissingDependencyError: If the simulator is not installed.
+    geometry: Collision shapes of the simulated robots: all (``primitive``), one for each link
+        (``light``), or convex pieces of the meshes (``convex``). Observations and goals do not
+        depend on it.
     """
     if observe is not None and not isinstance(observe, ObservationConfig):
         raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
@@ -250,12 +228,7 @@ def batch_from_specs(
 def _require_contacts(
     simulator: Simulator, specs: Sequence[EnvSpec], geometry: CollisionGeometry
 ) -> None:
-    """Require a simulator with contacts if a scene has something to touch.
-
-    Raises:
-        TaskError: If a scene has a block or obstacles, or a geometry was chosen, that the simulator
-            would ignore.
-    """
+    """Require a simulator with contacts if a scene has something to touch."""
     if simulator.simulates_contacts:
         return
     if geometry != "primitive":

@@ -54,15 +54,6 @@ def draw_boxes(
 
     Edges are uniform in ``size`` times the reach, the largest distance of the tool from the robot's
     shoulder (``workspace``), which depends neither on a pedestal nor on the position of a rail.
-
-    Args:
-        robot: The robot, with a tool.
-        count: Number of boxes.
-        size: Range of their edge lengths, relative to the reach.
-        rng: Source of random numbers.
-
-    Raises:
-        BenchmarkError: If count or size is invalid, or the robot has no workspace.
     """
     low, high = size
     if count < 1 or not 0 < low <= high < math.inf:
@@ -85,21 +76,10 @@ def draw_layouts(
     less than ``KEPT`` of the free configurations. A layout is accepted if it leaves ``KEPT_GOALS``
     of the goals. Boxes may overlap. Fewer layouts of a kind are the beginning of more.
 
-    Args:
-        space: The robot with its obstacles, at any poses, and its ground; it is left with the
-            first layout.
-        counts: Numbers of layouts for training and for evaluation.
-        seeds: Source of all random numbers.
-        usable: Which goals the obstacles leave possible.
-
     Returns:
         Poses in the world, in single precision, as simulators have them: x, y, z, qw, qx, qy, qz of
         L layouts of O boxes, those for training first, shape (L, O, 7); and which goals they leave
         possible, shape (L, G).
-
-    Raises:
-        BenchmarkError: If a layout cannot be drawn, or the robot has hardly a free configuration.
-        MeshError: If a collision mesh cannot be read.
     """
     probe_seeds, *side_seeds = seeds.spawn(3)
     plain = FreeSpace(replace(space.scene, obstacles=(), block=None))
@@ -188,11 +168,7 @@ def place_boxes(boxes: Sequence[Block], layout: NDArray[np.floating]) -> tuple[B
 
 
 def layouts_of(config: TaskConfig, side: LayoutSide) -> range:
-    """Return the indices of the layouts of a goal set that episodes draw from.
-
-    Raises:
-        TaskError: If the side is unknown.
-    """
+    """Return the indices of the layouts of a goal set that episodes draw from."""
     ranges = {
         "train": range(config.train_layouts),
         "eval": range(config.train_layouts, config.train_layouts + config.eval_layouts),
@@ -206,13 +182,6 @@ def layout_faults(
     goals: GoalSet, robot: Robot, scene: Scene, usable: Usable, *, block: Block | None = None
 ) -> list[str]:
     """Return the faults of a set's layouts, a line each.
-
-    Args:
-        goals: The set.
-        robot: The robot.
-        scene: Ground and obstacles of its scene.
-        usable: Which goals the obstacles leave possible.
-        block: Block of the scene.
 
     Returns:
         Obstacles that are not those of the scene; arrays of a wrong shape; a box that touches the

@@ -80,11 +80,7 @@ class RobotTables:
         return self.home.shape[1]
 
     def action_mask(self, *, fingers: bool) -> torch.Tensor:
-        """Return the links whose joint an action moves, shape (R, L), bool.
-
-        Args:
-            fingers: Whether joints beyond the tool count, as in push.
-        """
+        """Return the links whose joint an action moves, shape (R, L), bool."""
         joint = self.joint_of_link.clamp(min=0)
         mask = self.joint_of_link >= 0
         return mask if fingers else mask & torch.gather(self.moves_tool, 1, joint)
@@ -96,10 +92,9 @@ class RobotTables:
 
         Joints stay within their limits. Only joints that move the tool turn.
 
-        Args:
-            robots: Index of the robot of each column, shape (n,), int64.
-            q: Configurations, shape (..., n, J) [rad or m].
-            near: Configurations that they should be near to, shape (n, J) [rad or m].
+        robots: Index of the robot of each column, shape (n,), int64.
+        q: Configurations, shape (..., n, J) [rad or m].
+        near: Configurations that they should be near to, shape (n, J) [rad or m].
         """
         nearer = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
         turns = ~self.is_prismatic[robots] & self.moves_tool[robots]
@@ -114,18 +109,7 @@ def build_robot_tables(
     max_links: int = MAX_LINKS,
     device: torch.device | str = "cpu",
 ) -> RobotTables:
-    """Build the tables of robots.
-
-    Args:
-        robots: Robots with a tool frame and at least one movable joint.
-        folders: Folders of parts, where stored fits are looked up.
-        max_links: Number of links with padding, L; no robot may have more.
-        device: Device of the tensors.
-
-    Raises:
-        BenchmarkError: If there are no robots, or one has too many links.
-        RobotError: If a robot has no tool frame or no movable joint.
-    """
+    """Build the tables of robots."""
     if not robots:
         raise BenchmarkError("there are no robots")
     for robot in robots:

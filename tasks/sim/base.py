@@ -172,19 +172,7 @@ def require_reset_shapes(
     block_pose: torch.Tensor,
     obstacle_poses: torch.Tensor | None,
 ) -> None:
-    """Require that arguments of ``Simulation.reset`` have the right shapes.
-
-    Args:
-        scenes: Scene of each environment.
-        num_joints: Number of independent joints with padding, J.
-        mask: As of ``reset``, like the others.
-        q: Joint positions.
-        block_pose: Poses of blocks.
-        obstacle_poses: Poses of obstacles, or None.
-
-    Raises:
-        ValueError: If a shape is wrong, or the mask is not of type bool.
-    """
+    """Require that arguments of ``Simulation.reset`` have the right shapes."""
     n = len(scenes)
     if tuple(mask.shape) != (n,) or str(mask.dtype) != "torch.bool":
         raise ValueError(

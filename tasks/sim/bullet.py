@@ -52,19 +52,7 @@ class BulletSimulation:
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, processes: int = 1
     ) -> None:
-        """Load every scene; its robot is at zero until the first reset.
-
-        Args:
-            scenes: Scene of each environment.
-            contacts: Pairs of things that collide; by default everything.
-            processes: Number of processes, this one included; at most one per scene is used.
-
-        Raises:
-            SimulationError: If PyBullet cannot hold a scene, or a worker dies.
-            FormatError: If a robot cannot be written for it.
-            MeshError: If a collision mesh cannot be read.
-            ValueError: If there are no processes or no scenes.
-        """
+        """Load every scene; its robot is at zero until the first reset."""
         if processes < 1 or not scenes:
             raise ValueError(
                 f"{processes} processes for {len(scenes)} scenes; both must be at least 1"
@@ -116,12 +104,7 @@ class BulletSimulation:
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``.
-
-        Raises:
-            ValueError: If a shape is wrong, or a position is not finite.
-            SimulationError: If the simulation is closed, or a worker died.
-        """
+        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
         self._require_open()
         joints = self._is_joint.shape[1]
         require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
@@ -146,13 +129,7 @@ class BulletSimulation:
         self._run(messages, lambda batch: batch.reset(*local_state))
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``.
-
-        Raises:
-            ValueError: If the shape is wrong, or a target is not finite.
-            SimulationError: If the simulation is closed, an environment diverged before and was not
-                reset, or a worker died, which closes the simulation.
-        """
+        """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
         messages = [(worker, STEP) for worker in self._workers]
@@ -239,12 +216,7 @@ class BulletSimulation:
 
 
 def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:
-    """Write the URDF of every robot in the scenes once; return what each scene loads.
-
-    Raises:
-        FormatError: If a robot cannot be written.
-        MeshError: If a collision mesh cannot be read.
-    """
+    """Write the URDF of every robot in the scenes once; return what each scene loads."""
     written: dict[int, ExportedRobot] = {}
     for scene in scenes:
         key = id(scene.robot)

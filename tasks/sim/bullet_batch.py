@@ -90,17 +90,7 @@ class BulletScene:
     """
 
     def __init__(self, scene: Scene, urdf: Path, merged: Robot, contacts: Contacts) -> None:
-        """Load the robot and its surroundings.
-
-        Args:
-            scene: The scene.
-            urdf: URDF of ``merged``, as ``export_robots`` writes it.
-            merged: The scene's robot after ``merge_rigid_links``.
-            contacts: Pairs of things that collide.
-
-        Raises:
-            SimulationError: If PyBullet has no client left, or cannot load the robot.
-        """
+        """Load the robot and its surroundings."""
         self._scene, self._contacts = scene, contacts
         self.id: int = pybullet.connect(pybullet.DIRECT)
         if self.id < 0:
@@ -242,10 +232,7 @@ class BulletScene:
     ) -> None:
         """Put robot and block at rest, and clear the contact history.
 
-        Args:
-            positions: Positions of all movable joints [rad or m].
-            block_pose: Pose of the block, (x, y, z, qw, qx, qy, qz); ignored without a block.
-            obstacle_poses: Poses of the obstacles; None leaves them where they are.
+        positions: Positions of all movable joints [rad or m].
         """
         for joint, position in zip(self.driven, positions, strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
@@ -370,15 +357,7 @@ class BulletBatch:
     """Scenes that step one after the other and write their states into buffers."""
 
     def __init__(self, share: Share, buffers: StateBuffers) -> None:
-        """Load every scene, its robot at zero.
-
-        Args:
-            share: Environments to load.
-            buffers: Buffers with rows for all environments; padding is not written.
-
-        Raises:
-            SimulationError: If PyBullet cannot hold a scene.
-        """
+        """Load every scene, its robot at zero."""
         scenes = share.scenes
         self._share, self._scenes = share, scenes
         self._buffers, self._envs = buffers, list(share.envs)
@@ -451,11 +430,7 @@ class BulletBatch:
         block_pose: Float32,
         obstacle_poses: Float32 | None,
     ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``.
-
-        Raises:
-            SimulationError: If an environment that had diverged cannot be loaded again.
-        """
+        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
         buffers = self._buffers
         for row, (env, positions, pose) in enumerate(
             zip(envs.tolist(), q, block_pose, strict=True)
@@ -483,14 +458,10 @@ class BulletBatch:
     def step(self, targets: Float32) -> dict[int, str]:
         """Advance the environments by one control step; see ``Simulation.step``.
 
-        Args:
-            targets: Targets of all environments, shape (n, J), contiguous and finite.
+        targets: Targets of all environments, shape (n, J), contiguous and finite.
 
         Returns:
             The reason for each environment that diverged: not finite, or beyond ``MAX_VELOCITY``.
-
-        Raises:
-            SimulationError: If an environment diverged before and was not reset.
         """
         if self._diverged:
             reason = next(iter(self._diverged.values()))

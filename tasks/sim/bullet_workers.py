@@ -66,16 +66,7 @@ class SharedBuffers:
 
 
 def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
-    """Start a worker, which loads its share and then answers.
-
-    Args:
-        number: Name of the worker.
-        share: Environments of the worker.
-        shared: Memory of all processes.
-
-    Raises:
-        SimulationError: If the worker died already.
-    """
+    """Start a worker, which loads its share and then answers."""
     parent_end, worker_end = _CONTEXT.Pipe()
     process = _CONTEXT.Process(
         target=_serve, args=(worker_end, shared), name=str(number), daemon=True
@@ -93,11 +84,7 @@ def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
 
 
 def send(worker: Worker, message: bytes) -> None:
-    """Send a message to a worker.
-
-    Raises:
-        SimulationError: If the worker is dead.
-    """
+    """Send a message to a worker."""
     try:
         worker.pipe.send_bytes(message)
     except OSError as error:
@@ -109,9 +96,6 @@ def gather(workers: Sequence[Worker]) -> tuple[dict[int, str], list[Exception]]:
 
     Returns:
         The reason for each environment that diverged; and the exceptions raised in the workers.
-
-    Raises:
-        SimulationError: If a worker died.
     """
     reasons: dict[int, str] = {}
     failures: list[Exception] = []

@@ -61,17 +61,7 @@ class KinematicSimulation:
         *,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Put every robot at home.
-
-        Args:
-            scenes: Scene of each environment.
-            contacts: ``NO_CONTACTS``, which is also the default.
-            device: Device of all tensors.
-
-        Raises:
-            SimulationError: If a scene has a block or obstacles, or contacts are requested.
-            ValueError: If there are no scenes.
-        """
+        """Put every robot at home."""
         if not scenes:
             raise ValueError("there are no scenes; expected one or more")
         if contacts not in (None, NO_CONTACTS):
@@ -108,13 +98,7 @@ class KinematicSimulation:
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
-        """Put some environments at rest; see ``Simulation.reset``. There are no obstacles.
-
-        Raises:
-            ValueError: If a shape is wrong or, on the CPU, a position is not finite; then nothing
-                has changed.
-            SimulationError: If the simulation is closed.
-        """
+        """Put some environments at rest; see ``Simulation.reset``. There are no obstacles."""
         self._require_open()
         require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, None)
         rows = mask[:, None]
@@ -129,11 +113,6 @@ class KinematicSimulation:
 
         On the CPU no environment diverges. On a GPU those do whose targets or positions are not
         finite.
-
-        Raises:
-            ValueError: If the shape is wrong or, on the CPU, a target is not finite; then nothing
-                has moved.
-            SimulationError: If the simulation is closed.
         """
         self._require_open()
         if targets.shape != self.q.shape:
@@ -200,11 +179,7 @@ def _first_not_finite(rows: torch.Tensor) -> int | None:
 def _load(
     scenes: Sequence[Scene], contacts: Contacts | None, workers: int, device: torch.device
 ) -> KinematicSimulation:
-    """Load scenes; see ``Simulator.load``.
-
-    Raises:
-        SimulationError: If a scene has contacts.
-    """
+    """Load scenes; see ``Simulator.load``."""
     return KinematicSimulation(scenes, contacts, device=device)
 
 

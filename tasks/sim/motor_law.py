@@ -135,9 +135,7 @@ class MotorForces:
     def __init__(self, robots: Sequence[Robot], efforts: Sequence[float]) -> None:
         """Compute the inertia of each robot.
 
-        Args:
-            robots: Robots, whose movable joints are the rows of all arrays, m in number.
-            efforts: Largest force of each row [N m or N].
+        efforts: Largest force of each row [N m or N].
         """
         self._efforts = np.array(efforts, dtype=np.float64)
         max_dof = max((robot.dof for robot in robots), default=0)
@@ -166,10 +164,9 @@ class MotorForces:
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
         """Return the largest forces in a control step, shape (m,) [N m or N].
 
-        Args:
-            errors: Distances from the targets at the beginning of the step, and at its end without
-                contacts, shape (m,) each [rad or m].
-            velocities: Velocities at the same times, shape (m,) each.
+        errors: Distances from the targets at the beginning of the step, and at its end without
+            contacts, shape (m,) each [rad or m].
+        velocities: Velocities at the same times, shape (m,) each.
         """
         springs = [BANDWIDTH**2 * clamp(e, self._farthest) for e in errors]
         dampers = [2 * BANDWIDTH * v for v in velocities]

@@ -112,15 +112,6 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     ``untested_pairs`` alone determines which links collide: MuJoCo's exception for neighbours is
     off. MuJoCo never tests static geoms against each other: the root link and links fixed to it do
     not collide with the ground, obstacles or a block without mass.
-
-    Args:
-        scenes: Scene of each environment; a robot that several share is compiled once.
-        contacts: Pairs of things that collide.
-
-    Raises:
-        SimulationError: If MuJoCo refuses a scene.
-        FormatError: If MJCF cannot express a robot.
-        MeshError: If a mesh cannot be read.
     """
     specs: dict[int, tuple[Robot, mujoco.MjSpec]] = {}
     models: dict[object, World] = {}

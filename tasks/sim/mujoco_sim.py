@@ -52,11 +52,7 @@ class GatheredArrays:
     """
 
     def __init__(self, arrays: Sequence[Array]) -> None:
-        """Allocate the memory; ``read`` copies.
-
-        Args:
-            arrays: One-dimensional arrays to copy at every ``read``.
-        """
+        """Allocate the memory; ``read`` copies."""
         self._arrays = [*arrays, np.zeros(1)]
         ends = np.cumsum([len(array) for array in self._arrays])
         self.begin = np.concatenate([[0], ends[:-1]])
@@ -72,12 +68,7 @@ class MujocoState:
     """Tensors of joints and blocks, gathered from the data of all environments at once."""
 
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
-        """Prepare; ``read`` fills the tensors.
-
-        Args:
-            worlds: Model of each environment, n of them.
-            data: Data of each environment.
-        """
+        """Prepare; ``read`` fills the tensors."""
         n, joints = len(worlds), max(world.robot.dof for world in worlds)
         blocks = [i for i, world in enumerate(worlds) if world.block is not None]
         poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
@@ -190,13 +181,7 @@ class PositionControl:
     """
 
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData], joints: int) -> None:
-        """Prepare.
-
-        Args:
-            worlds: Model of each environment, n of them.
-            data: Data of each environment.
-            joints: Number of independent joints with padding, J.
-        """
+        """Prepare."""
         self._shape = (len(worlds), joints)
         bias = [env_data.qfrc_bias for env_data in data]
         weight = [env_data.qfrc_gravcomp for env_data in data]
@@ -232,12 +217,10 @@ class PositionControl:
     def controls(self, targets: Array, q: Array, qd: Array, velocities: Array, out: Array) -> None:
         """Compute the controls of all actuators from the data as the last step left them.
 
-        Args:
-            targets: Targets of the independent joints, shape (n, J); padding is zero.
-            q: Positions of the independent joints, shape (n, J).
-            qd: Velocities of the independent joints, shape (n, J).
-            velocities: ``qvel`` of all environments, concatenated, and a zero.
-            out: Receives the controls, shape (n, J).
+        targets: Targets of the independent joints, shape (n, J); padding is zero.
+        q: Positions of the independent joints, shape (n, J).
+        qd: Velocities of the independent joints, shape (n, J).
+        out: Receives the controls, shape (n, J).
         """
         error = clamp(targets - q, self._farthest)
         mean_acceleration = BY_ERROR * error + BY_VELOCITY * qd
@@ -286,19 +269,7 @@ class MujocoSimulation:
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, threads: int = 1
     ) -> None:
-        """Compile; every robot is at home, every block at its pose in the scene.
-
-        Args:
-            scenes: Scene of each environment; a robot that several share is compiled once.
-            contacts: Pairs of things that collide; by default everything.
-            threads: Number of threads that step, the caller's included.
-
-        Raises:
-            SimulationError: If MuJoCo refuses a scene.
-            FormatError: If MJCF cannot express a robot.
-            MeshError: If a mesh cannot be read.
-            ValueError: If there are no scenes or no threads.
-        """
+        """Compile; every robot is at home, every block at its pose in the scene."""
         if not scenes or threads < 1:
             raise ValueError(f"{len(scenes)} scenes, {threads} threads; there must be one of each")
         self.scenes = tuple(scenes)
@@ -363,13 +334,7 @@ class MujocoSimulation:
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``.
-
-        Raises:
-            ValueError: If a shape is wrong or a position is not finite; the environments before
-                that one have been reset.
-            SimulationError: If the simulation is closed.
-        """
+        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
         self._require_open()
         joints = self._targets.shape[1]
         require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
@@ -385,10 +350,6 @@ class MujocoSimulation:
         """Advance all environments by one control step; see ``Simulation.step``.
 
         Environments also diverge if their contacts do not fit into MuJoCo's memory.
-
-        Raises:
-            ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            SimulationError: If the simulation is closed.
         """
         self._require_open()
         rows = self._view(targets)
@@ -481,12 +442,7 @@ class MujocoSimulation:
 
 
 def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
-    """Step environments until none is left; several threads may share both arguments.
-
-    Args:
-        work: Environments to step.
-        refused: Receives the environments that MuJoCo could not step, with its reasons.
-    """
+    """Step environments until none is left; several threads may share both arguments."""
     for env, model, data, actuators, controls, torques, applied in work:
         actuators[:] = controls
         torques[:] = applied

@@ -139,10 +139,6 @@ def ground_contact_links(robot: Robot, T_world_root: Pose) -> frozenset[str]:
     along the arm are then tenths of a radian off, for any number of iterations. MuJoCo (4.0) takes
     an upright cylinder whose axis is a few last bits longer than 1 to be a radius deep in the
     plane.
-
-    Args:
-        robot: The robot.
-        T_world_root: Pose of its root; the world's z points up.
     """
     T_world_link = T_world_root.matrix @ forward_kinematics(robot, np.array(robot.home))
     level = {robot.root.name}

@@ -112,15 +112,7 @@ def controls(
 
     Threads: (worlds, J). See ``PositionControl``.
 
-    Args:
-        joints: Joints of the group.
-        targets: Targets of the independent joints, (n, J).
-        qpos: Positions.
-        qvel: Velocities.
-        force: Joint-space inertia times the accelerations of ``accelerations``.
-        bias: Coriolis and gravity forces.
-        weight: Forces of gravity compensation.
-        control: Receives the controls.
+    targets: Targets of the independent joints, (n, J).
     """
     world, joint = wp.tid()
     missing = float(0.0)
@@ -164,17 +156,10 @@ def read_state(
 
     Threads: (worlds,).
 
-    Args:
-        joints: Joints of the group.
-        things: Block and obstacles.
-        qpos: Positions.
-        qvel: Velocities.
-        mocap_pos: Positions of mocap bodies.
-        mocap_quat: Orientations of mocap bodies.
-        out_q: Receives positions of the independent joints, (n, J).
-        out_qd: Receives their velocities, (n, J).
-        out_pose: Receives poses of the blocks, (n, 7).
-        out_velocity: Receives velocities of the blocks in the world frame, (n, 6).
+    out_q: Receives positions of the independent joints, (n, J).
+    out_qd: Receives their velocities, (n, J).
+    out_pose: Receives poses of the blocks, (n, 7).
+    out_velocity: Receives velocities of the blocks in the world frame, (n, 6).
     """
     world = wp.tid()
     env = joints.env[world]
@@ -223,18 +208,9 @@ def find_diverged(
     Threads: (worlds,). A world diverged if a target, a position or a velocity is not finite, if a
     velocity is beyond ``MAX_SPEED``, or if its contacts do not fit into the memory.
 
-    Args:
-        joints: Joints of the group.
-        ignored_overflow: Bits of ``overflow`` that lose no contact.
-        group: Number of the group.
-        targets: Targets of the independent joints, (n, J).
-        qpos: Positions.
-        qvel: Velocities.
-        overflow: Overflow bits of each world since its reset.
-        out_overflow: Receives the overflow bits, (n,).
-        out_diverged: Receives whether the world diverged, (n,).
-        counts: Numbers of control steps in which a world diverged, and in which contacts did not
-            fit, are added to row ``group``.
+    targets: Targets of the independent joints, (n, J).
+    out_overflow: Receives the overflow bits, (n,).
+    out_diverged: Receives whether the world diverged, (n,).
     """
     world = wp.tid()
     env = joints.env[world]
@@ -292,19 +268,10 @@ def reset_worlds(
     Threads: (worlds,). Besides state and warm start, a step of MuJoCo Warp reads only what it
     computed itself.
 
-    Args:
-        joints: Joints of the group.
-        things: Block and obstacles.
-        mask: Whether to reset each environment, (n,).
-        q: Positions of the independent joints, (n, J).
-        block_pose: Poses of the blocks, (n, 7).
-        obstacle_poses: Poses of the obstacles, (n, O, 7); O is 0 to leave them where they are.
-        qpos: Receives positions.
-        qvel: Receives zeros.
-        warmstart: Receives zeros.
-        mocap_pos: Receives positions of obstacles and of a block that does not move.
-        mocap_quat: Receives their orientations.
-        overflow: Receives zeros.
+    mask: Whether to reset each environment, (n,).
+    q: Positions of the independent joints, (n, J).
+    block_pose: Poses of the blocks, (n, 7).
+    obstacle_poses: Poses of the obstacles, (n, O, 7); O is 0 to leave them where they are.
     """
     world = wp.tid()
     env = joints.env[world]

@@ -71,13 +71,6 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
     Two models have one structure if all fields that MuJoCo Warp holds once for all worlds are
     equal: the tree, the types of joints, geoms and actuators, the pairs of geoms that are tested,
     and meshes. Masses, poses, sizes, limits and gains may differ.
-
-    Args:
-        scenes: Scene of each environment.
-        compiled: Compiled scene of each environment; those that share one are the same object.
-
-    Raises:
-        SimulationError: If MuJoCo Warp does not support a model.
     """
     models: dict[int, Model] = {}
     groups: list[_Group] = []
@@ -108,12 +101,7 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
 
 
 def put_model(structure: Structure, device: str) -> Model:
-    """Return the model of a structure on a device, with a row of numbers for each of its worlds.
-
-    Args:
-        structure: The structure.
-        device: Name of the device of Warp.
-    """
+    """Return the model of a structure on a device, with a row of numbers for each of its worlds."""
     rows = len(structure.worlds)
     with wp.ScopedDevice(device):
         model = mujoco_warp.put_model(
@@ -132,11 +120,7 @@ def _prepared(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _warp_model(world: World, scene: Scene) -> Model:
-    """Return a scene's model on the CPU.
-
-    Raises:
-        SimulationError: If MuJoCo Warp does not support it.
-    """
+    """Return a scene's model on the CPU."""
     try:
         with wp.ScopedDevice("cpu"):
             return mujoco_warp.put_model(_prepared(world.model))
@@ -238,14 +222,7 @@ class Group:
     def __init__(
         self, structure: Structure, number: int, device: str, buffers: dict[str, wp.array]
     ) -> None:
-        """Put the structure's worlds on the device; ``WarpSimulation`` resets them.
-
-        Args:
-            structure: The environments and their models.
-            number: Number of the group.
-            device: Name of the device of Warp.
-            buffers: Arrays of all environments, see ``WarpSimulation``.
-        """
+        """Put the structure's worlds on the device; ``WarpSimulation`` resets them."""
         self._buffers, self._number = buffers, number
         first = structure.worlds[0]
         model = first.model
@@ -384,8 +361,7 @@ def max_contacts(num_shapes: int) -> int:
 
     Trained arms that push had up to 1.3 contacts for each shape in MuJoCo.
 
-    Args:
-        num_shapes: Number of shapes of the robot, its block, obstacles and ground together.
+    num_shapes: Number of shapes of the robot, its block, obstacles and ground together.
     """
     return max(48, 2 * num_shapes)
 
@@ -476,19 +452,7 @@ class WarpSimulation:
         *,
         device: torch.device | str = "cuda",
     ) -> None:
-        """Compile; every robot is at home, every block and obstacle at its pose in the scene.
-
-        Args:
-            scenes: Scene of each environment; a robot that several share is compiled once.
-            contacts: Pairs of things that collide; by default everything.
-            device: Device of all tensors.
-
-        Raises:
-            SimulationError: If MuJoCo or MuJoCo Warp refuses a scene.
-            FormatError: If MJCF cannot express a robot.
-            MeshError: If a mesh cannot be read.
-            ValueError: If there are no scenes.
-        """
+        """Compile; every robot is at home, every block and obstacle at its pose in the scene."""
         if not scenes:
             raise ValueError("there are no scenes; expected one or more")
         wp.config.log_level = wp.LOG_WARNING
@@ -537,12 +501,7 @@ class WarpSimulation:
         block_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
-        """Put some environments at rest; see ``Simulation.reset``.
-
-        Raises:
-            ValueError: If a shape is wrong.
-            SimulationError: If the simulation is closed.
-        """
+        """Put some environments at rest; see ``Simulation.reset``."""
         self._require_open()
         require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, obstacle_poses)
         self._mask.copy_(mask)
@@ -557,12 +516,7 @@ class WarpSimulation:
                 group.read()
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``.
-
-        Raises:
-            ValueError: If the shape is wrong.
-            SimulationError: If the simulation is closed.
-        """
+        """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
         if targets.shape != self._targets.shape:
             raise ValueError(
@@ -640,11 +594,7 @@ class _Streams:
 
 
 def kernels_stored(arch: int) -> bool:
-    """Return whether an earlier start compiled kernels for GPUs of an architecture.
-
-    Args:
-        arch: Compute capability, such as 90 for 9.0.
-    """
+    """Return whether an earlier start compiled kernels for GPUs of an architecture."""
     return any(Path(wp.config.kernel_cache_dir).rglob(f"*.sm{arch}.cubin"))
 
 

@@ -99,9 +99,6 @@ def parse_address(query: str) -> Address | None:
 
     Returns:
         The address; None if the query is empty, which stands for the viewer's start page.
-
-    Raises:
-        AddressError: If the query names no page, or two different ones.
     """
     if len(query) > MAX_QUERY:
         raise AddressError(f"the address has {len(query)} characters; at most {MAX_QUERY} are read")
@@ -130,11 +127,7 @@ def _encode(pairs: Iterable[tuple[str, str]]) -> str:
 
 
 def require_few_chosen(chosen: Sequence[str]) -> None:
-    """Require that the tray's robots fit into every page's address.
-
-    Raises:
-        AddressError: If they do not.
-    """
+    """Require that the tray's robots fit into every page's address."""
     n = len(_encode((CHOSEN, uri) for uri in chosen))
     if n > MAX_CHOSEN:
         raise AddressError(
@@ -150,11 +143,7 @@ def parse_count(text: str, default: int) -> int:
 
 
 def pack_text(text: str) -> str:
-    """Compress a text into characters that an address keeps unescaped (base64url).
-
-    Raises:
-        AddressError: If the packed text is too long for an address.
-    """
+    """Compress a text into characters that an address keeps unescaped (base64url)."""
     content = base64.urlsafe_b64encode(zlib.compress(text.encode(), 9)).decode().rstrip("=")
     if len(content) > MAX_PACKED:
         raise AddressError(
@@ -165,11 +154,7 @@ def pack_text(text: str) -> str:
 
 
 def unpack_text(content: str) -> str:
-    """Return the text that ``pack_text`` has packed.
-
-    Raises:
-        AddressError: If the content is invalid or too long.
-    """
+    """Return the text that ``pack_text`` has packed."""
     if len(content) > MAX_PACKED:
         raise AddressError(
             f"the address has a text of {len(content)} characters; at most {MAX_PACKED} are read"

@@ -77,18 +77,7 @@ def serve(
     library: Sequence[Path] = (),
     origins: Sequence[str] = (),
 ) -> Viewer:
-    """Start a viewer.
-
-    Args:
-        words: Target of the start page, see ``start_address``.
-        host: Address to bind.
-        port: Port; if it is taken, the next free one.
-        library: Folders with further parts.
-        origins: Other sites whose pages may use the viewer.
-
-    Raises:
-        MorphgenError: If the target does not exist, or the address does not belong to this machine.
-    """
+    """Start a viewer."""
     targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
     folders = [path.parent if path.is_file() else path for path in targets]
     roots = tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
@@ -143,12 +132,9 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
 
     The token is secret, so that only the script of a page can change what its browser shows.
 
-    Args:
-        viewer: The viewer.
-        token: Secret of the browser.
-        query: An action with its value; ``open`` replaces the page by that of an address, others
-            are actions of the tray. Then the number of the page, whether pages are dark, and the
-            width of the window [pixels].
+    query: An action with its value; ``open`` replaces the page by that of an address, others
+        are actions of the tray. Then the number of the page, whether pages are dark, and the
+        width of the window [pixels].
     """
     browser = viewer.browsers.get(token)
     session = None if browser is None else viewer.sessions.get(browser)
@@ -175,12 +161,7 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
 
 
 def open_first_page(session: Session, token: str) -> None:
-    """Build the page that a browser's URL names.
-
-    Args:
-        session: The session of a browser that has just connected.
-        token: Secret of the browser, which its script sends with every request.
-    """
+    """Build the page that a browser's URL names."""
 
     def find_address() -> None:
         location = read_location(session.client)
@@ -193,12 +174,7 @@ def open_first_page(session: Session, token: str) -> None:
 
 
 def open_page(session: Session, find_address: Callable[[], object]) -> None:
-    """Build a page, or one that says why it cannot be shown.
-
-    Args:
-        session: The session.
-        find_address: Sets the session's address.
-    """
+    """Build a page, or one that says why it cannot be shown."""
     client, redact = session.client, session.files.redact
     try:
         clear_page(client)

@@ -36,11 +36,7 @@ _SET_PAGES = ("gallery", "population")
 
 
 def frame_page(response: Response) -> None:
-    """Put the frame into a response with viser's page.
-
-    Raises:
-        RuntimeError: If the installed viser has another page.
-    """
+    """Put the frame into a response with viser's page."""
     is_packed = response.headers.get("Content-Encoding") == "gzip"
     response.body = _framed(bytes(response.body), is_packed=is_packed)
     del response.headers["Content-Length"]
@@ -72,10 +68,6 @@ def page_links(address: Address, chosen: Sequence[str]) -> list[tuple[str, Addre
 
     A link keeps what the current page is about: from a set's gallery, *Population* leads to the
     population of the same set. *Compare* and *Playback* take the chosen robots.
-
-    Args:
-        address: Address of the current page.
-        chosen: URIs of the chosen robots.
     """
     uri = address.subject if address.page in ("robot", "compare") else ""
     robots = tuple(chosen) or ((uri,) if uri else ())

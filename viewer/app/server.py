@@ -60,15 +60,7 @@ class AccessPolicy:
 
 
 def access_policy(host: str, origins: Sequence[str] = ()) -> AccessPolicy:
-    """Return the access policy of a viewer.
-
-    Args:
-        host: Address that the viewer binds.
-        origins: Other sites that may use it, from ``--allow-origin``.
-
-    Raises:
-        MorphgenError: If an origin is malformed.
-    """
+    """Return the access policy of a viewer."""
     address = host.strip("[]")
     names = {*LOCAL_NAMES, address.lower()}
     # Binding "", 0.0.0.0 or :: listens on all addresses.
@@ -85,11 +77,6 @@ def refusal_reason(policy: AccessPolicy, path: str, headers: Headers) -> str:
 
     A request without ``Origin`` does not come from a page of another site, because browsers send
     ``Origin`` with every websocket. So programs on this machine may connect without one.
-
-    Args:
-        policy: The viewer's names and allowed sites.
-        path: Path and query of the request.
-        headers: Headers of the request.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
@@ -118,10 +105,6 @@ def content_security_policy(policy: AccessPolicy, host: str) -> str:
 
     Second defence: without it, viser's page would connect to any server that its address names, and
     run what that server sends.
-
-    Args:
-        policy: The viewer's names and allowed sites.
-        host: ``Host`` of a request that was not refused.
     """
     sites = " ".join(sorted(policy.origins))
     sockets = " ".join(f"ws{origin[4:]}" for origin in sorted(policy.origins))
@@ -263,12 +246,7 @@ class MessageFilter:
     """Handlers that validate one browser's messages and pass valid ones on to viser."""
 
     def __init__(self, client: viser.ClientHandle, report: Callable[[str], object]) -> None:
-        """Replace viser's handlers of values for controls and of uploads.
-
-        Args:
-            client: The browser; its page has no controls yet.
-            report: Called with the reason when a value or upload is rejected.
-        """
+        """Replace viser's handlers of values for controls and of uploads."""
         self._client, self._report = client, report
         self._upload: _Upload | None = None
         self._viser = replace_handlers(
@@ -453,17 +431,7 @@ class _Connection(ServerConnection):
 def start_server(
     host: str, port: int, policy: AccessPolicy, receive: Receive = lambda token, query: False
 ) -> viser.ViserServer:
-    """Start viser's server; every request has to pass the access policy.
-
-    Args:
-        host: Address to bind.
-        port: Port; if it is taken, the next free one.
-        policy: The access policy.
-        receive: Receives the requests of the pages' scripts.
-
-    Raises:
-        RuntimeError: If the installed viser does not start a websockets server.
-    """
+    """Start viser's server; every request has to pass the access policy."""
     with _starting, _guarded(policy, receive), contextlib.redirect_stdout(io.StringIO()):
         # Silent, because viser's banner would name the port before ``morphgen view`` does.
         server = viser.ViserServer(host=host, port=port, verbose=False)

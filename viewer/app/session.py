@@ -54,11 +54,6 @@ def read_location(client: viser.ClientHandle) -> Location:
 
     viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
     local storage, under a key that no other tab uses, and viser reads it from there.
-
-    Raises:
-        AddressError: If the browser sends something else.
-        RuntimeError: If the browser has disconnected, or has no local storage.
-        TimeoutError: If it does not answer.
     """
     key = f"morphgen-{uuid.uuid4().hex}"
     client.local_storage.set_item(key, "")
@@ -143,11 +138,7 @@ class Session:
 
     @property
     def client(self) -> viser.ClientHandle:
-        """The browser, for work on the page.
-
-        Raises:
-            SessionClosed: If the browser shows another page now.
-        """
+        """The browser, for work on the page."""
         if self.closed.is_set():
             raise SessionClosed("the browser has left this page")
         return self.browser
@@ -169,14 +160,7 @@ class Session:
         )
 
     def enqueue(self, work: Work, key: str = "", *, even_closed: bool = False) -> None:
-        """Run work on the session's event thread, after everything that was enqueued before.
-
-        Args:
-            work: Called without arguments; the page shows a ``MorphgenError`` that it raises.
-            key: If work of the same key is still queued, this call is dropped: the queued work will
-                see the newest state.
-            even_closed: Whether to run it although the browser has left the page meanwhile.
-        """
+        """Run work on the session's event thread, after everything that was enqueued before."""
         self._submit(self.events, work, key, even_closed=even_closed)
 
     def run_in_background(self, work: Work, key: str = "") -> None:
@@ -184,20 +168,11 @@ class Session:
         self._submit(self.background, work, key)
 
     def run_in_worker(self, work: Callable[..., T], *arguments: object) -> T:
-        """Run a function in a worker process and return its result.
-
-        Raises:
-            MorphgenError: If the function raises it, or the process died.
-        """
+        """Run a function in a worker process and return its result."""
         return self.workers.result(self.workers.submit(work, *arguments))
 
     def cached(self, key: str, make: Callable[[], T]) -> T:
-        """Return the result of slow work, which is done once for all browsers.
-
-        Args:
-            key: Name of the result.
-            make: Computes it; it may show its progress in the status line.
-        """
+        """Return the result of slow work, which is done once for all browsers."""
 
         def made() -> T:
             result = make()
@@ -330,11 +305,7 @@ class Session:
         self.run_script(call("visit", address.query, instead))
 
     def choose(self, uris: Sequence[str]) -> None:
-        """Put robots into the tray in place of the previous ones.
-
-        Raises:
-            AddressError: If they do not fit into the address.
-        """
+        """Put robots into the tray in place of the previous ones."""
         chosen = tuple(dict.fromkeys(uris))
         try:
             require_few_chosen(chosen)

@@ -22,16 +22,7 @@ from morphgen.viewer.robot_uri import (
 
 
 def start_address(words: Sequence[str], files: FileAccess) -> Address:
-    """Return the page that ``morphgen view`` opens.
-
-    Args:
-        words: Nothing for the library; a folder, a file, or the name of a split or grammar; or
-            words of ``morphgen compose``.
-        files: Files that may be read.
-
-    Raises:
-        MorphgenError: If the target does not exist.
-    """
+    """Return the page that ``morphgen view`` opens."""
     if not words:
         return Address("library")
     if len(words) > 1 or "=" in words[0]:

@@ -78,16 +78,8 @@ class UploadError(MorphgenError):
 def store_upload(name: str, content: bytes, files: FileAccess) -> str:
     """Check and store an upload.
 
-    Args:
-        name: Name of the file.
-        content: Content of the file.
-        files: Has the folder of uploads.
-
     Returns:
         The URI of the robot.
-
-    Raises:
-        UploadError: If the file is too large, not a URDF, an MJCF or a zip of one, or unsafe.
     """
     if len(content) > MAX_UPLOAD:
         raise UploadError(
@@ -150,11 +142,7 @@ def _unzip(name: str, content: bytes) -> dict[str, bytes]:
 
 
 def _parse_descriptions(unpacked: dict[str, bytes]) -> _Documents:
-    """Parse every file that may be a description, once.
-
-    Raises:
-        UploadError: If they are too large together.
-    """
+    """Parse every file that may be a description, once."""
     documents: _Documents = {}
     size = 0
     for path, data in unpacked.items():
@@ -179,11 +167,7 @@ def _format(document: etree._Element | FormatError) -> str | None:
 
 
 def _root(documents: _Documents, path: str) -> etree._Element:
-    """Return the root of a description.
-
-    Raises:
-        UploadError: If it is malformed.
-    """
+    """Return the root of a description."""
     document = documents[path]
     if isinstance(document, FormatError):
         raise UploadError(f"{document}; nothing was kept") from document
@@ -306,14 +290,7 @@ def _write_upload(
     mjcf: str | None,
     files: FileAccess,
 ) -> str:
-    """Write an upload into a new folder, or nothing; return the folder's name.
-
-    Args:
-        stored: Contents of its files by their paths.
-        urdfs: Roots of its URDFs by their paths.
-        mjcf: Path of the description to show, if that is an MJCF.
-        files: Has the folder of uploads.
-    """
+    """Write an upload into a new folder, or nothing; return the folder's name."""
     if sum(1 for _ in files.uploads.iterdir()) >= MAX_UPLOADS:
         raise UploadError(f"{MAX_UPLOADS} uploads are kept already; start the viewer again")
     folder = files.uploads / secrets.token_hex(16)  # cannot be guessed by other users of the viewer

@@ -53,9 +53,6 @@ def robot_page(robot: Robot, dark: bool = False) -> bytes:
 
     Its joints move through their ranges one after the other, again and again. The page has a slider
     for the time, and stops with the space bar.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     robot = split_colours(robot)
     low, high = robot_bounds(robot)
@@ -82,11 +79,6 @@ def robot_page(robot: Robot, dark: bool = False) -> bytes:
 
 def joint_sweep(robot: Robot, column: int, n: int) -> Array:
     """Return configurations in which a joint moves from home to both limits and back.
-
-    Args:
-        robot: The robot.
-        column: Index of the independent joint.
-        n: Number of configurations; the last one is home.
 
     Returns:
         Shape (n, dof) [rad or m].
@@ -127,11 +119,7 @@ def joint_titles(robot: Robot) -> list[str]:
 
 
 def web_page(recording: StateSerializer, title: str, *, dark: bool) -> bytes:
-    """Return a recorded scene as a web page.
-
-    Raises:
-        RuntimeError: If the installed viser has another page.
-    """
+    """Return a recorded scene as a web page."""
     html, count = _TITLE.subn(f"<title>{escape(title)}</title>", recording.as_html(dark), count=1)
     if count != 1:
         raise RuntimeError("this version of viser has another page; see viewer/app/web_page.py")

@@ -44,13 +44,7 @@ class Workers:
                 return self._pool.submit(call_in_worker, work, *arguments)
 
     def result(self, future: Future[T]) -> T:
-        """Wait for the result of a call.
-
-        Raises:
-            WorkerDied: If a process of the pool died before the call was done.
-            CancelledError: If the pool was closed before the call was done.
-            MorphgenError: If the call raises it.
-        """
+        """Wait for the result of a call."""
         try:
             return future.result()
         except BrokenProcessPool as error:
@@ -81,12 +75,7 @@ class SharedResults:
         self._lock = threading.Lock()
 
     def get(self, key: str, make: Callable[[], T]) -> T:
-        """Return the result of a key.
-
-        Args:
-            key: Names the work and its input.
-            make: Computes the result if it is not kept. Two threads may both compute it.
-        """
+        """Return the result of a key."""
         with self._lock:
             if key in self._results:
                 self._results.move_to_end(key)

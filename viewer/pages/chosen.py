@@ -17,11 +17,7 @@ EMPTY = "No robot is chosen: tick the box of cards in a gallery, or select robot
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        MorphgenError: If no robot is chosen.
-    """
+    """Build the page."""
     if not session.chosen:
         raise MorphgenError(EMPTY)
     rows = uri_rows(session.chosen, session.files)

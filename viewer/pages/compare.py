@@ -54,12 +54,7 @@ class ComparePage:
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        UriError: If the address names more than ``MAX_COMPARED`` robots.
-        MorphgenError: If a robot cannot be read.
-    """
+    """Build the page."""
     uris = tuple(filter(None, session.address.subjects))
     if len(uris) > MAX_COMPARED:
         raise UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_COMPARED}")

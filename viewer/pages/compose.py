@@ -76,12 +76,7 @@ class ComposePage:
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        MorphgenError: If the address names invalid words, an unknown grammar or robot, or a robot
-            without derivation.
-    """
+    """Build the page."""
     files, subject = session.files, session.address.subject.strip() or DEFAULT_WORDS
     derivation = subject_derivation(subject, files)
     words = DEFAULT_WORDS if derivation else subject
@@ -127,11 +122,7 @@ def show(session: Session) -> None:
 
 
 def drawn_in_set(subject: str, files: FileAccess) -> tuple[str, Choices] | None:
-    """Return the grammar and the choices that gave a robot of a set; None for other robots.
-
-    Raises:
-        FormatError: If the files of the set are invalid.
-    """
+    """Return the grammar and the choices that gave a robot of a set; None for other robots."""
     folder = parent_folder(subject)
     if not folder or not (path := files.path(folder)).joinpath(INDEX).is_file():
         return None
@@ -147,11 +138,7 @@ def drawn_in_set(subject: str, files: FileAccess) -> tuple[str, Choices] | None:
 
 
 def subject_derivation(subject: str, files: FileAccess) -> Derivation | None:
-    """Return the derivation of the robot that an address names by its URI; None for words.
-
-    Raises:
-        MorphgenError: If the robot cannot be read, or has no derivation.
-    """
+    """Return the derivation of the robot that an address names by its URI; None for words."""
     if subject.startswith((DERIVATION, MEMBER)):
         return resolve_derivation(subject, files)
     first = subject.split()[0]
@@ -177,15 +164,7 @@ def _exists(subject: str, files: FileAccess) -> bool:
 def show_robot(
     page: ComposePage, robot: Robot, derivation: Derivation, command: str, uri: str
 ) -> None:
-    """Show a robot in place of the previous one, and check it in the background.
-
-    Args:
-        page: The page.
-        robot: The robot.
-        derivation: Derivation of the robot.
-        command: Command that makes the same robot.
-        uri: URI of the robot, for the link to its own page.
-    """
+    """Show a robot in place of the previous one, and check it in the background."""
     change = compose_view.show(page.view, robot)
     page.robot = robot
     page.summary.content = summary(
@@ -230,11 +209,7 @@ def _add_downloads_tab(page: ComposePage) -> None:
 
 
 def _shown_robot(page: ComposePage) -> Robot:
-    """Return the robot that the page shows.
-
-    Raises:
-        CompositionError: If there is none.
-    """
+    """Return the robot that the page shows."""
     if page.robot is None:
         raise CompositionError("no robot is shown: choose parts that fit, or draw one")
     return page.robot

@@ -55,18 +55,7 @@ ROBOTS = "robots"
 
 
 def write_robot(session: Session, robot: Robot, name: str, set_name: str = "") -> None:
-    """Write a robot's bundle with findings and picture below ``robots/``.
-
-    Args:
-        session: The page.
-        robot: The robot.
-        name: Name of the bundle's folder.
-        set_name: Folder of robots that gets the bundle; empty for ``robots/`` itself.
-
-    Raises:
-        CompositionError: If that folder is a set of ``morphgen sample``.
-        FormatError: If a name is not a plain folder name, or the bundle cannot be written.
-    """
+    """Write a robot's bundle with findings and picture below ``robots/``."""
     parent = session.files.roots[0] / ROBOTS
     if set_name:
         parent = bundle_folder(parent, set_name)
@@ -84,11 +73,7 @@ def write_robot(session: Session, robot: Robot, name: str, set_name: str = "") -
 
 
 def send_robot(session: Session, robot: Robot, name: str) -> None:
-    """Send a zip of a robot's bundle to the browser.
-
-    Raises:
-        FormatError: If the name is not a plain folder name.
-    """
+    """Send a zip of a robot's bundle to the browser."""
     name = bundle_folder(Path(), name).name  # validates the name
     session.set_status("packing the bundle")
     files = session.run_in_worker(new_bundle_files, robot)
@@ -224,13 +209,7 @@ def history_html(history: History) -> str:
 def offspring_html(
     parent: Individual, generation: Sequence[Individual], picked: Collection[int]
 ) -> str:
-    """Return cards of the offspring with what differs from the parent; empty without offspring.
-
-    Args:
-        parent: The parent.
-        generation: The offspring.
-        picked: Indices of those that are to be crossed.
-    """
+    """Return cards of the offspring with what differs from the parent; empty without offspring."""
     cards = []
     for i, individual in enumerate(generation):
         lines = change_lines(parent.derivation, individual.derivation)
@@ -353,12 +332,7 @@ def show_parent(tab: EvolveTab) -> None:
 
 
 def leave_parent(tab: EvolveTab, source: str) -> None:
-    """Forget the parent and remove its offspring: another robot is shown now.
-
-    Args:
-        tab: The tab.
-        source: Words or URI of the robot.
-    """
+    """Forget the parent and remove its offspring: another robot is shown now."""
     tab.parent, tab.source = None, source
     _clear_generation(tab)
     show_parent(tab)
@@ -501,11 +475,7 @@ def _click(tab: EvolveTab, event: viser.SceneClickEvent, *, adopt: bool) -> None
 
 
 def _require_parent(tab: EvolveTab) -> Individual:
-    """Return the robot that evolves.
-
-    Raises:
-        CompositionError: If there is none.
-    """
+    """Return the robot that evolves."""
     if tab.parent is None:
         raise CompositionError(
             "the robot has no grammar: press 'Evolve this robot', or draw one on the tab Grammar"

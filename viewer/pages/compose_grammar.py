@@ -78,14 +78,7 @@ def grammar_around(derivation: Derivation, library: Library) -> str:
 def _sequence(
     writer: _Writer, node: Derivation, prefix: str, *, is_root: bool = False
 ) -> list[str]:
-    """Return the items that stand for a part and everything attached to it.
-
-    Args:
-        writer: Gets the productions of the symbols.
-        node: The part.
-        prefix: Beginning of its label that the grammar adds for its port.
-        is_root: Whether it is attached to no other part.
-    """
+    """Return the items that stand for a part and everything attached to it."""
     manifest = writer.library.manifest(node.part)
     alternatives = _alternatives(node, manifest, writer.library, is_root=is_root)
     items = [writer.add(node.label.removeprefix(prefix), "\n  | ".join(alternatives))]
@@ -202,18 +195,7 @@ class History:
 def make_individual(
     grammar: Grammar, library: Library, choices: Choices, name: str = ""
 ) -> Individual:
-    """Return the robot that choices give; choices that are missing are typical ones.
-
-    Args:
-        grammar: The grammar.
-        library: Library of the grammar's parts.
-        choices: The choices.
-        name: Name of the robot; by default that of ``individual_name``.
-
-    Raises:
-        GrammarError: If the grammar cannot be derived.
-        MorphgenError: If the robot cannot be composed.
-    """
+    """Return the robot that choices give; choices that are missing are typical ones."""
     chooser = RecordedChooser(FirstChooser(), choices)
     derivation = derive(grammar, library, chooser)
     robot = compose(derivation, library, name or individual_name(grammar, derivation))
@@ -228,12 +210,7 @@ def individual_name(grammar: Grammar, derivation: Derivation) -> str:
 def offspring(
     grammar: Grammar, folders: tuple[Path, ...], parents: Sequence[Choices], seed: int
 ) -> list[Individual]:
-    """Return the mutants of one parent, or the children of two. Runs in a worker.
-
-    Raises:
-        GrammarError: If the parent has no random choices.
-        SamplingError: If no valid robot that differs from the parents is found.
-    """
+    """Return the mutants of one parent, or the children of two. Runs in a worker."""
     library = Library(folders)
     if len(parents) == 1:
         samples = mutate(grammar, library, parents[0], NUM_OFFSPRING, seed=seed, name=grammar.name)
@@ -275,21 +252,13 @@ def _short(value: str) -> str:
 
 
 def pack_choices(choices: Choices) -> str:
-    """Return choices as text for an address.
-
-    Raises:
-        AddressError: If they are too long.
-    """
+    """Return choices as text for an address."""
     rounded = {key: round_number(value) for key, value in choices.items()}
     return pack_text(json.dumps(rounded, separators=(",", ":")))
 
 
 def unpack_choices(text: str) -> Choices:
-    """Return the choices that ``pack_choices`` has packed.
-
-    Raises:
-        AddressError: If the text is invalid.
-    """
+    """Return the choices that ``pack_choices`` has packed."""
     try:
         choices = json.loads(unpack_text(text))
     except (ValueError, RecursionError) as error:
@@ -352,18 +321,7 @@ def add_grammar_tab(
     source: str,
     show_robot: ShowRobot,
 ) -> GrammarTab:
-    """Add the tab, with the text, seed and number that the page's address gives.
-
-    Args:
-        session: The browser.
-        tabs: Group to which the tab is added.
-        source: Source of the grammar; see ``source_text``.
-        show_robot: Shows a robot on the page.
-
-    Raises:
-        AddressError: If the text in the address is invalid.
-        MorphgenError: If there is no such grammar or robot.
-    """
+    """Add the tab, with the text, seed and number that the page's address gives."""
     gui, state = session.client.gui, session.address.state
     name, original = source_text(source, session.files)
     names = _starts(source)
@@ -410,15 +368,7 @@ def add_grammar_tab(
 
 
 def source_text(source: str, files: FileAccess) -> tuple[str, str]:
-    """Return the name and the text of a grammar.
-
-    Args:
-        source: Name or file of a grammar, or words or a URI of a robot for ``grammar_around``.
-        files: Files that the page may read.
-
-    Raises:
-        MorphgenError: If there is no such grammar or robot.
-    """
+    """Return the name and the text of a grammar."""
     if not is_robot(source):
         name = Path(source).stem if source.endswith(SUFFIX) else source
         return name, grammar_text(resolve_grammar(source, files))
@@ -436,11 +386,7 @@ def is_robot(source: str) -> bool:
 
 
 def edited_grammar(tab: GrammarTab) -> Grammar:
-    """Return the grammar of the text.
-
-    Raises:
-        GrammarError: If it is invalid.
-    """
+    """Return the grammar of the text."""
     return grammar_from_text(tab.text.value, tab.name)
 
 
@@ -472,11 +418,7 @@ def show_grammar(tab: GrammarTab, mode: Mode) -> None:
 def _make_robot(
     tab: GrammarTab, grammar: Grammar, typical: Individual
 ) -> tuple[Individual, str, dict[str, str]]:
-    """Return the robot of the tab's mode, the command that makes it, and its address's state.
-
-    Raises:
-        MorphgenError: If the grammar gives no such robot.
-    """
+    """Return the robot of the tab's mode, the command that makes it, and its address's state."""
     session, library = tab.session, tab.session.files.library
     is_text = tab.is_edited or is_robot(tab.source)
     name = shlex.quote(f"{tab.name}{SUFFIX}" if is_text else tab.source)
@@ -502,11 +444,7 @@ def _starts(source: str) -> tuple[str, ...]:
 
 
 def load_source(tab: GrammarTab, source: str) -> None:
-    """Replace the text by that of another grammar, and show its typical robot.
-
-    Raises:
-        MorphgenError: If there is no such grammar or robot; see ``source_text``.
-    """
+    """Replace the text by that of another grammar, and show its typical robot."""
     tab.name, tab.original = source_text(source, tab.session.files)
     tab.source = source
     tab.start.options = _starts(source)

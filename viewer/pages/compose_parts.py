@@ -65,15 +65,7 @@ def show_composed(
     resolve: Callable[[], tuple[Derivation, str]],
     show: Callable[[Robot, Derivation], None],
 ) -> None:
-    """Show a robot and its address, or why it cannot be composed; then the last robot stays.
-
-    Args:
-        session: The browser.
-        fault: Text that says what is wrong.
-        subject: Subject of the page's address.
-        resolve: Returns the derivation and the name of the robot, or raises a MorphgenError.
-        show: Shows the robot on the page.
-    """
+    """Show a robot and its address, or why it cannot be composed; then the last robot stays."""
     try:
         derivation, name = resolve()
         robot = compose(derivation, session.files.library, name)
@@ -174,11 +166,7 @@ def add_parameters_tab(
 ) -> Callable[[], None]:
     """Add the tab with a folder of sliders for every part.
 
-    Args:
-        session: The browser.
-        tabs: Group to which the tab is added.
-        derivation: Derivation of the robot, of any shape.
-        show_robot: Shows a robot on the page.
+    derivation: Derivation of the robot, of any shape.
 
     Returns:
         Function that shows the robot.

@@ -20,11 +20,7 @@ from morphgen.viewer.splits import ChooseSides, add_split_form
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        UriError: If the folder does not exist or holds no robot.
-    """
+    """Build the page."""
     if not session.address.subject:
         show_index(session)
         return
@@ -47,11 +43,7 @@ def show(session: Session) -> None:
 def choose_sides(
     rows: list[Row], passing: list[Row], num_train: int, num_test: int
 ) -> tuple[list[Row], list[Row]]:
-    """Return the first rows that pass the filter (train) and the first that do not (test).
-
-    Raises:
-        BenchmarkError: If there are too few of either.
-    """
+    """Return the first rows that pass the filter (train) and the first that do not (test)."""
     uris = {row.uri for row in passing}
     failing = [row for row in rows if row.uri not in uris]
     if len(passing) < num_train or len(failing) < num_test:

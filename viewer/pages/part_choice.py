@@ -50,12 +50,7 @@ class Control:
 
 
 def parse_choice(words: Sequence[str], library: Library) -> PartChoice:
-    """Parse words of ``morphgen compose``.
-
-    Raises:
-        CompositionError: If a word is not of the form key=value, or its slot is empty.
-        PartError: If a part or parameter is unknown, or a value is invalid.
-    """
+    """Parse words of ``morphgen compose``."""
     parts: dict[str, str] = {}
     texts: dict[str, str] = {}
     for word in words:
@@ -173,14 +168,7 @@ def choice_of(derivation: Derivation, library: Library) -> PartChoice | None:
 
 
 def with_part(choice: PartChoice, slot: str, part: str, library: Library) -> PartChoice:
-    """Return the choice with another part in a slot, without parts whose slot no longer exists.
-
-    Args:
-        choice: The current choice.
-        slot: The slot.
-        part: Name of a part, or ``NO_PART``.
-        library: The library of parts.
-    """
+    """Return the choice with another part in a slot, without parts whose slot no longer exists."""
     chosen = {**choice.parts, slot: "" if part == NO_PART else part}
     parts = {key: name for key, name in chosen.items() if name}
     allowed = {"base", *slots_of(PartChoice(parts), library)}

@@ -127,11 +127,6 @@ def curves(
 
     uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
 
-    Args:
-        episode: The episode, as far as it is simulated.
-        step: Number of control steps that the scene shows.
-        scores: Scores by robot that are known; missing ones are appended.
-
     Returns:
         Data of distance and of score: 2 + R arrays of the length of the episode. Robots whose
         episode ended earlier keep their last value, because uPlot draws no curve with NaN.
@@ -206,15 +201,7 @@ class RolloutControls:
 
 
 def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
-    """Return the rollout that an address describes.
-
-    Args:
-        address: Address of the page.
-        trained_on: Robots that the policy was trained on; the first is the default robot.
-
-    Raises:
-        MorphgenError: If the task, simulator or seed is invalid.
-    """
+    """Return the rollout that an address describes."""
     state, installed = address.state, simulators()
     task = address.subject
     if task not in TASKS:
@@ -422,11 +409,7 @@ class PlayPage:
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        MorphgenError: If the address names an unknown task, policy or robot, or an invalid episode.
-    """
+    """Build the page."""
     gui, subject = session.client.gui, session.address.subject
     paused_at = parse_time(session.address.state.get("t", ""))
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
@@ -455,11 +438,7 @@ def show(session: Session) -> None:
 
 
 def parse_time(text: str) -> float | None:
-    """Return the time at which an address shows an episode [s]; None if the text is empty.
-
-    Raises:
-        AddressError: If the text is no time.
-    """
+    """Return the time at which an address shows an episode [s]; None if the text is empty."""
     if not text:
         return None
     try:

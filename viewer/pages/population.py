@@ -139,11 +139,7 @@ if (window.morphgenHover) window.morphgenHover.table = new Int16Array(bytes.buff
 
 
 def install_script(cards: Sequence[str]) -> str:
-    """Return the JavaScript that shows cards.
-
-    Args:
-        cards: HTML of each robot's card; text from outside is escaped.
-    """
+    """Return the JavaScript that shows cards."""
     values = {"cards": json.dumps(list(cards)), "tolerance": TOLERANCE * SCALE, "scale": SCALE}
     return _INSTALL % values
 
@@ -428,11 +424,7 @@ def _select(page: PopulationPage, choice: str) -> None:
 
 
 def _require_selection(page: PopulationPage) -> list[Row]:
-    """Return the selected robots.
-
-    Raises:
-        UriError: If there are none.
-    """
+    """Return the selected robots."""
     if rows := selected_rows(page):
         return rows
     raise UriError("no robot is selected: drag a rectangle with the shift key held")
@@ -503,11 +495,7 @@ PANEL_WIDTH = 340.0
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        MorphgenError: If the address names no robots.
-    """
+    """Build the page."""
     if not session.address.subject:
         show_index(session)
         return

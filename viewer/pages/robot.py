@@ -67,12 +67,7 @@ RENDER_TIMEOUT = 60.0
 
 
 def show(session: Session) -> None:
-    """Build the page of the robot that the address names.
-
-    Raises:
-        UnsoundError: If the robot's structure is broken.
-        MorphgenError: If the robot cannot be read.
-    """
+    """Build the page of the robot that the address names."""
     uri = session.address.subject
     gui = session.client.gui
     session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")

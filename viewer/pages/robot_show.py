@@ -405,13 +405,9 @@ class _LinkDrag:
 def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, target: Array) -> Array:
     """Return a configuration in which a point of a link is as near as possible to a target.
 
-    Args:
-        robot: The robot.
-        q: Configuration, shape (dof,).
-        row: The only index in q that changes, within its limits.
-        link: Index of the link.
-        point: Point in the link's frame, shape (3,) [m].
-        target: Point in the root frame, shape (3,) [m].
+    q: Configuration, shape (dof,).
+    point: Point in the link's frame, shape (3,) [m].
+    target: Point in the root frame, shape (3,) [m].
     """
     q, (low, high) = q.copy(), joint_limits(robot)[row]
     column = robot.mimic_map[0][:, row]

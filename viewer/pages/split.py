@@ -51,11 +51,7 @@ class SplitPage:
 
 
 def show(session: Session) -> None:
-    """Build the page.
-
-    Raises:
-        MorphgenError: If the split does not exist or cannot be read.
-    """
+    """Build the page."""
     if not session.address.subject:
         show_index(session)
         return

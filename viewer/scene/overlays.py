@@ -48,9 +48,8 @@ def sample_workspace(robot: Robot) -> Array:
 def shell(points: Array, y_max: float) -> Triangles:
     """Return the outermost positions by direction from the middle, as far as y is above a limit.
 
-    Args:
-        points: Tool positions, shape (n, 3) [m].
-        y_max: Faces in front of this plane are left out, so that the inside is visible [m].
+    points: Tool positions, shape (n, 3) [m].
+    y_max: Faces in front of this plane are left out, so that the inside is visible [m].
 
     Returns:
         Triangles in the frame of the points; directions without points have none.
@@ -86,9 +85,8 @@ def shell(points: Array, y_max: float) -> Triangles:
 def cut(points: Array, y: float) -> Slice:
     """Return the cells of a plane that the tool reaches.
 
-    Args:
-        points: Tool positions, shape (n, 3) [m].
-        y: Position of the plane [m].
+    points: Tool positions, shape (n, 3) [m].
+    y: Position of the plane [m].
     """
     low, high = points.min(axis=0), points.max(axis=0)
     side = max(float((high - low).max()), 1e-3) / _CELLS
@@ -268,10 +266,8 @@ def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> No
 def show_workspace(overlays: Overlays, points: Array, y: float) -> None:
     """Draw the shell of the tool's positions behind a vertical plane, and the slice in it.
 
-    Args:
-        overlays: The overlays.
-        points: Tool positions, shape (n, 3) [m].
-        y: Position of the plane [m].
+    points: Tool positions, shape (n, 3) [m].
+    y: Position of the plane [m].
     """
     remove_overlay(overlays, "workspace")
     view, section = overlays.view, cut(points, y)

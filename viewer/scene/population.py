@@ -49,14 +49,8 @@ def add_population(
 ) -> PopulationScene:
     """Draw a population.
 
-    Args:
-        client: The browser.
-        population: The robots.
-        positions: Positions of their roots on the ground, shape (n, 2) [m].
-        q: Independent joint positions, shape (n, J) [rad or m].
-
-    Raises:
-        MeshError: If a mesh cannot be read.
+    positions: Positions of their roots on the ground, shape (n, 2) [m].
+    q: Independent joint positions, shape (n, J) [rad or m].
     """
     instances = population.instances
     poses = world_poses(population, positions, q)
@@ -81,10 +75,8 @@ def add_population(
 def move(scene: PopulationScene, positions: Array, q: Array) -> None:
     """Move all robots; the browser gets all changes in one message.
 
-    Args:
-        scene: The scene.
-        positions: Positions of the roots on the ground, shape (n, 2) [m].
-        q: Independent joint positions, shape (n, J) [rad or m].
+    positions: Positions of the roots on the ground, shape (n, 2) [m].
+    q: Independent joint positions, shape (n, J) [rad or m].
     """
     poses = world_poses(scene.population, positions, q)
     wxyzs, origins = quaternions(poses), poses[:, :3, 3]
@@ -98,10 +90,7 @@ def move(scene: PopulationScene, positions: Array, q: Array) -> None:
 def fade(scene: PopulationScene, selected: NDArray[np.bool_], background: Rgb) -> None:
     """Show the selected robots in their colours and the others faded; all in theirs without any.
 
-    Args:
-        scene: The scene.
-        selected: Mask of the selected robots, shape (n,).
-        background: Colour towards which the others fade.
+    selected: Mask of the selected robots, shape (n,).
     """
     instances = scene.population.instances
     colours = instances.colour.astype(np.float64)
@@ -126,11 +115,7 @@ def quaternions(poses: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def surface(prototype: Prototype) -> Triangles:
-    """Return the surface of a prototype, simplified because it is drawn many times.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Return the surface of a prototype, simplified because it is drawn many times."""
     match prototype:
         case Box():
             return triangles(prototype)

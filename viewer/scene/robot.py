@@ -85,11 +85,9 @@ class RobotView:
     ) -> None:
         """Draw shapes, given by link, in a layer; they replace the layer's previous shapes.
 
-        Args:
-            layer: The layer.
-            shapes: Shapes of each link.
-            growth: Distance by which surfaces are moved outwards [m], so that they do not coincide
-                with those of another layer.
+        shapes: Shapes of each link.
+        growth: Distance by which surfaces are moved outwards [m], so that they do not coincide
+            with those of another layer.
         """
         self.remove_layer(layer)
         self.layers[layer] = [
@@ -176,14 +174,7 @@ def add_robot(
 ) -> RobotView:
     """Draw a robot's visual shapes at its home configuration.
 
-    Args:
-        scene: Scene of a browser or of a server.
-        robot: The robot.
-        name: Name of its node in the scene, such as ``/robot``.
-        position: Position of its root [m].
-
-    Raises:
-        MeshError: If a mesh cannot be read.
+    position: Position of its root [m].
     """
     base = scene.add_frame(name, show_axes=False, position=position)
     length = 0.12 * robot_extent(robot)
@@ -206,9 +197,7 @@ def add_robot(
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
     """Return the lowest and highest corner of a robot in its root frame [m].
 
-    Args:
-        robot: The robot; the origin of its root counts too.
-        q: Configuration, shape (dof,); the home configuration by default.
+    q: Configuration, shape (dof,); the home configuration by default.
     """
     T_root_link = forward_kinematics(robot, robot.home if q is None else q)
     points = [np.zeros((1, 3))]
@@ -302,10 +291,9 @@ def remove_offspring(scene: OffspringScene) -> None:
 def hit_robot(boxes: Array, origin: Array, direction: Array) -> int | None:
     """Return the index of the nearest box that a ray meets; None if it meets none.
 
-    Args:
-        boxes: Lowest and highest corners, shape (n, 2, 3) [m].
-        origin: Start of the ray, shape (3,) [m].
-        direction: Direction of the ray, shape (3,).
+    boxes: Lowest and highest corners, shape (n, 2, 3) [m].
+    origin: Start of the ray, shape (3,) [m].
+    direction: Direction of the ray, shape (3,).
     """
     safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
     distances = (boxes - origin) / safe
@@ -323,17 +311,7 @@ _RING_POINTS = 24
 
 
 def turntable(robot: Robot, suffix: str) -> bytes:
-    """Return a video of a robot at home that turns once around the vertical.
-
-    Args:
-        robot: The robot.
-        suffix: ``.mp4`` or ``.gif``.
-
-    Raises:
-        FormatError: If ffmpeg is missing or fails.
-        MeshError: If a mesh cannot be read.
-        MissingDependencyError: If there is no offscreen OpenGL.
-    """
+    """Return a video of a robot at home that turns once around the vertical."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"turntable{suffix}"
         write_video(_frames(robot), path, FPS)

@@ -57,11 +57,7 @@ class RolloutScene:
 
 
 def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
-    """Draw an episode's robots and their surroundings at its start.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Draw an episode's robots and their surroundings at its start."""
     areas = [track_area(track) for track in episode.tracks]
     positions = grid_positions(areas)
     root = scene.add_frame(NODE, show_axes=False)
@@ -159,12 +155,7 @@ _FRAMED_STEPS = 32
 
 
 def render_video(episode: Episode) -> bytes:
-    """Return an ``.mp4`` of an episode in real time; several robots are tiled.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-        MissingDependencyError: If there is no offscreen OpenGL.
-    """
+    """Return an ``.mp4`` of an episode in real time; several robots are tiled."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "episode.mp4"
         write_video(_render_frames(episode), path, 1 / (STRIDE * episode.period))
@@ -172,21 +163,13 @@ def render_video(episode: Episode) -> bytes:
 
 
 def record_scene(episode: Episode) -> bytes:
-    """Return a ``.viser`` file for viser's own player: the scene with all its motions.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Return a ``.viser`` file for viser's own player: the scene with all its motions."""
     with scene_server() as server:
         return _record(server, episode).serialize()
 
 
 def episode_page(episode: Episode, dark: bool) -> bytes:
-    """Return a web page that plays an episode without a server or a network.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Return a web page that plays an episode without a server or a network."""
     with scene_server() as server:
         set_stage(server.scene, dark=dark)
         recording = _record(server, episode)

@@ -31,9 +31,6 @@ def outline_triangles(geometry: Geometry, thickness: float) -> Triangles:
     """Return the surface of a geometry, moved outwards by a thickness [m] and inside out.
 
     Where only front faces are drawn, it is visible around the geometry and nowhere else.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     vertices, faces = grown_triangles(geometry, thickness)
     return vertices, np.ascontiguousarray(faces[:, ::-1])
@@ -91,10 +88,7 @@ def draw_range(view: RobotView, index: int) -> list[Any]:
 def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Array, Array]:
     """Return the lines that show a joint's range.
 
-    Args:
-        joint: A movable joint.
-        size: Radius of the arc, and half the length of the axis [m].
-        direction: Direction of the needle of a rotational joint, perpendicular to its axis.
+    size: Radius of the arc, and half the length of the axis [m].
 
     Returns:
         Lines of the needle in the child's frame, and of the range and the axis in the joint's frame

@@ -53,9 +53,6 @@ def triangles(geometry: Geometry) -> Triangles:
     """Return the surface of a geometry in its own frame.
 
     Vertices at sharp edges are doubled, so that the browser shades them as edges.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
     """
     if isinstance(geometry, Mesh):
         return _mesh_triangles(geometry, load_mesh(geometry))
@@ -63,11 +60,7 @@ def triangles(geometry: Geometry) -> Triangles:
 
 
 def grown_triangles(geometry: Geometry, thickness: float) -> Triangles:
-    """Return the surface of a geometry, moved outwards by a thickness [m]; its edges are closed.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-    """
+    """Return the surface of a geometry, moved outwards by a thickness [m]; its edges are closed."""
     mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
@@ -180,10 +173,8 @@ def background_colour(*, dark: bool) -> Rgb:
 def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
     """Draw an endless grid that fades with the distance, cells of 10 cm or, if large, of 1 m.
 
-    Args:
-        scene: The scene.
-        size: Size of what stands on it [m].
-        height: Height of the ground [m].
+    size: Size of what stands on it [m].
+    height: Height of the ground [m].
     """
     cell = 0.1 if size < 8 else 1.0
     scene.add_grid(
@@ -207,11 +198,8 @@ def add_scale_bar(
 ) -> None:
     """Draw a bar on the ground in front of a box, of a length that fits: 0.1, 0.2, 0.5, 1, ... m.
 
-    Args:
-        scene: The scene.
-        low: Lowest corner of the box, shape (3,) [m].
-        high: Highest corner of the box, shape (3,) [m].
-        direction: From the box to the camera; decides which side is the front.
+    low: Lowest corner of the box, shape (3,) [m].
+    high: Highest corner of the box, shape (3,) [m].
     """
     extent = max(float((high - low).max()), MIN_EXTENT)  # a robot without shapes is a point
     length = bar_length(0.3 * extent)
@@ -304,12 +292,8 @@ def place_camera(
 ) -> None:
     """Point a camera at a box; see ``look_at``.
 
-    Args:
-        camera: Camera of a browser, or the initial one of a recorded scene.
-        low: Lowest corner of the box, shape (3,) [m].
-        high: Highest corner of the box, shape (3,) [m].
-        direction: From the box to the camera.
-        aspect: Width of the picture divided by its height.
+    low: Lowest corner of the box, shape (3,) [m].
+    high: Highest corner of the box, shape (3,) [m].
     """
     forward = -np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -332,9 +316,8 @@ def fit_camera(points: Array, tangents: Array) -> Array:
     times a tangent. Each axis of the picture gives two such bounds, on the farthest points to both
     sides; the camera's offset is between them, and the stricter axis decides its distance.
 
-    Args:
-        points: Points in the camera's axes: right, up, forward, shape (n, 3) [m].
-        tangents: Largest offset per distance to the right and up, shape (2,).
+    points: Points in the camera's axes: right, up, forward, shape (n, 3) [m].
+    tangents: Largest offset per distance to the right and up, shape (2,).
 
     Returns:
         Position of the camera in its axes, shape (3,) [m].

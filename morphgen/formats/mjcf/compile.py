@@ -55,10 +55,6 @@ def compile_document(
 
     Returns:
         The document's model before and after the compilation, and MuJoCo's warnings.
-
-    Raises:
-        MeshError: If a mesh cannot be read.
-        FormatError: If MuJoCo refuses the document, or it is too large for a robot.
     """
     with MujocoWarnings() as warnings:
         try:
@@ -153,11 +149,7 @@ _MAX_STEM = 60
 def ellipsoid_mesh(radii: Vec3) -> Mesh:
     """Return a convex mesh of the volume of an ellipsoid: a subdivided icosahedron, scaled.
 
-    Args:
-        radii: Along x, y and z [m].
-
-    Raises:
-        FormatError: If the cache cannot be written.
+    radii: Along x, y and z [m].
     """
     return Mesh(_keep("ellipsoid", _unit_sphere()), radii)
 
@@ -167,14 +159,6 @@ def inline_meshes(spec: mujoco.MjSpec, document: MjcfDocument) -> dict[str, Path
 
     A file has the vertices as written, before MuJoCo's scale and reference pose; without triangles,
     those of their convex hull, as in MuJoCo.
-
-    Args:
-        spec: The document. MuJoCo has compiled it, so that vertices are finite, faces name
-            vertices, and vertices without faces have a hull.
-        document: The document.
-
-    Raises:
-        FormatError: If a mesh has no area or too large coordinates, or the cache cannot be written.
     """
     files = {}
     for asset in spec.meshes:

@@ -124,16 +124,6 @@ def read_document(path: Path, finder: PackageFinder, *, with_options: bool = Fal
 
     MuJoCo gets the elements of an allow-list. It ignores namespaces, which would hide an element
     from that list, so names with a namespace are refused.
-
-    Args:
-        path: The file.
-        finder: Finds ROS packages, and the folder that files may come from.
-        with_options: Whether to keep the options of a simulation.
-
-    Raises:
-        UnsoundError: If a mesh is not found; it lists all of them.
-        FormatError: If a file is missing, too large, not XML or elsewhere, or the document has an
-            element that cannot be read.
     """
     includes = _Includes(path, finder)
     root, findings = includes.read(path, 0)

@@ -79,10 +79,6 @@ def robot_bodies(
     is the one body in the world: with a free joint, which is left out, or welded to the world at
     its origin. If that body is elsewhere or moves, or the world has shapes other than planes, the
     world is the root. It is also the root of several bodies that all have joints, as of two arms.
-
-    Raises:
-        FormatError: If the body is unknown, the world holds other bodies besides the robot, or a
-            joint is a ball.
     """
     findings: tuple[Finding, ...] = ()
     if root_body is not None:
@@ -246,9 +242,6 @@ def body_shapes(
 
     MuJoCo moves meshes to their centre of mass and principal axes; the shapes are again in the
     coordinates of the mesh files.
-
-    Raises:
-        FormatError: If a geom has no counterpart, such as a plane of a body.
     """
     first = model.body_geomadr[body]
     geoms = range(first, first + model.body_geomnum[body])
@@ -380,12 +373,6 @@ def read_frames(
     or joint gets ``_site`` appended. If neither a site nor a link is called ``tool``, the first
     site with a word such as ``attachment``, ``tcp`` or ``grip`` in its name is the frame ``tool``,
     besides its own. The order of the words decides, then that of the file.
-
-    Args:
-        model: The compiled model.
-        links: Name of the link of every body of the robot, by index.
-        T_link_body: Pose of every body's frame in its link's frame.
-        joints: Joints of the robot.
     """
     taken = {*links.values(), *(joint.parent for joint in joints), *(j.child for j in joints)}
     joint_names = {joint.name for joint in joints}
@@ -435,11 +422,7 @@ class Couplings:
     """Constraints that were left out."""
 
     def mimic(self, joint: int, model: mujoco.MjModel, names: dict[int, str]) -> Mimic | None:
-        """Return the mimic of a joint; None if it is independent.
-
-        Raises:
-            KeyError: If the leader has no name in ``names``.
-        """
+        """Return the mimic of a joint; None if it is independent."""
         if joint not in self.mimics:
             return None
         leader, multiplier, offset = self.mimics[joint]
@@ -476,16 +459,6 @@ def read_couplings(
     accepted only if they merely drive joints that follow the same leader. Constraints to mocap
     bodies outside the robot, by which users drag it, are left out with a finding. Inactive
     constraints have no effect.
-
-    Args:
-        model: The compiled model.
-        joints: Joints of the robot.
-        bodies: Bodies of the robot; constraints that touch none of its joints and bodies are
-            somebody else's.
-        document: The document, for messages.
-
-    Raises:
-        FormatError: If a constraint or tendon has no counterpart.
     """
     scope, couplings = _Scope(model, joints, bodies, document), Couplings()
     resolved_tendons = set()
@@ -753,18 +726,6 @@ def read_mjcf(
     the home configuration if it is within the limits; otherwise every joint is at its ``ref``, or
     in the middle of its range. ``<exclude>`` makes ignored pairs. What a ``Robot`` does not hold is
     left out: stiffness, armature, gains, sensors, cameras, lights and textures.
-
-    Args:
-        path: The file.
-        finder: Finds ROS packages, and the folder that files may come from besides the document's.
-        root_body: Body that is the root of the robot; see ``robot_bodies``.
-
-    Raises:
-        UnsoundError: If meshes are not found.
-        MeshError: If a mesh cannot be read.
-        FormatError: If the file cannot be read, MuJoCo refuses it, or it has something that a
-            robot cannot have, such as a ball joint.
-        RobotError: If joints follow each other in a circle.
     """
     require_description_file(path)
     document = read_document(path, finder or default_finder())

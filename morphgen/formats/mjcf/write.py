@@ -178,16 +178,9 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     1e-14 kg m^2, far below any real part. Armature is the motor's share of a light joint's inertia.
     An effort of zero counts as missing, as in most URDFs: the actuator has no limit.
 
-    Args:
-        robot: The robot.
-        mesh_file: Maps a mesh to its file relative to the MJCF, such as ``meshes/hand.stl``. The
-            file must contain the mesh as the shape uses it: only its part, with scale applied.
-            MuJoCo reads STL of at most 200,000 faces and OBJ of any size.
-
-    Raises:
-        FormatError: If MJCF cannot express the robot: a link named ``world`` that is not a root
-            without mass, or limits with lower >= upper.
-        MeshError: If a collision mesh cannot be read.
+    mesh_file: Maps a mesh to its file relative to the MJCF, such as ``meshes/hand.stl``. The
+        file must contain the mesh as the shape uses it: only its part, with scale applied.
+        MuJoCo reads STL of at most 200,000 faces and OBJ of any size.
     """
     meshes = Meshes(mesh_file)
     root = _document(robot, meshes)
@@ -198,14 +191,8 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
 def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
     """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes.
 
-    Args:
-        robot: The robot.
-        mesh_file: As for ``mjcf_text``; None puts the triangles into the model, for collision
-            shapes those of the convex hull.
-
-    Raises:
-        FormatError: As ``mjcf_text``.
-        MeshError: If a mesh cannot be read.
+    mesh_file: As for ``mjcf_text``; None puts the triangles into the model, for collision
+        shapes those of the convex hull.
     """
     meshes = Meshes(mesh_file)
     spec = mujoco.MjSpec.from_string(etree.tostring(_document(robot, meshes), encoding="unicode"))

@@ -76,23 +76,10 @@ def read_urdf(
 ) -> Robot:
     """Read a URDF, or a xacro (by its suffix), with every mesh reference resolved.
 
-    Args:
-        path: The file.
-        args: Values of the xacro's arguments.
-        finder: Finds ROS packages; by default around ``path``, in the environment of ROS and in
-            the installed data packages.
-        keep_order: Whether to keep the order of the file's joints if parents precede children;
-            otherwise links are ordered depth first.
-        written_frames: Whether to turn links that ``urdf_text`` wrote for frames into frames.
-
     Returns:
         The robot, without frames unless ``written_frames``. Its home is the one that
         ``urdf_text`` wrote, else zero, or the middle of a range without zero. What was repaired or
         left out is listed in ``source_findings``.
-
-    Raises:
-        UnsoundError: If the tree is broken or a mesh is not found.
-        FormatError: If the file cannot be read, is not XML or does not expand.
     """
     require_description_file(path)
     finder = finder or default_finder()
@@ -108,11 +95,7 @@ def read_urdf(
 
 
 def require_description_file(path: Path) -> None:
-    """Require that a path is a regular file whose name can be printed.
-
-    Raises:
-        FormatError: If it is not.
-    """
+    """Require that a path is a regular file whose name can be printed."""
     if not path.is_file():
         why = "not a regular file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {why}")
@@ -129,21 +112,7 @@ def robot_from_xml(
     keep_order: bool = False,
     written_frames: bool = False,
 ) -> Robot:
-    """Read URDF text.
-
-    Args:
-        data: The XML.
-        path: Origin of the text, for messages and relative mesh paths.
-        finder: Finds the packages of ``package://`` URIs.
-        trusted: Whether to skip the check of the structure, because a document of the same
-            structure was checked before.
-        keep_order: See ``read_urdf``.
-        written_frames: See ``read_urdf``.
-
-    Raises:
-        UnsoundError: If the tree is broken or a mesh is not found.
-        FormatError: If it is not XML.
-    """
+    """Read URDF text."""
     root, repairs = parse_description(data, str(path))
     findings = () if trusted else structure_findings(root, str(path))
     errors = tuple(finding for finding in findings if finding.severity == "error")
@@ -187,11 +156,7 @@ def robot_from_xml(
 
 
 def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
-    """Turn links that ``urdf_text`` wrote for frames into frames.
-
-    Raises:
-        FormatError: If the robot has no such link on a fixed joint.
-    """
+    """Turn links that ``urdf_text`` wrote for frames into frames."""
     joints = {joint.child: joint for joint in robot.joints}
     for name in names:
         if name not in joints or joints[name].is_movable:
@@ -233,11 +198,7 @@ class _Meshes:
 
 
 def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
-    """Find the files of all meshes; remove shapes whose mesh is missing, if the finder skips them.
-
-    Raises:
-        UnsoundError: If a file is missing, and not skipped; it lists all of them.
-    """
+    """Find the files of all meshes; remove shapes without one, if the finder skips them."""
     found: dict[str, FoundFile] = {}
     missing: dict[str, Finding] = {}
     for element in root.iterfind(f"link/*/{_MESH}"):

@@ -241,12 +241,7 @@ def _unread_finding(
 
 
 def content_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
-    """Check an element and everything that is read inside it.
-
-    Args:
-        element: A ``<link>``, ``<joint>``, ``<material>`` or ``<robot>`` (its attributes only).
-        location: The location that findings name.
-    """
+    """Check an element and everything that is read inside it."""
     tag = element.tag
     yield from _text_findings(element, location)
     for numbers in _NUMBERS.get(tag, ()):
@@ -458,10 +453,6 @@ _REPLACEMENT = {
 
 def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]:
     """Check that a URDF is a kinematic tree with valid numbers.
-
-    Args:
-        root: The document's root element; findings report ``sourceline`` of its elements.
-        origin: Name of the document in messages, usually its path.
 
     Returns:
         Findings in the order of detection. A document without errors can be converted.

@@ -37,8 +37,7 @@ def joined_capsules(shapes: Iterable[tuple[str, Shape]]) -> tuple[Shape, ...]:
     Three shapes in a row are joined if their names say so, and if they still are a capsule: a user
     may have changed one.
 
-    Args:
-        shapes: The shapes in their order, with the names of their elements.
+    shapes: The shapes in their order, with the names of their elements.
     """
     rows = list(shapes)
     joined = []
@@ -96,13 +95,6 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
 
     A ``<morphgen>`` element, which loaders ignore, holds what URDF cannot express: the home
     configuration, and which links are frames.
-
-    Args:
-        robot: The robot.
-        mesh_uri: Maps a mesh to the file name to write.
-
-    Raises:
-        FormatError: If a prismatic joint has no limits.
     """
     root = etree.Element("robot", name=robot.name)
     etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", _MUJOCO_COMPILER)

@@ -101,11 +101,7 @@ class CompiledXacro:
     """Index of the expression after each text except the last."""
 
     def fill(self, values: Mapping[str, str]) -> bytes:
-        """Return the document for values of the parameters, given as xacro arguments.
-
-        Raises:
-            FormatError: If an expression cannot be evaluated for them.
-        """
+        """Return the document for values of the parameters, given as xacro arguments."""
         names = dict(_NAMES) | {_symbol(name): _literal(text) for name, text in values.items()}
         try:
             numbers = [str(expression.evaluate(names)) for expression in self.expressions]
@@ -123,13 +119,6 @@ def compile_xacro(
     path: Path, constants: Mapping[str, str], numbers: Mapping[str, str], finder: PackageFinder
 ) -> CompiledXacro | None:
     """Expand a xacro file for all values of some of its arguments; memoised.
-
-    Args:
-        path: The file.
-        constants: Arguments that decide the document's structure, such as counts.
-        numbers: Arguments that are numbers. The first call compares the filled document for these
-            values with an expansion.
-        finder: Finds the packages of ``$(find package)``.
 
     Returns:
         The compiled document; None if the file uses a number other than by arithmetic, or cannot be
@@ -180,13 +169,6 @@ def trace(
     installed_only: bool = False,
 ) -> tuple[list[str], list[str]] | None:
     """Expand a xacro file in this process with symbols in place of numbers.
-
-    Args:
-        path: The file, absolute.
-        finder: As for ``compile_xacro``.
-        constants: As for ``compile_xacro``.
-        numbers: As for ``compile_xacro``.
-        installed_only: As for ``Expansion``.
 
     Returns:
         The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.

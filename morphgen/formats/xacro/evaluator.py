@@ -54,9 +54,6 @@ def size_of(value: object) -> int:
     """Count the characters and entries of a value, nested ones included.
 
     This is the work of copying or printing it.
-
-    Raises:
-        RefusedError: If there are more than ``MAX_SIZE``; a value that contains itself has.
     """
     size = 0
     pending = [value]
@@ -76,11 +73,7 @@ def size_of(value: object) -> int:
 
 
 def checked(value: object) -> object:
-    """Return a value unchanged if it is small enough.
-
-    Raises:
-        RefusedError: If it is too large.
-    """
+    """Return a value unchanged if it is small enough."""
     if isinstance(value, int):
         if value.bit_length() > MAX_BITS:
             raise RefusedError(f"a whole number has more than {MAX_BITS} bits")
@@ -335,11 +328,7 @@ class Scope:
     work: int = MAX_WORK
 
     def spend(self, work: int) -> None:
-        """Subtract work from the remaining work.
-
-        Raises:
-            RefusedError: If none remains.
-        """
+        """Subtract work from the remaining work."""
         self.work -= work
         if self.work < 0:
             raise RefusedError(f"it takes more than {MAX_WORK} steps")
@@ -364,11 +353,7 @@ class Translation:
         self.text = text
 
     def of(self, node: ast.AST) -> Node:
-        """Return the function that evaluates a node.
-
-        Raises:
-            RefusedError: If the node or one inside it is of a kind that is not allowed.
-        """
+        """Return the function that evaluates a node."""
         translate = getattr(self, f"_{type(node).__name__.lower()}", None)
         if translate is None:
             raise self.refused(node)
@@ -659,12 +644,7 @@ class Expression:
     """A translated expression; it can be evaluated for any values of its names."""
 
     def __init__(self, text: str) -> None:
-        """Translate.
-
-        Raises:
-            SyntaxError: If it is not an expression.
-            RefusedError: If it contains a construct that is not allowed, or is too long.
-        """
+        """Translate."""
         if len(text) > MAX_LENGTH:
             raise RefusedError(f"an expression is longer than {MAX_LENGTH} characters")
         try:
@@ -680,17 +660,7 @@ class Expression:
     def evaluate(
         self, names: Mapping[str, object], inner: Mapping[str, object] | None = None
     ) -> object:
-        """Return the value of the expression.
-
-        Args:
-            names: Values and functions by name.
-            inner: Further values; they hide those of ``names``.
-
-        Raises:
-            RefusedError: If the evaluation exceeds a bound, or its value is not data.
-            NameError: If a name is unknown.
-            Exception: Any exception of the operation in Python, such as ``ZeroDivisionError``.
-        """
+        """Return the value of the expression."""
         value = self._node(Scope(names, dict(inner or {})))
         if isinstance(value, Function) or (isinstance(value, dict) and type(value) is not dict):
             raise RefusedError("its value is a function or namespace, not data")
@@ -699,10 +669,5 @@ class Expression:
 
 @lru_cache(maxsize=4096)
 def expression(text: str) -> Expression:
-    """Return a translated expression; memoised.
-
-    Raises:
-        SyntaxError: As ``Expression``.
-        RefusedError: As ``Expression``.
-    """
+    """Return a translated expression; memoised."""
     return Expression(text)

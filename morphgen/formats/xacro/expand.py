@@ -54,12 +54,7 @@ _LOCATION = "morphgen-location"
 
 
 def read_file(path: Path) -> bytes:
-    """Return the content of a regular file; a device or a pipe might never end.
-
-    Raises:
-        OSError: If it cannot be read.
-        RefusedError: If it is not a regular file, or too large.
-    """
+    """Return the content of a regular file; a device or a pipe might never end."""
     try:
         return read_bytes(path, MAX_FILE)
     except FormatError as error:
@@ -90,11 +85,7 @@ class ElementLocations:
     def handle(
         self, operation: int, key: str, location: object, source: object, clone: Untyped
     ) -> None:
-        """Store the location of a clone; minidom calls this.
-
-        Raises:
-            RefusedError: If there are more than ``MAX_CLONES``.
-        """
+        """Store the location of a clone; minidom calls this."""
         del operation, source
         clone.setUserData(key, location, self)
         self.clones += 1
@@ -115,17 +106,7 @@ class _Builder(expatbuilder.ExpatBuilderNS):
 
 
 def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
-    """Parse a YAML file of texts, numbers, lists and dictionaries.
-
-    Args:
-        data: The file's content.
-        path: The file, for messages.
-        units: xacro's unit tags.
-
-    Raises:
-        FormatError: If it is invalid YAML.
-        RefusedError: If it is too large with all aliases expanded.
-    """
+    """Parse a YAML file of texts, numbers, lists and dictionaries."""
 
     class Loader(yaml.SafeLoader):
         """Safe YAML with xacro's unit tags, which must not be added to the shared loader."""
@@ -155,11 +136,7 @@ def _refuse_tag(loader: yaml.SafeLoader, node: yaml.Node) -> object:
 
 
 def document_text(document: minidom.Document) -> str:
-    """Return a document as text.
-
-    Raises:
-        RefusedError: If it is too long.
-    """
+    """Return a document as text."""
     pieces = []
     length = 0
     for piece in _serialised(document.documentElement):
@@ -387,18 +364,8 @@ def run_in_child(
 ) -> Any:  # noqa: ANN401
     """Run a function in a child process with limits.
 
-    Args:
-        task: A function of a module of morphgen; it takes ``path``, ``finder`` and ``values`` and
-            returns JSON data.
-        path: The xacro file, absolute.
-        finder: Finds its packages.
-        **values: Arguments of the task.
-
     Returns:
         The result of the task.
-
-    Raises:
-        FormatError: If the task raises it, or exceeds a limit.
     """
     source = str(Path(__file__).parents[3])
     request = {
@@ -537,17 +504,8 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     it is expanded in this process as long as it reads installed files only. Every other file,
     including one of the user's own library, is expanded in a child process with resource limits.
 
-    Args:
-        path: The file.
-        args: Values of the document's ``xacro:arg``; the others keep their defaults.
-        finder: Where ``$(find package)`` looks, besides around the file.
-
     Returns:
         The expanded document: UTF-8, no XML declaration, no comments.
-
-    Raises:
-        FormatError: The file or one that it includes is missing, broken or cannot be expanded, asks
-            for what is not allowed or too much, or neither declares an argument of ``args``.
     """
     path = path.absolute()
     if is_installed(path):
@@ -569,13 +527,8 @@ def expand_here(path: Path, finder: PackageFinder, args: Mapping[str, str]) -> s
 def evaluate(expression: str, values: Mapping[str, float]) -> float:
     """Evaluate a text with ``${...}`` to a number.
 
-    Args:
-        expression: Such as ``"0.5"`` or ``"${length / 2}"``, with xacro's functions (``pi``,
-            ``sin``, ``max``, ``radians``, ...).
-        values: Numbers by name; they hide xacro's own names.
-
-    Raises:
-        FormatError: It cannot be evaluated, or is not a finite number.
+    expression: Such as ``"0.5"`` or ``"${length / 2}"``, with xacro's functions (``pi``,
+        ``sin``, ``max``, ``radians``, ...).
     """
     engine = thread_engine()
     engine.eval_extension = _no_substitution
@@ -603,16 +556,7 @@ class Expansion:
         *,
         installed_only: bool = False,
     ) -> None:
-        """Prepare.
-
-        Args:
-            args: Values of the document's ``xacro:arg``.
-            origin: The file, absolute.
-            finder: Where ``$(find package)`` looks.
-            objects: Further arguments, whose values reach expressions without conversion to text.
-            installed_only: Whether to refuse files that are not ``is_installed``; ``met_foreign``
-                is then true if the document asked for one.
-        """
+        """Prepare."""
         self.engine = thread_engine()
         self.engine.parse = self._parse_include
         self.engine.load_yaml = self._load_yaml
@@ -629,11 +573,7 @@ class Expansion:
         self.met_foreign = False
 
     def run_file(self) -> bytes:
-        """Expand the file.
-
-        Raises:
-            FormatError: As ``expand``.
-        """
+        """Expand the file."""
         try:
             data = read_file(self.origin)
         except OSError as error:
@@ -643,11 +583,7 @@ class Expansion:
         return self.run(data)
 
     def run(self, data: bytes) -> bytes:
-        """Expand a document in place of the file's content.
-
-        Raises:
-            FormatError: As ``expand``.
-        """
+        """Expand a document in place of the file's content."""
         self.engine.init_stacks(str(self.origin))
         with self._located():
             document = self._parse(data, str(self.origin))
