@@ -2,7 +2,7 @@
 
 A release is a split folder (see ``split_folder``) with further files:
 
-release.json       version of the release, evaluation, difficulty, commitment of a private test side
+release.json       version of the release, evaluation, difficulty
 licences.json      every part with its licence and robots; LICENCES.md is the same for readers
 difficulty.csv     size, nearest train robots and reference scores of every robot, from version 0.3
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
@@ -48,22 +48,6 @@ LIMITS = ZipLimits(max_bytes=4 * 2**30, max_files=100_000)
 _VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}(?:[-+.]?[0-9A-Za-z]{1,20})?", re.ASCII)
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 _URL = re.compile(r"https?://[^\s\"<>]{1,500}")
-_DIGEST = re.compile(r"[0-9a-f]{64}")
-
-
-class PrivateTest(Record, frozen=True):
-    """The public description of a private test side, see ``private_test``."""
-
-    robots: int
-    """Number of private robots."""
-    grammars: dict[str, str]
-    """Hash of each grammar that they are drawn from, by its name."""
-    commitment: str
-    """SHA-256 of secret, description and hashes of the robots, hexadecimal."""
-
-    def __post_init__(self) -> None:
-        if self.robots < 1 or not self.grammars or not _DIGEST.fullmatch(self.commitment):
-            raise ValueError("expected robots, grammars, and a commitment of 64 hexadecimal digits")
 
 
 class Release(Record, frozen=True):
@@ -87,7 +71,6 @@ class Release(Record, frozen=True):
     """Address of the release; empty if it is not given."""
     difficulty: dict[str, Any] = msgspec.field(default_factory=dict)
     """Cosine similarity of test and train robots, and the nearest train robot by each measure."""
-    private_test: PrivateTest | None = None
 
     def __post_init__(self) -> None:
         if self.format != FORMAT:

@@ -225,7 +225,7 @@ Without morphgen: `datasets.load_dataset("json", data_files="{robots}")`,
 ## Difficulty
 
 {difficulty}
-{private}
+
 ## Licences
 
 {licences}
@@ -262,7 +262,6 @@ def card_text(
         sums=SUMS_FILE,
         evaluation=_evaluation(release),
         difficulty=_difficulty(release, rows),
-        private=_private(release),
         licences=_licence_summary(parts),
         citation=citation(split, release),
     )
@@ -364,18 +363,6 @@ def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
         f"{high:.2f}). `{DIFFICULTY_FILE}` has a row per robot, train robots too.{more} Nearest: "
         f"the most similar train robot and its value by each measure{scores}.\n\n"
         f"{difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
-    )
-
-
-def _private(release: Release) -> str:
-    if release.private_test is None:
-        return ""
-    private = release.private_test
-    return (
-        "\n## Private test side\n\n"
-        f"{private.robots} more test robots were drawn from {', '.join(private.grammars)} with a "
-        f"secret. Its commitment is `{private.commitment}`. Once the secret is published, "
-        "`morphgen split reveal` draws the robots again and verifies them.\n"
     )
 
 

@@ -16,7 +16,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Command, Option, command, flag, number, option, path_option
 from morphgen.cli.progress import bar, status
 from morphgen.cli.split_new import new
-from morphgen.cli.split_release import release, reveal, score
+from morphgen.cli.split_release import release, score
 from morphgen.errors import BenchmarkError, GrammarError, PartError
 from morphgen.tasks.registry import TASKS
 
@@ -696,8 +696,6 @@ def _stats_row(
 split = Command(
     "split",
     "list, make, audit, build, release and score splits of train and test robots",
-    commands=(
-        *(list_splits, show, new, audit, build, verify, stats, difficulty, release, score, reveal),
-    ),
+    commands=(*(list_splits, show, new, audit, build, verify, stats, difficulty, release, score),),
     details="A split is a YAML file with the robots to train on and those to test on.",
 )

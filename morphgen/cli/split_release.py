@@ -1,4 +1,4 @@
-"""``morphgen split release`` and ``reveal``: publish a split, and its private test side later."""
+"""``morphgen split release`` and ``score``: publish a split, and rank submissions to it."""
 
 from __future__ import annotations
 
@@ -58,12 +58,6 @@ if TYPE_CHECKING:
     number("--episodes", "least number of episodes per robot of a submission (default: 34)"),
     flag("--light", "write the URDF and the derivation of robots only, without meshes"),
     flag("--no-goals", "ship no goal sets"),
-    number("--private-test", "number of further test robots that are drawn with a secret"),
-    path_option(
-        "--secret-file",
-        "FILE",
-        "with --private-test: file of the secret, which is made if it does not exist",
-    ),
     *opt.JOBS_LIBRARY_JSON,
     details="The archive holds the built split, goal sets, licences of all parts, a Croissant "
     "description, a dataset card, the difficulty of every robot, reference scores and SHA-256 of "
@@ -73,22 +67,16 @@ if TYPE_CHECKING:
     examples=(
         "split release interpolation/arm3/reach --version 1.0.0 --date 2027-01-31",
         "split release extrapolation/arms/reach --licence-allow CC-BY-NC-ND-4.0",
-        "split release my_split.yaml --private-test 5 --secret-file secret.txt",
     ),
 )
 def release(args: argparse.Namespace) -> None:
     """Make a release and print where it is."""
-    from morphgen.benchmark.private_test import make_secret, test_grammars
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import BuildSettings
     from morphgen.formats.files import require_writable_folder
     from morphgen.tasks.goals.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
     from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
 
-    if (args.private_test is None) != (args.secret_file is None):
-        raise BenchmarkError(
-            "--private-test and --secret-file: a private test side needs both; give both or none"
-        )
     require_writable_folder(args.out)
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
@@ -103,10 +91,6 @@ def release(args: argparse.Namespace) -> None:
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), submitted_results(references)
-    if args.private_test:
-        test_grammars(split, library)  # refuses other splits before a secret is made
-    is_new_secret = args.secret_file is not None and not args.secret_file.exists()
-    before = _archives(args.out)
     request = ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -118,26 +102,18 @@ def release(args: argparse.Namespace) -> None:
         protocol=protocol,
         goals=not args.no_goals,
         settings=BuildSettings(light=args.light),
-        private_robots=args.private_test or 0,
-        secret=make_secret(args.secret_file) if args.secret_file else "",
     )
-    try:
-        with bar(args, "releasing") as update:
-            report = release_split(
-                split,
-                args.out,
-                library,
-                request,
-                extra=extra,
-                results=results,
-                jobs=args.jobs,
-                progress=update,
-            )
-    except BaseException:  # an interrupt, too, which may come after the archive was written
-        if is_new_secret and _archives(args.out) == before:  # no release needs the new secret
-            args.secret_file.unlink(missing_ok=True)
-        raise
-    private = report.release.private_test
+    with bar(args, "releasing") as update:
+        report = release_split(
+            split,
+            args.out,
+            library,
+            request,
+            extra=extra,
+            results=results,
+            jobs=args.jobs,
+            progress=update,
+        )
     notes = _notes(args, split, extra)
     data = {
         "archive": str(report.archive),
@@ -145,7 +121,6 @@ def release(args: argparse.Namespace) -> None:
         "content": report.content,
         "files": report.files,
         "bytes": report.size,
-        "commitment": private.commitment if private else None,
         "notes": notes,
     }
     lines = [
@@ -153,19 +128,9 @@ def release(args: argparse.Namespace) -> None:
         f"  sha256: {report.sha256}",
         f"  content: {report.content}",
     ]
-    if private is not None:
-        lines += [
-            f"  private test side: {private.robots} robots, commitment {private.commitment}",
-            f"  keep {args.secret_file} secret until you reveal them; without it they are lost",
-        ]
     lines += [f"  note: {note}" for note in notes]
     lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
     opt.print_result(args, data, lambda: "\n".join(lines))
-
-
-def _archives(out: Path) -> set[Path]:
-    """Return the archives in a folder, which may not exist."""
-    return set(out.glob("*.zip"))
 
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
@@ -187,40 +152,6 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
     if not args.date:
         notes.append("no --date: dataset tools recommend a date of publication")
     return notes
-
-
-@command(
-    "reveal",
-    "draw the private test robots of a release again, and verify its commitment",
-    path_option("release", "RELEASE", "archive of the release, or its folder"),
-    option("--secret-file", type=Path, required=True, metavar="FILE", help="file of the secret"),
-    path_option("--out", "DIR", "folder of the split's file", default=Path()),
-    *opt.LIBRARY_JSON,
-    details="Writes a split with the train robots of the release, whose test side are the private "
-    "robots. A secret that does not give the robots that the release committed to is refused.",
-    examples=("split reveal releases/my-split-1.0.0.zip --secret-file secret.txt",),
-)
-def reveal(args: argparse.Namespace) -> None:
-    """Reveal a private test side and print the split's file."""
-    from morphgen.benchmark.private_test import read_secret, reveal
-    from morphgen.benchmark.release_file import opened_folder, read_release
-    from morphgen.benchmark.split_file import read_split, write_new_splits
-    from morphgen.benchmark.split_folder import SPLIT_FILE
-
-    secret = read_secret(args.secret_file)
-    with opened_folder(args.release) as folder:
-        described = read_release(folder)
-        split = read_split(folder / SPLIT_FILE)
-    private = reveal(split, described, secret, opt.library_of(args))
-    path = args.out / f"{private.name}.yaml"
-    write_new_splits([private], [path])
-    robots = [member.as_dict() for member in private.test]
-    lines = [
-        f"{path}: {len(private.test)} private test robots, as committed to by {described.stem}",
-        *(f"  {member.name}  {member.robot_hash}" for member in private.test),
-        f"next: morphgen split audit {path}",
-    ]
-    opt.print_result(args, {"file": str(path), "test": robots}, lambda: "\n".join(lines))
 
 
 @command(
@@ -309,7 +240,6 @@ def score(args: argparse.Namespace) -> None:
 def _shipped_split(name: str, where: Path) -> str:
     """Return the name of a split that comes with morphgen; a submission cannot name other files."""
     from morphgen.benchmark.split_file import split_names
-    from morphgen.errors import BenchmarkError
 
     if name not in split_names():
         raise BenchmarkError(

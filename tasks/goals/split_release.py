@@ -13,19 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from morphgen.benchmark.audit import Audit, audit, audit_survey
+from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.difficulty import BaselineResults, difficulty_csv, survey_difficulty
 from morphgen.benchmark.licences import licence_ids, licenced_parts, require_allowed
-from morphgen.benchmark.private_test import draw_private_test
 from morphgen.benchmark.release_file import (
     CROISSANT_FILE,
     DIFFICULTY_FILE,
     LICENCES_FILE,
     LICENCES_TEXT,
     RELEASE_FILE,
-    PrivateTest,
     Release,
     release_text,
 )
@@ -103,10 +99,6 @@ class ReleaseRequest:
     """Ship the goal set of every robot."""
     settings: BuildSettings = BUNDLED
     """Settings of the build."""
-    private_robots: int = 0
-    """Number of private test robots; 0 for no private test side."""
-    secret: str = field(default="", repr=False)
-    """Secret that the private robots are drawn with."""
 
 
 @dataclass(frozen=True)
@@ -144,14 +136,7 @@ def release_split(
     audited = audit_survey(survey, library)
     require_passed(audited)
     rows = survey_difficulty(survey, results)
-    private = None
-    if request.private_robots:
-        drawn, private = draw_private_test(
-            split, request.version, request.private_robots, request.secret, library
-        )
-        require_allowed(split, (*parts, *licenced_parts(drawn, library)), request.allowed_licences)
-        _require_fit(audit(drawn, library, jobs=jobs, progress=progress))
-    release = _release(split, request, _difficulty(survey, audited), private)
+    release = _release(split, request, _difficulty(survey, audited))
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(
@@ -196,22 +181,7 @@ def require_passed(result: Audit) -> None:
         )
 
 
-def _require_fit(result: Audit) -> None:
-    """Require that private robots pass the audit; the error does not describe them."""
-    if not result.passed():
-        codes = {each.code for each in result.findings if each.severity == "error"}
-        raise BenchmarkError(
-            f"the private test robots fail the audit of the split ({', '.join(sorted(codes))}); "
-            "name another --secret-file, so that others are drawn"
-        )
-
-
-def _release(
-    split: Split,
-    request: ReleaseRequest,
-    difficulty: Mapping[str, Any],
-    private: PrivateTest | None = None,
-) -> Release:
+def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any]) -> Release:
     data = {
         "name": split.name,
         "id": split_id(split),
@@ -222,7 +192,6 @@ def _release(
         "url": request.url,
         "evaluation": request.protocol.as_data(split),
         "difficulty": dict(difficulty),
-        "private_test": None if private is None else msgspec.to_builtins(private),
     }
     return read_record(data, Release, "release", BenchmarkError)
 

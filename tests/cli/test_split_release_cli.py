@@ -1,4 +1,4 @@
-"""``morphgen split release``, ``score`` and ``reveal``, and ``eval --submission``."""
+"""``morphgen split release`` and ``score``, and ``eval --submission``."""
 
 import json
 import shutil
@@ -14,7 +14,6 @@ from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.grammar.library import default_library
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
-STICKS = ("split", "new", "interpolation", "--grammar", "stick", "--train", "4", "--name")
 RELEASE = ("split", "release", "--light", "--no-goals")
 
 
@@ -36,7 +35,6 @@ def test_release_prints_archive_and_hashes_and_passes_verify(run, small):
     code, out, _ = run(*RELEASE, small, "--version", "2.0.0", "--json")
     data = json.loads(out)
     assert (f"  sha256: {data['sha256']}", f"  content: {data['content']}") == (sha256, content)
-    assert data["commitment"] is None
     assert [f"  note: {note}" for note in data["notes"]] == notes
     assert [note.partition(":")[0] for note in data["notes"]] == [
         "no reference scores",
@@ -72,13 +70,8 @@ def test_a_tampered_archive_fails_verify_and_ranks_nothing(run, refused, small):
         (("extrapolation/arms/reach",), "--licence-allow CC-BY-NC-ND-4.0"),
         (("interpolation/arm3/reach", "--licence-allow", "GPL"), "no part of interpolation/arm3"),
         (("interpolation/arm3/reach", "--version", "1"), "expected one such as 1.0.0"),
-        (("interpolation/arm3/reach", "--private-test", "2"), "a private test side needs both"),
         (("interpolation/arm3/reach", "--sim", "kinematic"), "no simulator with contacts"),
         (("interpolation/arm3/reach", "--scores", "none.json"), "none.json: no such file"),
-        (
-            ("composition/ee-task", "--private-test", "2", "--secret-file", "s"),
-            "its test robots are not drawn from grammars",
-        ),
     ],
 )
 def test_release_refuses(refused, words, why):
@@ -93,71 +86,6 @@ def test_a_restricted_licence_is_released_when_it_is_allowed(run):
     card = Path("composition-ee-arm-reach-1.0.0/README.md").read_text()
     assert "- cc-by-nc-nd-4.0\n" in card
     assert "**sake_ez is CC-BY-NC-ND-4.0 (non-commercial, no derivatives)**: robots ur5-ez" in card
-
-
-def test_a_private_test_side_is_revealed_with_its_secret(run, refused):
-    run(*STICKS, "my/sticks")
-    secret = ("--secret-file", "secret.txt")
-    code, out, err = run(*RELEASE, "my/sticks.yaml", "--private-test", "3", *secret)
-    assert (code, err) == (0, "")
-    text = Path("secret.txt").read_text().strip()
-    assert text not in out
-    archive = "releases/my-sticks-1.0.0.zip"
-    shutil.unpack_archive(archive, ".")
-    files = [path for path in Path("my-sticks-1.0.0").rglob("*") if path.is_file()]
-    code, out, err = run("split", "reveal", archive, *secret)
-    assert (code, err) == (0, "")
-    private = read_split("my/sticks-private.yaml")
-    assert len(private.test) == 3
-    contents = b"".join(path.read_bytes() for path in files)
-    for robot in private.test:
-        assert robot.robot_hash.encode() not in contents
-        assert robot.derivation.encode() not in contents
-    assert text.encode() not in contents
-    assert run("split", "audit", "my/sticks-private.yaml")[0] == 0
-    assert run("split", "reveal", "my-sticks-1.0.0", *secret)[0] == 0  # the folder, too
-    Path("secret.txt").write_text("5a" * 32)
-    err = refused("split", "reveal", archive, *secret)
-    assert "this secret does not give the robots that the release committed to" in err
-    assert "5a5a" not in err
-
-
-def test_a_release_that_is_refused_leaves_no_new_secret_and_keeps_an_old_one(run, refused):
-    run(*STICKS, "my/sticks")
-    words = ("my/sticks.yaml", "--private-test", "2", "--secret-file")
-    assert run(*RELEASE, *words, "secret.txt")[0] == 0
-    refused(*RELEASE, *words, "new.txt")  # the version is released, with other private robots
-    assert not Path("new.txt").exists()
-    old = Path("old.txt")
-    old.write_text("5a" * 32)
-    old.chmod(0o600)
-    refused(*RELEASE, *words, "old.txt")
-    assert old.read_text() == "5a" * 32
-
-
-@pytest.mark.parametrize("published", [True, False])
-def test_an_interrupt_keeps_the_secret_of_a_release_that_was_written(run, monkeypatch, published):
-    def interrupted(split, out, *args, **options):
-        if published:
-            out.mkdir()
-            (out / "my-sticks-1.0.0.zip").touch()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("morphgen.tasks.goals.split_release.release_split", interrupted)
-    run(*STICKS, "my/sticks")
-    words = ("my/sticks.yaml", "--private-test", "2", "--secret-file", "new.txt")
-    assert run(*RELEASE, *words)[0] != 0
-    assert Path("new.txt").exists() == published
-
-
-def test_reveal_refuses_releases_without_a_private_side(run, refused, small):
-    run(*RELEASE, small)
-    Path("secret.txt").write_text("5a" * 32)
-    words = ("releases/mine-small-1.0.0.zip", "--secret-file", "secret.txt")
-    assert "has no private test side" in refused("split", "reveal", *words)
-    run("split", "build", small, "--light")
-    words = ("data/mine/small", "--secret-file", "secret.txt")
-    assert "is no release: it has no release.json" in refused("split", "reveal", *words)
 
 
 def test_show_stats_and_build_name_restricted_parts(run):

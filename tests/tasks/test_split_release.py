@@ -79,7 +79,6 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
     )
     assert release.evaluation == EvalProtocol().as_data(combined())
     assert set(release.difficulty["nearest"]) == {"planar-plane"}
-    assert release.private_test is None
     _, front, text = (folder / "README.md").read_text().split("---\n", 2)
     card = yaml.safe_load(front)
     assert (card["license"], card["size_categories"]) == ("mit", ["n<1K"])
