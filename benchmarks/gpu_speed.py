@@ -34,12 +34,11 @@ from tabulate import tabulate
 from morphgen.benchmark.split_file import read_split
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
-from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES, CollisionGeometry
 from morphgen.tasks.sim.warp_sim import Group, WarpSimulation
-from morphgen.tasks.step_graph import StepGraph
 
 SPLITS = (
     "interpolation/arm3/reach",

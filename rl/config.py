@@ -11,8 +11,8 @@ import msgspec
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.channels import CHANNELS
 from morphgen.tasks.observation import observation_config
+from morphgen.tasks.registry import CHANNELS
 
 MAX_NUM_STEPS = 16_384
 """Largest rollout length per environment; a rollout is held in memory."""
@@ -34,7 +34,7 @@ class PolicyConfig:
     tool_position: bool = False
     """Show the tool's position to the networks (ours; the paper's policies have to infer it)."""
     observe: tuple[str, ...] = ()
-    """Further observation channels, of ``morphgen.tasks.channels.CHANNELS``, in that order."""
+    """Further observation channels, of ``morphgen.tasks.registry.CHANNELS``, in that order."""
     normalize: bool = False
     """Normalize the kinematic channels by their running means and variances."""
     residual: bool = False

@@ -12,9 +12,8 @@ from torch.nn import functional
 
 from morphgen.errors import TaskError
 from morphgen.tasks.actions import BINS
-from morphgen.tasks.channels import KINEMATIC_CHANNELS
 from morphgen.tasks.observation import Observation
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS
 from morphgen.tasks.task import STANDARD_FIELDS
 
 MIN_LOG_STD, MAX_LOG_STD, INITIAL_LOG_STD = -4.0, 0.5, -0.7

@@ -33,10 +33,9 @@ from morphgen.rl.distributed import (
 )
 from morphgen.rl.observation_layout import joint_entropy, layout_of, pad_links, truncate_links
 from morphgen.rl.policies import entries_unneeded, make_networks, rows_needed
-from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.host import is_host
+from morphgen.tasks.batch import StepGraph, TaskBatch, can_record
 from morphgen.tasks.observation import Observation
-from morphgen.tasks.step_graph import StepGraph, can_record
+from morphgen.tasks.sim.base import is_host
 
 
 def gae(

@@ -11,9 +11,8 @@ import torch
 
 from morphgen.processes import one_torch_thread
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.host import is_host
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
 
 STEPS_UNREAD = 32
 """Number of control steps after which the results on a GPU are read."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.host import is_host
+from morphgen.tasks.sim.base import is_host
 
 if TYPE_CHECKING:
     from morphgen.tasks.scenes.robot_tables import RobotTables

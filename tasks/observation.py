@@ -10,7 +10,7 @@ import torch
 
 from morphgen.benchmark.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
-from morphgen.tasks.channels import CHANNELS, KINEMATIC_CHANNELS
+from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Scene
 

@@ -15,7 +15,7 @@ from enum import IntEnum
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.host import is_host
+from morphgen.tasks.sim.base import is_host
 
 MAX_SEED = 2**64 - 1
 """Largest seed."""

@@ -1,4 +1,7 @@
-"""Tasks and simulators by name: morphgen's own, and those of other packages."""
+"""Tasks and simulators by name: morphgen's own, and those of other packages.
+
+It also has the names of the observation channels, for it loads neither torch nor NumPy.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,14 @@ from morphgen.errors import MissingDependencyError, TaskError, nearest
 if TYPE_CHECKING:
     from morphgen.tasks.sim.base import Simulator
     from morphgen.tasks.task import Task
+
+KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik")
+"""Channels of ``kinematic_channels``, in the order in which networks concatenate them."""
+CHANNELS = (
+    *KINEMATIC_CHANNELS,
+    *("velocity", "previous_action", "tree", "points", "no_state"),
+)
+"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
 
 
 class Named(Protocol):

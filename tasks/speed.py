@@ -12,8 +12,7 @@ import torch
 
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.host import is_host
-from morphgen.tasks.sim.base import SUBSTEPS
+from morphgen.tasks.sim.base import SUBSTEPS, is_host
 
 WARM_UP = 20
 """Number of control steps before the measurement."""

@@ -15,8 +15,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import ToolTargets
 from morphgen.tasks.random_numbers import EpisodeRandom
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.step_result import StepResult, TaskState
-from morphgen.tasks.task import STANDARD_FIELDS, EnvSpec, Task, TaskEnvs
+from morphgen.tasks.task import STANDARD_FIELDS, EnvSpec, StepResult, Task, TaskEnvs, TaskState
 from morphgen.typing import Array
 
 

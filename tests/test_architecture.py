@@ -160,7 +160,7 @@ def test_importing_the_checks_loads_no_simulator():
 
 @needs_pybullet
 def test_pybullet_processes_load_few_packages():
-    loaded = modules_after("import morphgen.tasks.sim.bullet_workers")
+    loaded = modules_after("import morphgen.tasks.sim.bullet_batch")
     assert "pybullet" in loaded
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
 

@@ -19,8 +19,7 @@ from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.runs.presets import PRESETS, preset_of
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
-from morphgen.tasks.channels import CHANNELS
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.registry import CHANNELS, DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
 
 if TYPE_CHECKING:

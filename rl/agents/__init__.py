@@ -60,7 +60,7 @@ class Agent:
     any_size: bool = False
     """Whether no weight belongs to the number of a link, so that a policy acts on larger robots."""
     channels: tuple[str, ...] = ()
-    """Observation channels that the networks need, of ``morphgen.tasks.channels.CHANNELS``."""
+    """Observation channels that the networks need, of ``morphgen.tasks.registry.CHANNELS``."""
 
     @property
     def config(self) -> type[NetworkConfig]:

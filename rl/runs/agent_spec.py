@@ -12,8 +12,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
 from morphgen.rl.aliases import current_name
 from morphgen.rl.config import NUMBERS, PolicyConfig, PPOConfig
-from morphgen.tasks.channels import CHANNELS
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import CHANNELS, TASKS
 
 OBSERVATION_SWITCHES = tuple(name.replace("_", "-") for name in CHANNELS)
 """Names of observation channels on the command line."""

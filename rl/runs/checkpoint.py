@@ -33,8 +33,8 @@ from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles,
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.scenes.collision_geometry import require_geometry
 from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs, task_configs
+from morphgen.tasks.scenes.make import require_geometry
 from morphgen.tasks.sim.base import CollisionGeometry
 from morphgen.tasks.task import TaskConfig
 

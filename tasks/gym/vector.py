@@ -24,9 +24,8 @@ from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.robot import Robot
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.channels import KINEMATIC_CHANNELS
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.registry import register_gym_envs
+from morphgen.tasks.registry import KINEMATIC_CHANNELS, register_gym_envs
 from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch

@@ -11,15 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals.goal_choices import GoalChoices
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet, require_pushable
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reset_options import unit_quaternion
-from morphgen.tasks.rows import choose, padded_rows, positive_part, row_norms
-from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
-from morphgen.tasks.task import EnvSpec, TaskEnvs
+from morphgen.tasks.rows import GoalChoices, choose, padded_rows, positive_part, row_norms
+from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
 from morphgen.typing import Array
 
 GAP = 0.05
@@ -103,7 +101,7 @@ class PushEnvs(TaskEnvs):
         token: NDArray[np.float32] = box_tokens(torch.zeros(7), self._size[row]).numpy()
 
         def evaluate(state: TaskState) -> StepResult:
-            return evaluate_push(self._config, cast(torch.Tensor, line[0]), state)
+            return evaluate_push(self._config, cast("torch.Tensor", line[0]), state)
 
         def observe(block_pose: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
             block = token.copy()

@@ -12,18 +12,22 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
+from morphgen.model.inverse_kinematics import solve_pose_ik, solve_position_ik
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
+from morphgen.model.robot import TOOL
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals.goal_choices import GoalChoices
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.goals import reachable_configuration
 from morphgen.tasks.reset_options import unit_quaternion
-from morphgen.tasks.rows import choose, padded_rows, row_norms
-from morphgen.tasks.step_result import NumpyRow, StepResult, TaskState
-from morphgen.tasks.task import EnvSpec, TaskEnvs
+from morphgen.tasks.rows import GoalChoices, choose, padded_rows, row_norms
+from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
 from morphgen.typing import Array
+
+_STARTS, _ITERATIONS = 32, 60
+"""Number of configurations from which inverse kinematics starts, and of its iterations."""
+_ARRIVED = 1e-3
+"""Largest distance of a tool from a goal that it reaches [m, and of rotation matrices]."""
 
 
 class ReachEnvs(TaskEnvs):
@@ -83,7 +87,7 @@ class ReachEnvs(TaskEnvs):
         if len(wanted) == 7:
             wanted = np.concatenate([wanted[:3], unit_quaternion(wanted[3:], "goal")])
         robot = space.scene.robot
-        found = reachable_configuration(
+        found = _reachable_configuration(
             space,
             wanted,
             self._q[self._env_spec_index[row], :, : robot.dof].cpu().double().numpy(),
@@ -128,12 +132,37 @@ class ReachEnvs(TaskEnvs):
         if self.needs_tool_rotation:
             return None
         goal: NDArray[np.float32] = self.goal[row].numpy()
-        evaluate = partial(evaluate_reach, self._config, cast(torch.Tensor, goal))
+        evaluate = partial(evaluate_reach, self._config, cast("torch.Tensor", goal))
         return NumpyRow(evaluate, lambda block_pose: {"goal": goal.copy()})
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
         return {"goal": np.array(self.goal[row].cpu().numpy())}
+
+
+def _reachable_configuration(
+    space: FreeSpace, goal: Array, starts: Array, *, with_rotation: bool
+) -> Array | None:
+    """Return a free configuration that brings the tool to a goal, or None if none was found.
+
+    goal: Position, shape (3,), or pose, shape (7,).
+    starts: Configurations from which inverse kinematics starts, shape (n, dof).
+    """
+    robot = space.scene.robot
+    tools = frame_pose(robot, starts, TOOL)[:, :3, 3]
+    nearest = np.argsort(np.linalg.norm(tools - goal[:3], axis=1), kind="stable")[:_STARTS]
+    if with_rotation:
+        T_root_goal = Pose(tuple(goal[:3]), tuple(goal[3:])).matrix
+        q = np.array([solve_pose_ik(robot, T_root_goal, start) for start in starts[nearest]])
+        error = np.abs(frame_pose(robot, q, TOOL) - T_root_goal).max(axis=(1, 2))
+    else:
+        q, errors = solve_position_ik(
+            robot, starts[nearest], np.tile(goal[:3], (len(nearest), 1)), iterations=_ITERATIONS
+        )
+        error = np.linalg.norm(errors, axis=1)
+    arrived = np.flatnonzero(error < _ARRIVED)
+    free = arrived[space.free(q[arrived])]
+    return q[free[0]] if len(free) else None
 
 
 def evaluate_reach(

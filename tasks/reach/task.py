@@ -1,24 +1,186 @@
-"""The task reach."""
+"""The task reach and its goal sets: tool poses, each with a configuration that reaches it.
+
+The configurations are also the starts of episodes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import shoulder
-from morphgen.model.robot import Robot
+from morphgen.errors import TaskError
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import frame_pose
+from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.free_space import (
+    FreeSpace,
+    cspace_components,
+    in_other_component,
+    outside_limits,
+)
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.goals import ReachGoalSet, certify_goals, sample_goals
-from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.scenes.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
+from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GOAL, EnvSpec, Marker, Task
+from morphgen.typing import Array
 
 if TYPE_CHECKING:
     import torch
 
     from morphgen.tasks.reach.envs import ReachEnvs
+
+
+EXACT = 1e-6
+"""Tolerance between a goal and the tool pose of its configuration [m, and of quaternions]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReachGoalSet:
+    """Goals of a robot, which are also its starts, and its obstacles."""
+
+    start_belongs_to_goal: ClassVar[bool] = False
+    not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
+
+    robot: str
+    key: str
+    """Hash of everything that the set depends on: 64 hexadecimal digits."""
+    q: Array
+    """Configurations in the main component of C-space, shape (G, dof) [rad or m]: free without
+    obstacles."""
+    poses: Array
+    """Tool poses of the configurations in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0,
+    shape (G, 7)."""
+    obstacles: tuple[Block, ...]
+    """Boxes at the poses of the first layout."""
+    layouts: Array
+    """Poses of the boxes in each layout, those for training first, shape (L, O, 7)."""
+    usable: NDArray[np.bool_]
+    """Which configurations are free in each layout, shape (L, G)."""
+    tried: int
+    """Number of tested random configurations."""
+    accepted: int
+    """Number of configurations that became goals: G."""
+    seed: int
+
+    @property
+    def goal_poses(self) -> Array:
+        """Poses of the tool, shape (G, 7)."""
+        return self.poses
+
+
+def sample_goals(
+    robot: Robot,
+    config: ReachConfig,
+    *,
+    obstacles: bool,
+    ground: float,
+    seeds: np.random.SeedSequence,
+    identity: Mapping[str, Any],
+) -> ReachGoalSet:
+    """Sample a robot's goal set; see ``Task.sample``.
+
+    Configurations are uniform within the joint limits. Those that collide, also with the ground,
+    and those outside of the main component of free C-space (``free_space``) are drawn again.
+    Obstacles do not matter: each of their layouts leaves some of the configurations free.
+    """
+    goals_seeds, obstacle_seeds = seeds.spawn(2)
+    goals_rng = np.random.default_rng(goals_seeds)
+    space = FreeSpace(Scene(robot, ground=ground))
+    planes = cspace_components(robot)
+    q, tried = space.sample(
+        config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
+    )
+    poses = _pose_rows(frame_pose(robot, q, TOOL))
+    moved = float(np.linalg.norm(poses[:, :3] - poses[0, :3], axis=1).max())
+    if moved <= config.near and len(poses) > 1:
+        raise TaskError(
+            f"robot {robot.name!r} cannot reach: over {len(poses)} configurations its tool moves "
+            f"{moved:.2g} m, and a goal is reached within {config.near:g} m; place the frame "
+            f"{TOOL!r} at the working point"
+        )
+    boxes: tuple[Block, ...] = ()
+    layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
+    if obstacles:
+        size_seeds, layout_seeds = obstacle_seeds.spawn(2)
+        count, size = config.obstacles, config.obstacle_size
+        boxes = draw_boxes(robot, count, size, np.random.default_rng(size_seeds))
+        layouts, usable = draw_layouts(
+            FreeSpace(Scene(robot, obstacles=boxes, ground=ground)),
+            (config.train_layouts, config.eval_layouts),
+            layout_seeds,
+            lambda space: space.free(q),
+        )
+        boxes = place_boxes(boxes, layouts[0])
+    return ReachGoalSet(
+        q=q,
+        poses=poses,
+        obstacles=boxes,
+        layouts=layouts,
+        usable=usable,
+        tried=tried,
+        accepted=len(q),
+        **identity,
+    )
+
+
+def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
+    """Test that every goal is reachable.
+
+    Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
+
+    Returns:
+        Faults, a line each: a configuration out of limits, in collision, in another component of
+        C-space, or whose tool is not at the goal; a set of another robot or other obstacles; see
+        also ``layout_faults``.
+    """
+    if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
+        return [
+            f"configurations {goals.q.shape} and poses {goals.poses.shape} are not goals of robot "
+            f"{robot.name!r} with {robot.dof} joints"
+        ]
+    faults = [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
+    rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+
+    def free_goals(space: FreeSpace) -> NDArray[np.bool_]:
+        """Return where a goal is free; those outside of all limits are faults already."""
+        free = np.ones(len(goals.q), dtype=np.bool_)
+        free[rows] = space.free(goals.q[rows])
+        return free
+
+    faults += layout_faults(goals, robot, scene, free_goals)
+    free = free_goals(FreeSpace(replace(scene, robot=robot, obstacles=())))
+    blocked = np.flatnonzero(~free).tolist()
+    faults += [f"goal {i}: its configuration is in collision" for i in blocked]
+    planes = cspace_components(robot)
+    for i in rows[free[rows]].tolist():
+        for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
+            a, b = planes[k].pairs[0]
+            faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
+    tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[rows]))
+    for i, tool in zip(rows.tolist(), tools, strict=True):
+        pose = goals.poses[i]
+        distance = float(np.linalg.norm(pose[:3] - tool[:3]))
+        # A quaternion and its negative are the same rotation.
+        rotation = min(float(np.linalg.norm(pose[3:] - sign * tool[3:])) for sign in (1, -1))
+        if not (distance <= EXACT and rotation <= EXACT):
+            faults.append(
+                f"goal {i}: the tool of its configuration is {distance:.2g} m away, and its "
+                f"quaternion {rotation:.2g}"
+            )
+    return faults
+
+
+def _pose_rows(T: Array) -> Array:
+    """Return poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
+    poses = [Pose.from_matrix(matrix) for matrix in T]
+    return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)
+
 
 MAX_DISTANCE = 3.0
 """Bound on the distance between tool and goal in reaches: each is within one, and a reach is an

@@ -1,8 +1,12 @@
-"""Batches of environments from robots, a split or specifications, in one call."""
+"""Batches of environments from robots, a split or specifications, in one call.
+
+The simulated robots collide as their primitives, one primitive for each link, or convex pieces.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
@@ -13,8 +17,16 @@ from morphgen.arguments import whole_number
 from morphgen.benchmark.split import Side, Split
 from morphgen.benchmark.tokens import default_max_links
 from morphgen.errors import TaskError, nearest
-from morphgen.grammar.library import LibraryFolders, default_library, library_folders
+from morphgen.extras import explain_missing_extras
+from morphgen.fitting.convex_pieces import as_convex
+from morphgen.fitting.replace_collision import with_primitives
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.rounding import as_written
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import Library, LibraryFolders, default_library, library_folders
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
+from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
@@ -23,15 +35,68 @@ from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.random_numbers import require_seed
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, installed_simulators
-from morphgen.tasks.scenes.collision_geometry import require_geometry, with_geometry
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
-from morphgen.tasks.sim.base import CollisionGeometry, Contacts, Simulator
+from morphgen.tasks.sim.base import (
+    COLLISION_GEOMETRIES,
+    CollisionGeometry,
+    Contacts,
+    Scene,
+    Simulator,
+)
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+
+def require_geometry(geometry: str) -> None:
+    """Require the name of a collision geometry."""
+    if geometry not in COLLISION_GEOMETRIES:
+        raise TaskError(
+            f"unknown collision geometry {geometry!r}{nearest(geometry, COLLISION_GEOMETRIES)}"
+        )
+
+
+@explain_missing_extras()
+def with_geometry(
+    scenes: Sequence[Scene], geometry: CollisionGeometry, folders: Sequence[Path] = ()
+) -> list[Scene]:
+    """Return scenes whose robots have the collision shapes of a geometry.
+
+    Masses and joints stay. Pairs of links that overlap with the new shapes wherever the
+    joints are, or at the home pose, do not collide.
+    """
+    if geometry == "primitive":
+        return list(scenes)
+    robots: dict[int, Robot] = {}
+    for scene in scenes:
+        if id(scene.robot) not in robots:
+            change = _light if geometry == "light" else _convex
+            robots[id(scene.robot)] = change(scene.robot, folders)
+    return [replace(scene, robot=robots[id(scene.robot)]) for scene in scenes]
+
+
+def _light(robot: Robot, folders: Sequence[Path]) -> Robot:
+    """Return the robot with the primitive of each link's token."""
+    shapes = token_shapes(robot, folders)
+    return with_primitives(robot, {name: (shape,) for name, shape in shapes.items()})
+
+
+def _convex(robot: Robot, folders: Sequence[Path]) -> Robot:
+    """Return the robot with the convex pieces of the meshes that its primitives were fitted to."""
+    if not robot.fits:  # it never had meshes
+        return robot
+    text = robot.provenance.get("derivation")
+    composed = compose(parse_derivation(str(text)), Library(folders), robot.name) if text else None
+    if composed is None or as_written(composed).joints != robot.joints:
+        raise TaskError(
+            f"robot {robot.name!r}: collision geometry 'convex' needs its meshes, which only a "
+            "robot that morphgen composes finds again; expected 'primitive' or 'light'"
+        )
+    return as_written(as_convex(composed, folders))
+
 
 T = TypeVar("T")
 

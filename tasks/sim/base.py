@@ -26,6 +26,18 @@ one that its token describes, which overlaps them most; fewer shapes take less t
 convex pieces of the meshes, which are closest to them and take more time."""
 COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 
+HOST_DEVICES = ("cpu",)
+"""Types of devices whose tensors the processor reads without waiting.
+
+Reading a tensor of a GPU waits for all of its work. Steps of a batch therefore read none, but on
+a host device they may look at a tensor to skip work that changes nothing.
+"""
+
+
+def is_host(device: torch.device) -> bool:
+    """Return whether the processor reads tensors of a device without waiting."""
+    return device.type in HOST_DEVICES
+
 
 @dataclass(frozen=True)
 class Block:

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
-from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, Share
-from morphgen.tasks.sim.bullet_workers import (
+from morphgen.tasks.sim.bullet_batch import (
     STEP,
+    BulletBatch,
+    ExportedRobot,
+    Float32,
+    Share,
     SharedBuffers,
     Worker,
     end,

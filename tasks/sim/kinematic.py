@@ -10,11 +10,11 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
-from morphgen.tasks.host import is_host
 from morphgen.tasks.sim.base import (
     Contacts,
     Scene,
     Simulator,
+    is_host,
     require_reset_shapes,
 )
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from morphgen.tasks import host
+from morphgen.tasks.sim import base
 
 READS = (
     "aten::_local_scalar_dense",  # item, int, float, bool
@@ -52,7 +52,7 @@ class DeviceReads(TorchDispatchMode):
 def device_reads():
     """Yield a record of what would wait for a GPU, and treat the CPU as one."""
     with pytest.MonkeyPatch.context() as patch, DeviceReads() as reads:
-        patch.setattr(host, "HOST_DEVICES", ())
+        patch.setattr(base, "HOST_DEVICES", ())
 
         def recorded(name, method):
             def call(*args, **kwargs):

@@ -8,10 +8,10 @@ from helpers.goal_sets import draw_spec
 from helpers.learners import learner
 from helpers.scenes import robot
 from morphgen.rl.ppo import FinalObservations
-from morphgen.tasks import host
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.sim import base
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=5)
 
@@ -26,7 +26,7 @@ def reads_of_a_rollout(spec, agent, discrete, num_steps):
     observe = ObservationConfig(velocity=True, jacobian=True, dls=True, tree=True)
     kind = "discrete" if discrete else "continuous"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(host, "HOST_DEVICES", ())
+        patch.setattr(base, "HOST_DEVICES", ())
         batch = batch_from_specs([spec], 8, sim="kinematic", kind=kind, observe=observe)
         student = learner(batch, agent=agent, discrete=discrete, num_steps=num_steps)
         student._collect_rollout()
@@ -58,7 +58,7 @@ def test_final_observations_are_the_same_on_every_device(monkeypatch):
         return finals.gather()
 
     on_host = gathered()
-    monkeypatch.setattr(host, "HOST_DEVICES", ())
+    monkeypatch.setattr(base, "HOST_DEVICES", ())
     elsewhere = gathered()
     assert torch.equal(on_host["goal"], values[masks])
     assert all(torch.equal(on_host[name], elsewhere[name]) for name in on_host)

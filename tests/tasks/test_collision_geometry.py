@@ -10,8 +10,7 @@ from morphgen.errors import TaskError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import has_meshes
 from morphgen.grammar.library import default_library
-from morphgen.tasks.scenes.collision_geometry import with_geometry
-from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.scenes.make import make_batch, with_geometry
 from morphgen.tasks.sim.base import Scene
 
 PANDA = "arm=panda ee=panda_hand"

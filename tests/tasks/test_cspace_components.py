@@ -15,7 +15,7 @@ from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Link
 from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.goals import certify_goals
+from morphgen.tasks.reach.task import certify_goals
 from morphgen.tasks.sim.base import Scene
 
 ACROSS = ((0.5, 0.0), (0.12, 6.0))

@@ -12,13 +12,13 @@ from helpers.stub_simulation import StubSimulation
 from morphgen.errors import TaskError
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.rollouts import STEPS_UNREAD, run_episodes
-from morphgen.tasks import host
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
+from morphgen.tasks.sim import base
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=9, train_layouts=3, eval_layouts=1)
 PUSH = PushConfig(num_goals=6, max_episode_steps=11, train_layouts=3, eval_layouts=1)
@@ -205,7 +205,7 @@ def test_skipping_what_changes_nothing_changes_no_bit(specs, names, monkeypatch)
         batch.reset(spread=True)
     numbers = drive(skipping, 60)
     with monkeypatch.context() as patch:
-        patch.setattr(host, "HOST_DEVICES", ())
+        patch.setattr(base, "HOST_DEVICES", ())
         require_equal(numbers, drive(complete, 60))
     assert (numbers["truncated"] | numbers["terminated"]).any(dim=0).all()
     assert numbers["diverged"].any(dim=0).any()
@@ -248,7 +248,7 @@ def test_steps_and_resets_read_no_tensor(specs, names):
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_steps_of_the_kinematic_simulation_read_no_tensor(specs, kind, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(host, "HOST_DEVICES", ())  # the simulation asks once
+        patch.setattr(base, "HOST_DEVICES", ())  # the simulation asks once
         batch = batch_from_specs([specs["reach"]], 4, sim="kinematic", kind=kind)
         batch.reset()
         rest = Zero().act(batch)

@@ -20,8 +20,8 @@ from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals import goal_sets
-from morphgen.tasks.reach import goals as module
-from morphgen.tasks.reach.goals import certify_goals
+from morphgen.tasks.reach import task as module
+from morphgen.tasks.reach.task import certify_goals
 from morphgen.tasks.scenes.obstacles import (
     KEPT,
     draw_boxes,

@@ -11,12 +11,12 @@ from helpers.goal_sets import draw_spec
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, frame_jacobian
-from morphgen.tasks.channels import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.kinematic_channels import COLUMN_SCALE, POSITION_SCALE, ROTATION_SCALE
 from morphgen.tasks.observation import MAX_TREE_DISTANCE, NUM_POINTS, observation_config
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
+from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.task import TaskEnvs
 

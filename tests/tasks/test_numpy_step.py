@@ -9,8 +9,7 @@ import torch
 from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
-from morphgen.tasks.gym.env import TaskEnv
-from morphgen.tasks.gym.numpy_step import numpy_stepper
+from morphgen.tasks.gym.env import TaskEnv, numpy_stepper
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig

@@ -30,7 +30,7 @@ from morphgen.tasks.goals.split_goals import (
 )
 from morphgen.tasks.goals.split_goals import sample_split_goals as make
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach import goals as reach_goals
+from morphgen.tasks.reach import task as reach_goals
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig

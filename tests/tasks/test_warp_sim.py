@@ -21,10 +21,10 @@ from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: morphgen[gpu]")
 import warp as wp
 
+from morphgen.tasks.batch import StepGraph
 from morphgen.tasks.sim import warp_sim
 from morphgen.tasks.sim import warp_sim as warp_group
 from morphgen.tasks.sim.warp_sim import WarpSimulation, structures
-from morphgen.tasks.step_graph import StepGraph
 
 if not torch.cuda.is_available():  # kernels of a GPU are tested as users run them
     wp.config.optimization_level = 0  # on an empty cache, compiling takes longer than the tests
