@@ -24,10 +24,11 @@ from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.urdf.read import robot_from_xml
-from morphgen.formats.urdf.write import BOUND_MASS
+from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.dynamics import gravity_load, mass_matrix
+from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
-from morphgen.model.robot import TOOL, Frame, Robot
+from morphgen.model.robot import TOOL, Frame, Inertial, Joint, Link, Robot
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5
@@ -49,7 +50,8 @@ or to ``MIN_FORCE``."""
 MIN_FORCE = 1e-3
 """Force below which a difference is not relative [N m or N]."""
 INERTIA_TOLERANCE = 1e-5
-"""Largest accepted difference of an entry of the joint-space inertia; see ``inertia_error``."""
+"""Largest accepted difference of an entry of the joint-space inertia; see ``inertia_error``. In
+addition, MuJoCo may add ``BOUND_MASS`` and ``BOUND_INERTIA`` to links without mass."""
 MIN_INERTIA = 1e-8
 """Diagonal entry below which a difference is not relative [kg m^2 or kg]: that of a joint that
 carries no mass is whatever the loader adds."""
@@ -282,11 +284,16 @@ def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, l
     coupling, _ = robot.mimic_map
     samples = q[: len(reading.forces)]
     forces = np.array([gravity_load(robot, configuration) for configuration in samples])
+    bounded = _with_bounds(robot)
     M = np.array([mass_matrix(robot, configuration) for configuration in samples])
+    added = np.array([mass_matrix(bounded, configuration) for configuration in samples]) - M
+    # No entry of a positive semidefinite matrix exceeds the geometric mean of its diagonal ones.
+    bounds = np.sqrt(np.maximum(np.einsum("nii->ni", added), 0.0))
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", M), MIN_INERTIA))
     force_errors = np.abs(reading.forces[:, order] - forces)
     read_M = coupling.T @ reading.inertia[:, order][:, :, order] @ coupling
-    inertia_errors = np.abs(read_M - M) / (scale[:, :, None] * scale[:, None, :])
+    differences = np.abs(read_M - M) - bounds[:, :, None] * bounds[:, None, :]
+    inertia_errors = np.maximum(differences, 0.0) / (scale[:, :, None] * scale[:, None, :])
     gravity_error, inertia_error = float(force_errors.max()), float(inertia_errors.max())
     faults = []
     if not gravity_error <= GRAVITY_TOLERANCE * max(MIN_FORCE, float(np.abs(forces).max())):
@@ -302,6 +309,29 @@ def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, l
         names = [robot.joints[k].name for k in robot.independent_joints]
         faults.append(f"inertia of {names[row]}, {names[column]} is {inertia_error:.2g} off")
     return gravity_error, inertia_error, faults
+
+
+def _with_bounds(robot: Robot) -> Robot:
+    """Return a robot with the masses that MuJoCo may add to links without mass, and to frames.
+
+    They are the whole inertia of a joint that carries nothing else. A body without ``<inertial>``
+    of an MJCF has its centre at the position of the body in its parent (MuJoCo 4.0), the URDF's at
+    its origin: there is a mass for each.
+    """
+    least = Inertial(
+        BOUND_MASS, inertia=(BOUND_INERTIA, 0.0, 0.0, BOUND_INERTIA, 0.0, BOUND_INERTIA)
+    )
+    places = [(frame.link, frame.T_link_frame) for frame in robot.frames]
+    for i, link in enumerate(robot.links):
+        if link.inertial is None or link.inertial.mass == 0:
+            at = robot.joints[i - 1].T_parent_joint.position if i else (0.0, 0.0, 0.0)
+            places += [(link.name, Pose()), (link.name, Pose(at))]
+    bodies = [Link(f"bound {i}", least) for i in range(len(places))]
+    joints = [
+        Joint(f"to {body.name}", "fixed", link, body.name, T)
+        for body, (link, T) in zip(bodies, places, strict=True)
+    ]
+    return replace(robot, links=(*robot.links, *bodies), joints=(*robot.joints, *joints), frames=())
 
 
 def _causes(

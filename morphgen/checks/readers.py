@@ -18,7 +18,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
-from morphgen.formats.usd import convert_urdf
+from morphgen.formats.usd import convert_urdf, prim_name
 from morphgen.model.dynamics import GRAVITY, actuation
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Mimic, Robot
@@ -211,6 +211,8 @@ def _formula(mimic: Mimic) -> str:
     return f"{mimic.multiplier:.6g} {mimic.joint} {mimic.offset:+.6g}"
 
 
+_MASS_SCALE = 2.0**-20
+"""Factor of the masses with which PyBullet computes forces."""
 _SLIDE, _HINGE = 2, 3
 """MuJoCo's types of the joints that a robot has."""
 
@@ -356,6 +358,17 @@ def _pybullet_dynamics(
     R_base_axes = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
     gravity = R_base_axes.T @ (0.0, 0.0, -GRAVITY)
     pybullet.setGravity(*gravity.tolist(), physicsClientId=client)
+    # Inverse dynamics (PyBullet 3.2.7) refuses inertia that is not symmetric to 1e-14 kg m^2, which
+    # rounding passes in links of 200 kg m^2. A power of two scales all numbers without rounding.
+    for i in range(pybullet.getNumJoints(body, physicsClientId=client)):
+        mass, _, moments = pybullet.getDynamicsInfo(body, i, physicsClientId=client)[:3]
+        pybullet.changeDynamics(
+            body,
+            i,
+            mass=mass * _MASS_SCALE,
+            localInertiaDiagonal=[moment * _MASS_SCALE for moment in moments],
+            physicsClientId=client,
+        )
     forces, inertia = _no_dynamics(names, n)
     zero = [0.0] * len(names)
     for i in range(len(forces) if names else 0):
@@ -364,7 +377,7 @@ def _pybullet_dynamics(
             body, positions, zero, zero, physicsClientId=client
         )
         inertia[i] = pybullet.calculateMassMatrix(body, positions, physicsClientId=client)
-    return forces, inertia
+    return forces / _MASS_SCALE, inertia / _MASS_SCALE
 
 
 def _no_dynamics(names: Sequence[str], n: int) -> tuple[Array, Array]:
@@ -472,19 +485,21 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
         model = mujoco.MjModel.from_xml_path(str(folder / file))
     except ValueError as error:
         raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
-    # Forces and inertia are those of the bodies, without contacts and equalities.
+    movable = [i for i in range(model.njnt) if model.jnt_type[i] in (_SLIDE, _HINGE)]
+    # A joint without a name is called after its body, as morphgen's reader does.
+    names = [
+        model.joint(i).name or f"{model.body(model.jnt_bodyid[i]).name}_joint" for i in movable
+    ]
+    joints = {name: _mujoco_joint(model, i) for i, name in zip(movable, names, strict=True)}
+    # Forces and inertia are those of the bodies, without contacts, equalities and motors.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.dof_armature[:] = 0
     model.opt.gravity[:] = 0.0, 0.0, -GRAVITY
     data = mujoco.MjData(model)
     sites = {model.site(i).name: i for i in range(model.nsite)}
     bodies = {model.body(i).name: i for i in range(model.nbody)}
     if frame and frame not in sites and frame not in bodies:
         raise FormatError(f"no site or body {frame!r}")
-    movable = [i for i in range(model.njnt) if model.jnt_type[i] in (_SLIDE, _HINGE)]
-    # A joint without a name is called after its body, as morphgen's reader does.
-    names = [
-        model.joint(i).name or f"{model.body(model.jnt_bodyid[i]).name}_joint" for i in movable
-    ]
     columns = model.jnt_dofadr[movable]
     forces, inertia = _no_dynamics(names, n)
     M = np.zeros((model.nv, model.nv))
@@ -507,8 +522,7 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
             mujoco.mj_forward(model, data)
             mujoco.mj_fullM(model, data, M)
             forces[i] = data.qfrc_bias[columns]
-            inertia[i] = (M - np.diag(model.dof_armature))[np.ix_(columns, columns)]
-    joints = {name: _mujoco_joint(model, i) for i, name in zip(movable, names, strict=True)}
+            inertia[i] = M[np.ix_(columns, columns)]
     return Reading(
         joints,
         float(model.body_mass.sum()),
@@ -750,7 +764,7 @@ def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
             for body in joint.GetBody1Rel().GetTargets()
         }
         links = stage.GetDefaultPrim().GetChild("Geometry")
-        of_frame = [prim for prim in Usd.PrimRange(links) if _name(prim) == frame or not frame]
+        of_frame = [prim for prim in Usd.PrimRange(links) if prim_name(prim) == frame or not frame]
         if not of_frame:
             raise FormatError(f"no prim {frame!r}")
         T_world_root, T_world_frame = (
@@ -758,7 +772,7 @@ def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
         )
         masses = [UsdPhysics.MassAPI(prim).GetMassAttr().Get() for prim in prims]
         movable = {
-            _name(joint.GetPrim()): JointReading(limits=_limits(joint.GetPrim()))
+            prim_name(joint.GetPrim()): JointReading(limits=_limits(joint.GetPrim()))
             for joint in joints.values()
             if not joint.GetPrim().IsA(UsdPhysics.FixedJoint)
         }
@@ -782,11 +796,11 @@ def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int)
         return np.tile(np.eye(4), (n, 1, 1))
     joint = joints.get(str(prim.GetPath()))
     if joint is None:
-        from pxr import UsdGeom
+        import usdex.core
 
-        local = UsdGeom.Xformable(prim).GetLocalTransformation() if prim else None
-        T_parent_prim = np.eye(4) if local is None else np.array(local).T
-        return _poses(prim.GetParent(), joints, q, n) @ T_parent_prim
+        # OpenUSD's own matrix of a small rotation is the identity; see morphgen/formats/usd.py.
+        position, _, rotation, _ = usdex.core.getLocalTransformComponentsQuat(prim)
+        return _poses(prim.GetParent(), joints, q, n) @ _local(position, rotation)
     parents = joint.GetBody0Rel().GetTargets()
     parent = prim.GetStage().GetPrimAtPath(parents[0]) if parents else None
     return (
@@ -800,7 +814,7 @@ def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int)
 def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
     """Return the motion of a joint in its frame, shape (n, 4, 4)."""
     motion = np.tile(np.eye(4), (n, 1, 1))
-    token, positions = prim.GetAttribute("physics:axis").Get(), q.get(_name(prim))
+    token, positions = prim.GetAttribute("physics:axis").Get(), q.get(prim_name(prim))
     if token is None or positions is None:  # a fixed joint has no axis
         return motion
     axis = "XYZ".index(token)
@@ -820,9 +834,3 @@ def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
     px, py, pz = map(float, position)
     return Pose((px, py, pz), (w, x, y, z)).matrix
-
-
-def _name(prim: Any) -> str:  # noqa: ANN401
-    """Return the URDF's name of a prim: USD allows fewer characters, so it may be a label."""
-    label = prim.GetMetadata("displayName")
-    return str(label or prim.GetName())

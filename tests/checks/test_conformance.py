@@ -16,7 +16,7 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read as urdf
 from morphgen.model.geometry import Capsule, Pose, Shape
-from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
 LOADERS = ["yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio", "usd"]
 OF_ALL_VALUES = LOADERS[:-1]
@@ -255,6 +255,65 @@ def test_other_gains_are_noticed(old, new, message, tmp_path):
     row = next(row for row in conformance(folder, 2).rows if row.loader == "mujoco (mjcf)")
     assert (row.passed, row.gains, row.limits) == (False, False, True)
     assert row.message.startswith(f"joint shoulder: {message} ")
+
+
+def turned(**rpy):
+    """An arm whose elbow is mounted with a small turn."""
+    elbow = arm().joints[1]
+    T = Pose.from_xyz_rpy(
+        (0.0, 0.0, 0.3), (rpy.get("x", 0.0), rpy.get("y", 0.0), rpy.get("z", 0.0))
+    )
+    return replace(
+        arm(), joints=(arm().joints[0], replace(elbow, T_parent_joint=T), *arm().joints[2:])
+    )
+
+
+def heavy(factor, turn):
+    """An arm whose links weigh tonnes, with principal axes that are those of no frame."""
+    R = Pose.from_xyz_rpy(rpy=turn).matrix[:3, :3]
+    links = []
+    for link in arm().links:
+        inertia = R @ (factor * link.inertial.matrix) @ R.T
+        mass = factor * link.inertial.mass
+        links.append(replace(link, inertial=Inertial.from_matrix(mass, link.inertial.com, inertia)))
+    return replace(arm(), links=tuple(links))
+
+
+def carrying_nothing(kind, **axis):
+    """An arm with a joint that carries a link without mass, and a frame on it."""
+    joint = Joint("last", kind, "slider", "end", Pose((0.1, 0.2, 0.3)), limits=(-1.0, 1.0), **axis)
+    joint = replace(joint, effort=1.0, velocity=1.0)
+    tool = Frame("tool", "end", Pose((0.3, 0.0, 0.1)))
+    robot = arm()
+    return replace(
+        robot,
+        links=(*robot.links, Link("end")),
+        joints=(*robot.joints, joint),
+        frames=(tool,),
+        home=(*robot.home, 0.0),
+    )
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        turned(x=2.1e-5),
+        turned(x=-1e-4, y=3e-4),
+        turned(z=5e-4),
+        heavy(2e5, (0.3, 0.2, 0.1)),
+        heavy(5e5, (1.0, -0.5, 2.0)),
+        heavy(1e6, (0.1, 0.0, 0.7)),
+        carrying_nothing("prismatic"),
+        carrying_nothing("revolute"),
+        carrying_nothing("prismatic", axis=(0.6, 0.0, 0.8)),
+    ],
+)
+def test_what_libraries_round_is_no_disagreement(robot, tmp_path):
+    """The converter loses small turns, PyBullet refuses rounded inertia, MuJoCo adds 1e-12 kg."""
+    report = conformance(bundle(robot, tmp_path), samples=5)
+    assert report.passed, [row.message for row in report.rows]
+    for row in report.rows:
+        assert row.rotation_error is None or row.rotation_error < 1e-6
 
 
 def test_a_missing_actuator_is_noticed(tmp_path):
