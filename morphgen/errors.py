@@ -72,6 +72,11 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
 
 
+def shortened(text: str, most: int = 80) -> str:
+    """Return the beginning of a text for a message, at most ``most`` characters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a hint for an unknown name: the closest valid one and the list, if not too long.
 

@@ -8,7 +8,7 @@ from typing import Any, get_type_hints
 
 import msgspec
 
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, shortened
 from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
@@ -105,8 +105,7 @@ def read_fields(
 
 def shown(value: object) -> str:
     """Return a value for a message, shortened."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:60]}..."
+    return shortened(repr(value))
 
 
 def policy_from(stored: object, where: str = "policy") -> PolicyConfig:

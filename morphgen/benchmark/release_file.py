@@ -116,14 +116,12 @@ def is_release(folder: Path) -> bool:
 def read_release(folder: Path) -> Release:
     """Read the description of a release."""
     path = folder / RELEASE_FILE
-    try:
-        return read_record(read_json(path), Release, str(path), BenchmarkError)
-    except FileNotFoundError as error:
+    if not is_release(folder):
         raise BenchmarkError(
             f"{folder} is no release: it has no {RELEASE_FILE}; morphgen split release makes one"
-        ) from error
-    except OSError as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
+        )
+    try:
+        return read_record(read_json(path), Release, str(path), BenchmarkError)
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
 

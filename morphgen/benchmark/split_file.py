@@ -277,8 +277,6 @@ def read_split_file(path: Path) -> SplitFile:
         text = read_text(path)
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
-    except OSError as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
     return parse_split(text, path)
 
 

@@ -207,10 +207,6 @@ def _text(path: Path) -> str:
         return read_text(path)
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
-    except FileNotFoundError as error:
-        raise BenchmarkError(f"{path}: no such file") from error
-    except OSError as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 _README = """\

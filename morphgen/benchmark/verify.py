@@ -92,8 +92,6 @@ def release_differences(
             yield LICENCES_FILE, "its licences are not those of the parts"
     except MorphgenError as error:
         yield RELEASE_FILE, str(error)
-    except OSError as error:
-        yield LICENCES_FILE, f"cannot be read: {error.strerror}"
     if (folder / DIFFICULTY_FILE).exists():  # releases of versions before 0.3 have none
         survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
         for why in _difficulty_differences(folder / DIFFICULTY_FILE, survey):

@@ -26,13 +26,18 @@ def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 
     max_bytes: Largest file to read [bytes].
     """
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise FormatError(f"{path}: is not a regular file")
-    if status.st_size > max_bytes:
-        raise FormatError(f"{path}: holds {status.st_size} bytes; at most {max_bytes} are read")
-    with path.open("rb") as file:
-        data = file.read(max_bytes + 1)
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe may never end
+            raise FormatError(f"{path}: is not a regular file")
+        if status.st_size > max_bytes:
+            raise FormatError(f"{path}: holds {status.st_size} bytes; at most {max_bytes} are read")
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        is_missing = isinstance(error, FileNotFoundError)
+        why = "no such file" if is_missing else f"cannot be read: {error.strerror}"
+        raise FormatError(f"{path}: {why}") from error
     if len(data) > max_bytes:
         raise FormatError(f"{path}: holds more than {max_bytes} bytes, the most that is read")
     return data

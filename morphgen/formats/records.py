@@ -33,7 +33,7 @@ import msgspec
 import yaml
 from msgspec import Meta
 
-from morphgen.errors import FormatError, MorphgenError, nearest
+from morphgen.errors import FormatError, MorphgenError, nearest, shortened
 
 T = TypeVar("T")
 KeyPath = tuple[str | int, ...]
@@ -45,8 +45,6 @@ FiniteNumber = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
 """A number that is neither NaN nor infinite, nor beyond what a robot can hold in SI units."""
 PositiveNumber = Annotated[float, Meta(gt=0, le=_LARGEST)]
 
-_SHOWN_VALUE = 80
-"""Longest value that an error shows [characters]."""
 _WORDS = {
     "array": "a list",
     "bool": "true or false",
@@ -95,10 +93,13 @@ def _fault(data: object, hint: Any, path: KeyPath) -> tuple[KeyPath, str]:  # no
     if isinstance(data, dict) and (reason := _key_fault(data, _member(data, hint))):
         return path, reason
     if get_origin(hint) is Literal:
-        return path, f"unknown value {_shown(data)}{nearest(str(data), map(str, get_args(hint)))}"
+        return (
+            path,
+            f"unknown value {shortened(repr(data))}{nearest(str(data), map(str, get_args(hint)))}",
+        )
     reason = _error(data, hint)
     if reason.startswith("expected"):
-        reason = f"invalid value {_shown(data)}; {reason}"
+        reason = f"invalid value {shortened(repr(data))}; {reason}"
     return path, reason
 
 
@@ -106,12 +107,12 @@ def _key_fault(data: dict[Any, Any], hint: Any) -> str:  # noqa: ANN401
     """Return what is wrong with the keys of an object, if anything."""
     for key in data:
         if not isinstance(key, str):
-            return f"key {_shown(key)} is not text; quote it"
+            return f"key {shortened(repr(key))} is not text; quote it"
     if _is_record(hint):
         keys = [field.encode_name for field in msgspec.structs.fields(hint)]
         for key in data:
             if key not in keys:
-                return f"unknown key {_shown(key)}{nearest(key, keys)}"
+                return f"unknown key {shortened(repr(key))}{nearest(key, keys)}"
     return ""
 
 
@@ -170,11 +171,6 @@ def _shape(hint: Any) -> type | None:  # noqa: ANN401
 
 def _is_record(hint: object) -> bool:
     return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _SHOWN_VALUE else f"{text[: _SHOWN_VALUE - 3]}..."
 
 
 def _line(text: str | bytes, path: KeyPath) -> int:

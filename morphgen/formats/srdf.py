@@ -11,9 +11,9 @@ from typing import Any, TypeAlias, TypeVar
 
 from lxml import etree
 
-from morphgen.errors import FormatError, nearest
+from morphgen.errors import FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes
-from morphgen.formats.xml import parse_xml, shortened
+from morphgen.formats.xml import parse_xml
 from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 

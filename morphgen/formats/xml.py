@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from lxml import etree
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, shortened
 from morphgen.model.findings import Finding
 
 _LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
@@ -28,13 +28,6 @@ _UNDECLARED = "undeclared:"
 """Begin of the namespace of a prefix that the document does not declare."""
 _MAX_PREFIXES = 20
 """Largest number of prefixes in a document that is repaired."""
-SHOWN_TEXT = 80
-"""Longest excerpt of a text in a message [characters]."""
-
-
-def shortened(text: str) -> str:
-    """Return the beginning of a text, for a message."""
-    return text if len(text) <= SHOWN_TEXT else f"{text[: SHOWN_TEXT - 3]}..."
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:

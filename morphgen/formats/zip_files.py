@@ -19,7 +19,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, shortened
 from morphgen.formats.files import replacing_file
 
 _ENTRY_SIGNATURE = b"PK\x01\x02"
@@ -33,8 +33,6 @@ _MODE = 0o100644
 _UNIX = 3
 """System that written entries name as their creator."""
 _LEVEL = 9
-_SHOWN = 100
-"""Longest name that an error shows [characters]."""
 _CHUNK = 2**20
 """Bytes that are unpacked at once."""
 
@@ -108,7 +106,7 @@ def unpack_zip(path: Path, folder: Path, limits: ZipLimits) -> None:
     except FileNotFoundError as error:
         raise FormatError(f"{path}: no such file") from error
     except UNREADABLE as error:
-        raise FormatError(f"{path}: not a readable zip: {_shortened(str(error))}") from error
+        raise FormatError(f"{path}: not a readable zip: {shortened(str(error))}") from error
 
 
 def require_few_entries(file: IO[bytes], limits: ZipLimits) -> None:
@@ -155,7 +153,7 @@ def _unpack_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path
         while chunk := source.read(_CHUNK):
             left -= len(chunk)
             if left < 0:
-                raise FormatError(f"{_shortened(entry.filename)!r} is larger than its entry says")
+                raise FormatError(f"{shortened(entry.filename)!r} is larger than its entry says")
             file.write(chunk)
 
 
@@ -174,7 +172,7 @@ def _entry_path(entry: zipfile.ZipInfo, limits: ZipLimits) -> str:
     elif any(len(part.encode()) > limits.max_name for part in path.parts):
         fault = f"is longer than {limits.max_name} characters"
     if fault:
-        raise FormatError(f"{_shortened(entry.orig_filename)!r} {fault}")
+        raise FormatError(f"{shortened(entry.orig_filename)!r} {fault}")
     return str(path)
 
 
@@ -186,15 +184,11 @@ def _require_distinct(paths: Sequence[str]) -> None:
     known_paths: set[str] = set()
     for path in paths:
         if path.casefold() in known_paths:
-            raise FormatError(f"{_shortened(path)!r} is there twice")
+            raise FormatError(f"{shortened(path)!r} is there twice")
         known_paths.add(path.casefold())
     for path in paths:
         if not known_paths.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
-            raise FormatError(f"{_shortened(path)!r} is in a folder that is a file")
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+            raise FormatError(f"{shortened(path)!r} is in a folder that is a file")
 
 
 UNREADABLE_NPZ = (*UNREADABLE, tokenize.TokenError, KeyError, MemoryError, OverflowError)

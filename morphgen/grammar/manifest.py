@@ -281,8 +281,6 @@ def _load_yaml(path: Path) -> tuple[bytes, Any]:
         raise PartError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
     except FormatError as error:
         raise PartError(str(error)) from error
-    except OSError as error:
-        raise PartError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

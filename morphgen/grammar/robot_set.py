@@ -192,10 +192,7 @@ def read_index(folder: Path) -> list[Record]:
 def read_settings(folder: Path) -> Record:
     """Return the settings of a set, the content of its ``set.json``."""
     path = folder / SETTINGS
-    try:
-        settings = read_json(path)
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
+    settings = read_json(path)
     if not isinstance(settings, dict) or not isinstance(settings.get("grammar"), str):
         raise FormatError(f"{path}: expected the settings of a set, with the name of its grammar")
     where = settings.get("where")

@@ -471,11 +471,11 @@ def _has_checkpoint(folder: Path) -> bool:
 def read_config(folder: Path) -> RunConfig:
     """Return the config of a run."""
     path = folder / CONFIG
+    if not path.is_file():
+        raise TaskError(f"{folder} is not the folder of a run: it has no {CONFIG}")
     try:
         data = read_json(path)
         _require_format(path, data)
-    except OSError as error:
-        raise TaskError(f"{folder} is not the folder of a run: it has no {CONFIG}") from error
     except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
     try:

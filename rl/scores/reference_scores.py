@@ -327,8 +327,6 @@ def _cell_files(folder: Path, split: Split) -> Iterator[tuple[str, Path]]:
 def _read(file: Path) -> Any:  # noqa: ANN401
     try:
         return read_json(file)
-    except OSError as error:
-        raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
 

@@ -199,8 +199,6 @@ def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
             data = read_json(file)
         except FormatError as error:  # which names the file
             raise BenchmarkError(str(error)) from error
-        except OSError as error:
-            raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
         yield file, data
 
 
@@ -213,10 +211,6 @@ def read_submission(path: Path) -> Submission:
     """Read a submission and check its form, not what it claims."""
     try:
         data = read_json(path)
-    except FileNotFoundError as error:
-        raise BenchmarkError(f"{path}: no such file") from error
-    except OSError as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
     if not is_submission(data):

@@ -271,14 +271,10 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
     """Return all goal sets of a built split with the config that made them; see ``read_goals``."""
     folder = Path(folder) / GOALS
     path = folder / INDEX
+    if not path.is_file():
+        raise BenchmarkError(f"{path}: no such file; morphgen split build --goals makes goal sets")
     try:
         return _parse_index(read_json(path), folder)
-    except FileNotFoundError as error:
-        raise BenchmarkError(
-            f"{error.filename}: no such file; morphgen split build --goals makes goal sets"
-        ) from error
-    except OSError as error:
-        raise BenchmarkError(f"{error.filename}: cannot be read: {error.strerror}") from error
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:

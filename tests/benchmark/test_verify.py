@@ -291,7 +291,7 @@ def test_an_exchanged_split_file_is_reported(whole):
         ("build.json", b'{"format": 2}', "build.json: format 2; this version reads 1"),
         ("SHA256SUMS", None, "is not finished"),
         ("SHA256SUMS", b"abc\n", "SHA256SUMS:1: expected a hash, two spaces and a path"),
-        ("split.yaml", None, "split.yaml: cannot be read"),
+        ("split.yaml", None, "split.yaml: no such file"),
         ("split.yaml", b"format: 1\n", "split.yaml:1: a split lacks"),
     ],
 )

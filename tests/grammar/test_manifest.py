@@ -211,4 +211,4 @@ def test_a_manifest_that_is_not_utf8_is_an_error(tmp_path):
 
 
 def test_a_missing_file_is_an_error(tmp_path):
-    assert refusal(tmp_path / "pincer.yaml") == ": cannot be read: No such file or directory"
+    assert refusal(tmp_path / "pincer.yaml") == ": no such file"

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from lxml import etree
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, shortened
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import (
     SKIP_HINT,
@@ -25,7 +25,7 @@ from morphgen.formats.resolve import (
 from morphgen.formats.urdf.schema import CHILDREN, above_free_base, structure_findings
 from morphgen.formats.urdf.write import MORPHGEN_TAG, joined_capsules
 from morphgen.formats.xacro.expand import expand
-from morphgen.formats.xml import parse_description, shortened
+from morphgen.formats.xml import parse_description
 from morphgen.model import rotation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import (

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from morphgen.errors import nearest
+from morphgen.errors import nearest, shortened
 from morphgen.formats.urdf.write import MUJOCO_BOUNDS
-from morphgen.formats.xml import shortened
 from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 

@@ -26,7 +26,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import yaml
 
-from morphgen.errors import FormatError, nearest
+from morphgen.errors import FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes, yaml_problem
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro.evaluator import (
@@ -51,14 +51,6 @@ Untyped: TypeAlias = Any
 """Objects of minidom and xacro, which have no type hints."""
 
 _LOCATION = "morphgen-location"
-
-
-def read_file(path: Path) -> bytes:
-    """Return the content of a regular file; a device or a pipe might never end."""
-    try:
-        return read_bytes(path, MAX_FILE)
-    except FormatError as error:
-        raise RefusedError(str(error)) from error
 
 
 def location_of(node: Untyped) -> str:
@@ -574,13 +566,7 @@ class Expansion:
 
     def run_file(self) -> bytes:
         """Expand the file."""
-        try:
-            data = read_file(self.origin)
-        except OSError as error:
-            raise FormatError(f"{self.origin}: cannot be read: {error.strerror}") from error
-        except RefusedError as error:
-            raise FormatError(str(error)) from error
-        return self.run(data)
+        return self.run(read_bytes(self.origin, MAX_FILE))
 
     def run(self, data: bytes) -> bytes:
         """Expand a document in place of the file's content."""
@@ -637,7 +623,8 @@ class Expansion:
         if self.installed_only and not is_installed(Path(filename)):
             self.met_foreign = True
             raise RefusedError(f"{filename} was not installed")
-        return read_file(Path(filename))
+        Path(filename).stat()  # so that the error of a missing file names the line of its use
+        return read_bytes(Path(filename), MAX_FILE)
 
     def _list_files(self, pattern: str) -> list[str]:
         """Return the files that match a pattern; its fixed first folders must be allowed."""
@@ -703,8 +690,7 @@ def _reason(error: BaseException) -> str:
         return "macros or properties refer to each other endlessly or too deeply"
     if isinstance(error, MemoryError):
         return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
-    reason = " ".join(f"{error or type(error).__name__} {suffix}".split())
-    return reason if len(reason) <= MAX_REASON else f"{reason[:MAX_REASON]}..."
+    return shortened(" ".join(f"{error or type(error).__name__} {suffix}".split()), MAX_REASON)
 
 
 def _unknown_name_hint(error: BaseException | None, values: Mapping[str, float]) -> str:
