@@ -30,6 +30,7 @@ from morphgen.grammar import compose, robot_set, sampling
 from morphgen.grammar import values as conditions
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_serially, make_set
+from morphgen.progress import show_progress
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -101,7 +102,7 @@ def _apart(measure: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> 
 def _measure(plan: SetConfig, n: int, jobs: int) -> Run:
     early = 0.0
 
-    def progress(done: int) -> None:
+    def watch(done: float, total: int | None) -> None:
         nonlocal early
         if not early and done >= n / 10:
             early = _peak()
@@ -109,7 +110,8 @@ def _measure(plan: SetConfig, n: int, jobs: int) -> Run:
     if jobs == 1:
         _warm(plan)
     start = time.perf_counter()
-    make_set(plan, n, make_serially if jobs == 1 else make_in_processes(jobs), progress)
+    with show_progress(watch):
+        make_set(plan, n, make_serially if jobs == 1 else make_in_processes(jobs))
     return Run(time.perf_counter() - start, early, _peak())
 
 

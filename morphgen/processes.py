@@ -20,12 +20,10 @@ from typing import Any, TypeVar
 
 from morphgen.arguments import whole_number
 from morphgen.errors import MissingDependencyError, MorphgenError
+from morphgen.progress import report, show_progress
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-Progress = Callable[[int, int], None]
-"""Callback with the number of results so far and in total."""
 
 CHUNK_SIZE = 8
 """Default number of items that a worker processes before it reports."""
@@ -42,28 +40,25 @@ _stopped: c_byte | None = None
 _is_working = False
 
 
-def no_progress(done: int, total: int) -> None:
-    """Ignore progress."""
-
-
 def parallel_map(
     work: Callable[[T], R],
     items: Sequence[T],
     jobs: int,
-    progress: Progress = no_progress,
     chunk: int = CHUNK_SIZE,
 ) -> Iterator[R]:
-    """Return an iterator over ``work(item)`` for every item, in the order of the items."""
+    """Return an iterator over ``work(item)`` for every item, in order; it reports the progress."""
     jobs = whole_number("jobs", jobs, MorphgenError, 1)
     chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
-    results = map(work, items) if jobs <= 1 else _in_processes(work, chunks, jobs)
-    return _reporting(results, progress, len(items))
+    results = (
+        map(show_progress(None)(work), items) if jobs <= 1 else _in_processes(work, chunks, jobs)
+    )
+    return _reporting(results, len(items))
 
 
-def _reporting(results: Iterable[R], progress: Progress, total: int) -> Iterator[R]:
+def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
     for done, result in enumerate(results, 1):
-        progress(done, total)
+        report(done, total)
         yield result
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
+from morphgen.progress import part_of, show_progress
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
@@ -34,10 +35,6 @@ EVAL_SEED_OFFSET = 0x5C0_4E5
 
 MakeController = Callable[[], Controller]
 """Function that returns a new controller."""
-Progress = Callable[[float, int], None]
-"""Callback with the number of episodes done, where running ones are fractions, and their total."""
-
-
 Record = Callable[[EnvSpec, Side, Sequence[Episode], Sequence[Episode]], None]
 """Callback with the specification of a robot, its side, its episodes, and those of the random
 policy, which begin alike."""
@@ -47,10 +44,6 @@ def no_record(
     spec: EnvSpec, side: Side, episodes: Sequence[Episode], random_episodes: Sequence[Episode]
 ) -> None:
     """Ignore the episodes."""
-
-
-def no_progress(done: float, total: int) -> None:
-    """Ignore the progress."""
 
 
 @dataclass(frozen=True)
@@ -97,15 +90,12 @@ def evaluate_run(
     mode: Mode,
     *,
     device: str = "cpu",
-    progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
     """Evaluate a run on the robots of a side of its split, or on its one robot."""
     files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(
-        files, source, config, mode, device=device, progress=progress, record=record
-    )
+    return evaluate_checkpoints(files, source, config, mode, device=device, record=record)
 
 
 def evaluate_checkpoints(
@@ -115,7 +105,6 @@ def evaluate_checkpoints(
     mode: Mode,
     *,
     device: str = "cpu",
-    progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
@@ -130,10 +119,10 @@ def evaluate_checkpoints(
         scores: list[Score] = []
         for policy, trained_on in zip(trained, sources, strict=True):
             robot = replace(source, member=trained_on.member)
-            scores += _evaluate_together([policy], robot, config, mode, device, progress, record)
+            scores += _evaluate_together([policy], robot, config, mode, device, record)
         return scores
     _require_same_interface(paths, [run for run, _ in trained])
-    return _evaluate_together(trained, source, config, mode, device, progress, record)
+    return _evaluate_together(trained, source, config, mode, device, record)
 
 
 def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: str) -> None:
@@ -172,7 +161,6 @@ def _evaluate_together(
     config: EvalConfig,
     mode: Mode,
     device: str,
-    progress: Progress,
     record: Record,
 ) -> list[Score]:
     """Evaluate policies on the same robots; scores are means over the episodes of all policies."""
@@ -182,7 +170,7 @@ def _evaluate_together(
 
     controllers = [partial(make, learner) for _, learner in trained]
     interface = trained[0][0].interface
-    return evaluate(controllers, source, config, interface, progress=progress, record=record)
+    return evaluate(controllers, source, config, interface, record=record)
 
 
 def evaluate_baseline(
@@ -190,7 +178,6 @@ def evaluate_baseline(
     source: RobotSource,
     config: EvalConfig,
     *,
-    progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
     """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out."""
@@ -202,7 +189,6 @@ def evaluate_baseline(
         config,
         Interface(),
         tasks=baseline.tasks,
-        progress=progress,
         record=record,
     )
 
@@ -214,7 +200,6 @@ def evaluate(
     interface: Interface,
     *,
     tasks: Sequence[str] | None = None,
-    progress: Progress = no_progress,
     record: Record = no_record,
 ) -> list[Score]:
     """Return the scores of the robots of a source, in order.
@@ -227,12 +212,10 @@ def evaluate(
         raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
     library = tuple(map(Path, source.library))
     episodes: list[list[Episode]] = [[] for _ in specs]
+    total = math.prod(_rounds(config)) * len(specs)
     for i, make in enumerate(controllers):
-
-        def show(done: float, total: int, num_before: int = i) -> None:
-            progress(num_before * total + done, len(controllers) * total)
-
-        new_episodes = _run_all(make, specs, config, interface, library, show)
+        with part_of(len(controllers) * total, i * total):
+            new_episodes = _run_all(make, specs, config, interface, library)
         for robot_episodes, new in zip(episodes, new_episodes, strict=True):
             robot_episodes.extend(new)
     random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
@@ -243,12 +226,14 @@ def evaluate(
     return scores
 
 
+@show_progress(None)  # goal sets are not episodes
 def _specs(source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None) -> list[EnvSpec]:
     specs = specs_of(source, GoalConfig(tasks=config.tasks))
     return [spec for spec in specs if tasks is None or spec.task in tasks]
 
 
 @lru_cache(maxsize=64)
+@show_progress(None)
 def _random_episodes(
     source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None
 ) -> list[list[Episode]]:
@@ -257,17 +242,21 @@ def _random_episodes(
     return _run_all(make, _specs(source, config, tasks), config, Interface(), library)
 
 
+def _rounds(config: EvalConfig) -> tuple[int, int]:
+    """Return the number of episodes in each environment, and of environments of a robot."""
+    rounds = -(-config.episodes // MAX_ENVS_PER_ROBOT)
+    return rounds, -(-config.episodes // rounds)
+
+
 def _run_all(
     make: MakeController,
     specs: Sequence[EnvSpec],
     config: EvalConfig,
     interface: Interface,
     library: tuple[Path, ...],
-    progress: Progress = no_progress,
 ) -> list[list[Episode]]:
     """Return episodes by robot, from as many batches as the simulator's limit makes necessary."""
-    rounds = -(-config.episodes // MAX_ENVS_PER_ROBOT)
-    envs_per_robot = -(-config.episodes // rounds)
+    rounds, envs_per_robot = _rounds(config)
     simulator = SIMULATORS[config.sim]
     batch_envs = max(simulator.max_envs // len(specs), 1)  # per robot
     seed = int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0])
@@ -289,13 +278,11 @@ def _run_all(
             device=simulator.devices[0],
             library=library,
         )
-
-        def show(done: float, num_before: int = first * rounds * len(specs)) -> None:
-            progress(num_before + done, total)
-
         try:
             controller = controller or make()
-            for episode in run_episodes(batch, controller, rounds, show):
+            with part_of(total, first * rounds * len(specs)):
+                new_episodes = run_episodes(batch, controller, rounds)
+            for episode in new_episodes:
                 episodes[episode.robot_index].append(episode)
         finally:
             batch.close()

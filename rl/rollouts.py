@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 
 from morphgen.processes import one_torch_thread
+from morphgen.progress import report
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
@@ -59,7 +59,6 @@ def run_episodes(
     batch: TaskBatch,
     controller: Controller,
     count: int,
-    progress: Callable[[float], None] = lambda done: None,
 ) -> list[Episode]:
     """Return the first episodes of every environment, the same number of each.
 
@@ -78,7 +77,8 @@ def run_episodes(
         if on_host or num_steps % STEPS_UNREAD == 0:
             is_running = results.finished < count
             fractions = (results.steps / batch.max_episode_steps)[is_running]
-            progress(float(results.finished.clamp(max=count).sum() + fractions.sum()))
+            done = results.finished.clamp(max=count).sum() + fractions.sum()
+            report(float(done), count * n)
             if not is_running.any():
                 return results.episodes(batch)
 

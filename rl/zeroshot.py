@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +16,6 @@ from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource
 from morphgen.rl.scores.scores import Interval, Score, success_interval
 from morphgen.rl.shipped_policies import name_of
-
-Progress = Callable[[str, float, int], None]
-"""Callback with a controller, the number of its episodes done, and their total."""
 
 
 @dataclass(frozen=True)
@@ -40,34 +36,17 @@ class ZeroShotResult:
     """Mean score of the episodes; that of reach is relative to the random policy."""
 
 
-def zero_shot(
-    source: RobotSource,
-    policy: Path,
-    config: EvalConfig,
-    *,
-    progress: Progress = lambda name, done, total: None,
-) -> list[ZeroShotResult]:
+def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> list[ZeroShotResult]:
     """Run a policy on a robot, and the controllers that do not learn.
 
     All of them have the same starts and goals.
     """
     task, name = str(source.task), name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)
-    (score,) = evaluate_checkpoints(
-        [policy],
-        source,
-        config,
-        "deterministic",
-        progress=lambda done, total: progress(name, done, total),
-    )
+    (score,) = evaluate_checkpoints([policy], source, config, "deterministic")
     scores = [(name, score)]
     for baseline in compared_with(task):
-        (score,) = evaluate_baseline(
-            baseline,
-            source,
-            config,
-            progress=lambda done, total, of=baseline: progress(of, done, total),  # type: ignore[misc]
-        )
+        (score,) = evaluate_baseline(baseline, source, config)
         scores.append((baseline, score))
     return [result_of(controller, score) for controller, score in scores]
 

@@ -25,6 +25,7 @@ PACKAGES = (
     "arguments",
     "extras",
     "typing",
+    "progress",
     "processes",
     "model",
     "formats",

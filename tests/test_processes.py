@@ -3,21 +3,22 @@
 import os
 import time
 from functools import partial
+from threading import Thread
 
 import pytest
 
 from helpers.worker_functions import die, die_at_three, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.processes import CHUNK_SIZE, parallel_map
+from morphgen.progress import own_progress, part_of, report, show_progress
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("n", [0, 1, CHUNK_SIZE, 5 * CHUNK_SIZE + 3])
 def test_results_come_in_order(jobs, n):
     counts = []
-    results = list(
-        parallel_map(partial(power, 2), range(n), jobs, lambda *count: counts.append(count))
-    )
+    with show_progress(lambda *count: counts.append(count)):
+        results = list(parallel_map(partial(power, 2), range(n), jobs))
     assert [value for value, _ in results] == [i**2 for i in range(n)]
     assert counts == [(i + 1, n) for i in range(n)]
     elsewhere = {process for _, process in results} - {os.getpid()}
@@ -50,3 +51,20 @@ def test_a_process_that_dies_while_results_are_used_is_reported():
 def test_number_of_jobs_is_at_least_one(jobs):
     with pytest.raises(MorphgenError, match=f"jobs {jobs}: expected a whole number, 1 or more"):
         list(parallel_map(fail, [1], jobs))
+
+
+def test_reports_count_the_items_of_the_outermost_work():
+    seen = []
+    with show_progress(lambda *count: seen.append(count)):
+        list(parallel_map(lambda n: list(parallel_map(abs, range(n), 1)), [2, 3], 1))
+        for first in (0, 2):
+            with part_of(4, first):
+                list(parallel_map(abs, [1, 2], 1))
+        with own_progress() as show:
+            report(9, 9)
+            show(1, None)
+        thread = Thread(target=report, args=(8, 8))
+        thread.start()
+        thread.join()
+    report(7, 7)
+    assert seen == [(1, 2), (2, 2), (1, 4), (2, 4), (3, 4), (4, 4), (1, None)]

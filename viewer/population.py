@@ -6,7 +6,7 @@ three instances. Arrays over instances are sorted by what they are instances of.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,6 +33,7 @@ from morphgen.model.kinematics import forward_kinematics, joint_limits, random_c
 from morphgen.model.kinematics_torch import KinematicTree, compile_tree
 from morphgen.model.kinematics_torch import forward_kinematics as batch_forward_kinematics
 from morphgen.model.robot import Robot
+from morphgen.progress import report
 from morphgen.typing import Array
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.comparison import all_roles, joint_roles
@@ -241,7 +242,6 @@ def _box(prototype: Prototype, scale: Array) -> tuple[Array, Array]:
 
 
 T = TypeVar("T")
-Progress = Callable[[int, int], None]
 
 MAX_ROBOTS = 1000
 """Largest population."""
@@ -313,7 +313,7 @@ def find_source(subject: str, files: FileAccess, seed: int, number: int) -> Sour
 
 
 def load_population(
-    source: Source, files: FileAccess, workers: Workers, progress: Progress
+    source: Source, files: FileAccess, workers: Workers
 ) -> tuple[Population, list[tuple[str, str]]]:
     """Read the robots in the workers.
 
@@ -328,7 +328,7 @@ def load_population(
         ]
     else:
         calls = [workers.submit(read_robots, chunk, files) for chunk in chunks]
-    results = _gather(calls, workers, len(source.rows), progress)
+    results = _gather(calls, workers, len(source.rows))
     faults = [(result.row.name, result.error) for result in results if result.robot is None]
     read = [(result.row, result.robot) for result in results if result.robot is not None]
     if not read:
@@ -364,7 +364,7 @@ def sample_robots(name: str, seed: int, rows: Sequence[Row], files: FileAccess) 
 
 
 def load_free_configurations(
-    population: Population, workers: Workers, progress: Progress
+    population: Population, workers: Workers
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Find random configurations without self-collision in the workers.
 
@@ -376,7 +376,7 @@ def load_free_configurations(
     calls = [workers.submit(free_configurations, chunk) for chunk in numbered]
     q = np.repeat(population.home[None], NUM_POSES, axis=0)
     found = np.zeros(len(population), dtype=np.bool_)
-    for i, free in enumerate(_gather(calls, workers, len(population), progress)):
+    for i, free in enumerate(_gather(calls, workers, len(population))):
         if len(free):
             q[:, i, : free.shape[1]] = free[np.arange(NUM_POSES) % len(free)]
             found[i] = True
@@ -408,9 +408,7 @@ def free_configurations(robots: Sequence[tuple[int, Robot]]) -> list[Array]:
     return results
 
 
-def load_map(
-    population: Population, files: FileAccess, workers: Workers, progress: Progress
-) -> Array:
+def load_map(population: Population, files: FileAccess, workers: Workers) -> Array:
     """Map the robots by the cosine of their tokens (see ``similarity``); shape (n, 2).
 
     Robots without tokens, such as those without a tool, are NaN.
@@ -419,7 +417,7 @@ def load_map(
     calls = [
         workers.submit(token_rows, chunk, max_links, files) for chunk in _chunks(population.robots)
     ]
-    tables = _gather(calls, workers, len(population), progress)
+    tables = _gather(calls, workers, len(population))
     points = np.full((len(population), 2), np.nan)
     known = [i for i, table in enumerate(tables) if table is not None]
     if not known:
@@ -468,13 +466,11 @@ def _chunks(items: Sequence[T]) -> list[Sequence[T]]:
     return [items[i : i + _CHUNK] for i in range(0, len(items), _CHUNK)]
 
 
-def _gather(
-    calls: Sequence[Future[list[T]]], workers: Workers, total: int, progress: Progress
-) -> list[T]:
+def _gather(calls: Sequence[Future[list[T]]], workers: Workers, total: int) -> list[T]:
     """Return the results of all calls in order."""
     results: list[T] = []
     for call in calls:
         chunk: list[T] = workers.result(call)
         results += chunk
-        progress(len(results), total)
+        report(len(results), total)
     return results

@@ -27,6 +27,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.progress import report
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup
@@ -84,7 +85,6 @@ def make_members(
     obstacles: bool,
     files: FileAccess,
     workers: Workers,
-    progress: Callable[[int, int], None],
 ) -> list[Member]:
     """Compose the robots of rows in the worker processes; return them as members of a split."""
     futures = [
@@ -93,7 +93,7 @@ def make_members(
     members = []
     for i, future in enumerate(futures, 1):
         members.append(workers.result(future))
-        progress(i, len(futures))
+        report(i, len(futures))
     return members
 
 
@@ -120,7 +120,6 @@ def study_split(
     split: Split,
     folders: tuple[Path, ...],
     workers: Workers,
-    progress: Callable[[int, int], None],
 ) -> SplitStudy:
     """Measure and compare a split's robots in worker processes."""
     members = [*split.train, *split.test]
@@ -136,7 +135,7 @@ def study_split(
     measured = {}
     for i, (text, future) in enumerate(futures.items(), 1):
         measured[text] = workers.result(future)
-        progress(i, len(futures))
+        report(i, len(futures))
     return workers.result(workers.submit(conclude_study, split, measured, folders))
 
 
@@ -208,17 +207,11 @@ def add_split_form(
 
     def save() -> None:
         """Compose the robots in the worker processes, and write the split."""
-        train, test = (
-            make_members(
-                rows,
-                task.value,
-                obstacles.value,
-                session.files,
-                session.workers,
-                lambda done, total: session.set_status(f"composing {total} robots", done / total),
+        with session.progress("composing {} robots"):
+            train, test = (
+                make_members(rows, task.value, obstacles.value, session.files, session.workers)
+                for rows in choose_sides()
             )
-            for rows in choose_sides()
-        )
         session.set_status("")
         path = save_split(name.value, regime.value, train, test, session.files)
         show_saved(session, path, text)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from morphgen.grammar.robot_source import RobotLike
-    from morphgen.processes import Progress
     from morphgen.tasks.actions import ActionKind
     from morphgen.tasks.gym.env import TaskEnv
     from morphgen.tasks.gym.vector import TaskVector
@@ -38,7 +37,6 @@ class SharedOptions(TypedDict, total=False):
     cache: str | PathLike[str] | None
     library: LibraryFolders
     max_links: int | None
-    progress: Progress
     render_mode: str | None
     size: tuple[int, int]
 

@@ -27,7 +27,6 @@ from morphgen.errors import BenchmarkError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
 from morphgen.tasks.goals.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 from morphgen.tasks.goals.split_goals import sample_split_goals
 from morphgen.tasks.goals.split_release import build_with_goals
@@ -86,12 +85,11 @@ class LoadedSplit:
         return licenced_parts(self.definition, self.library)
 
     @explain_missing_extras()
-    def statistics(self, *, jobs: int = 1, progress: Progress = no_progress) -> dict[str, Any]:
+    def statistics(self, *, jobs: int = 1) -> dict[str, Any]:
         """Compute sizes of the robots, and the similarity of test and train robots.
 
         Args:
             jobs: Number of processes.
-            progress: Receives the number of robots that are finished, and of all.
 
         Returns:
             Plain data; see ``morphgen.benchmark.survey.summarize_survey``.
@@ -100,7 +98,7 @@ class LoadedSplit:
             BenchmarkError: If a robot cannot be composed, or train or test is empty.
             MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
-        return statistics(self.definition, self.library, jobs=jobs, progress=progress)
+        return statistics(self.definition, self.library, jobs=jobs)
 
     @explain_missing_extras()
     def audit(
@@ -110,7 +108,6 @@ class LoadedSplit:
         goals: bool = False,
         goal_seed: int | None = None,
         jobs: int = 1,
-        progress: Progress = no_progress,
     ) -> Audit:
         """Find leaks between train and test robots, and between the goal sets of a built split.
 
@@ -121,20 +118,18 @@ class LoadedSplit:
             goals: Whether to audit goal sets even if the split ships none.
             goal_seed: Seed that the goal sets must have; by default that of the shipped ones, or 0.
             jobs: Number of processes.
-            progress: Receives the number of robots that are finished, and of all: first of the
-                robots, then of their goal sets.
 
         Raises:
             BenchmarkError: If the provenance of the split is malformed.
             MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
         split, library = self.definition, self.library
-        result = audit(split, library, near=near, jobs=jobs, progress=progress)
+        result = audit(split, library, near=near, jobs=jobs)
         sample = partial(sample_split_goals, split, library, jobs=jobs) if goals else None
         sets = goals_to_audit(self.folder, goal_seed, sample)
         findings = None
         if sets is not None:
-            findings = audit_goals(split, sets, library, jobs=jobs, progress=progress)
+            findings = audit_goals(split, sets, library, jobs=jobs)
         return with_goal_findings(result, split, findings)
 
     def write(self, path: str | PathLike[str] = ".") -> Path:
@@ -168,7 +163,6 @@ class LoadedSplit:
         goals: bool = False,
         goal_seed: int = 0,
         jobs: int = 1,
-        progress: Progress = no_progress,
     ) -> Path:
         """Write every robot and its tokens into a folder; continue an interrupted build.
 
@@ -187,8 +181,6 @@ class LoadedSplit:
             goals: Whether to ship the goal set of every robot.
             goal_seed: Seed of the goal sets.
             jobs: Number of processes; the files do not depend on it.
-            progress: Receives the number of robots that are finished, and of all: first of the
-                goal sets, then of the robots' files.
 
         Returns:
             The split's folder.
@@ -200,11 +192,7 @@ class LoadedSplit:
             MorphgenError: If a robot cannot be composed.
         """
         settings, config = BuildSettings(light=light, picture=picture), GoalConfig(goal_seed)
-        sets = (
-            sample_split_goals(self.definition, self.library, config, jobs=jobs, progress=progress)
-            if goals
-            else ()
-        )
+        sets = sample_split_goals(self.definition, self.library, config, jobs=jobs) if goals else ()
         report = build_with_goals(
             self.definition,
             Path(folder),
@@ -213,12 +201,11 @@ class LoadedSplit:
             sets,
             config,
             jobs=jobs,
-            progress=progress,
         )
         return report.folder
 
     @explain_missing_extras()
-    def verify(self, *, jobs: int = 1, progress: Progress = no_progress) -> tuple[Difference, ...]:
+    def verify(self, *, jobs: int = 1) -> tuple[Difference, ...]:
         """Compose every robot and compare it: with its hash, and with all files of a built split.
 
         Examples:
@@ -227,14 +214,13 @@ class LoadedSplit:
 
         Args:
             jobs: Number of processes.
-            progress: Receives the number of robots that are finished, and of all.
 
         Returns:
             Differences; none if all robots are the same here.
         """
         if self.folder is None:
-            return compare_robots(self.definition, self.library, jobs=jobs, progress=progress)
-        return verify(self.folder, self.library, jobs=jobs, progress=progress).differences
+            return compare_robots(self.definition, self.library, jobs=jobs)
+        return verify(self.folder, self.library, jobs=jobs).differences
 
 
 Names = str | Sequence[str]

@@ -19,7 +19,6 @@ from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
-from morphgen.processes import Progress, no_progress
 
 _FIXES = {
     "part-missing": "name the folder of your parts with --library, or correct the derivation",
@@ -82,7 +81,6 @@ def audit(
     *,
     near: NearThresholds = NEAR_THRESHOLDS,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> Audit:
     """Find leaks between train and test robots, and violations of the regime.
 
@@ -102,7 +100,7 @@ def audit(
     holds out, because such splits are made without repeated robots; else it is a warning. So is
     ``accepted-unused`` (the split accepts a finding that does not occur).
     """
-    return audit_survey(survey_split(split, library, jobs=jobs, progress=progress), library, near)
+    return audit_survey(survey_split(split, library, jobs=jobs), library, near)
 
 
 def audit_survey(

@@ -16,7 +16,6 @@ from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.benchmark.survey import SplitSurvey, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, no_progress
 from morphgen.typing import Array
 
 DIGITS = 6
@@ -87,10 +86,9 @@ def split_difficulty(
     *,
     results: BaselineResults | None = None,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> tuple[RobotDifficulty, ...]:
     """Compose, measure and compare the robots of a split; see ``survey_difficulty``."""
-    survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
+    survey = survey_split(split, library, within_train=True, jobs=jobs)
     return survey_difficulty(survey, results)
 
 

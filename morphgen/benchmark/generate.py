@@ -25,7 +25,6 @@ from morphgen.benchmark.regimes import (
 from morphgen.benchmark.robot_factory import (
     Candidate,
     ComposedRecipe,
-    Progress,
     RobotFactory,
     SampledRecipe,
     UnfitRobotError,
@@ -42,6 +41,7 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import RandomChooser, RecordedChooser, TooManyPartsError, derive
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
+from morphgen.progress import report, show_progress
 
 MAX_DRAWS = 2000
 """Number of rejected draws after which a search fails. A draw is cheap: most are rejected by their
@@ -131,13 +131,12 @@ class TestRobotSearch:
         request: SplitRequest,
         train: Sequence[Candidate],
         factory: RobotFactory,
-        progress: Progress,
         *,
         skip_unfit: bool = False,
     ) -> None:
         """Begin with no test robots."""
         self._skip_unfit = skip_unfit
-        self._request, self._factory, self._progress = request, factory, progress
+        self._request, self._factory = request, factory
         self._num_train = len(train)
         self._name_by_hash = {robot.hash: robot.name for robot in train}
         self._rejected: Counter[str] = Counter()
@@ -176,7 +175,8 @@ class TestRobotSearch:
         if reason:
             return reason
         try:
-            robot = self._factory(stream.recipe(number))
+            with show_progress(None):
+                robot = self._factory(stream.recipe(number))
         except UnfitRobotError as error:
             if not self._skip_unfit:
                 raise
@@ -191,7 +191,7 @@ class TestRobotSearch:
             return reason
         self._name_by_hash[robot.hash] = robot.name
         self.robots.append(robot)
-        self._progress(self._num_train + len(self.robots))
+        report(self._num_train + len(self.robots), None)
         return ""
 
     def failure(self) -> str:
@@ -267,7 +267,6 @@ def interpolation(
     *,
     hull: str = "any",
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have the structure of a train robot.
 
@@ -284,9 +283,9 @@ def interpolation(
     test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
     factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
     recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
-    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    train = make_robots(recipes, factory, jobs=jobs)
     criterion = StructureAndHull(train, request.train[0], hull, library)
-    search = TestRobotSearch(request, train, factory, progress)
+    search = TestRobotSearch(request, train, factory)
     if not search.find([test_stream], criterion, NearReason(train)):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
@@ -357,7 +356,6 @@ def composition(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have only trained parts, in an untrained combination.
 
@@ -382,7 +380,7 @@ def composition(
         candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
     }
     factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
-    composed_robots = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
+    composed_robots = make_robots(list(unique.values()), factory, jobs=jobs)
     robot_of = dict(zip(unique, composed_robots, strict=True))
     _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
     robots = []
@@ -610,7 +608,6 @@ def extrapolation(
     *,
     similarity: Bound | None = None,
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots share no grammar and no structure with a train robot.
 
@@ -630,10 +627,10 @@ def extrapolation(
     )
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]
-    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    train = make_robots(recipes, factory, jobs=jobs)
     reject_trained = UntrainedStructure(train, library)
     reject_by_similarity = SimilarityBound(train, request.train[0], similarity)
-    search = TestRobotSearch(request, train, factory, progress)
+    search = TestRobotSearch(request, train, factory)
     targets = ", ".join(grammar.name for grammar in test_grammars)
     if not search.find(test_streams, reject_trained, reject_by_similarity):
         raise BenchmarkError(f"{targets}: {search.failure()}; {reject_by_similarity.advice()}")

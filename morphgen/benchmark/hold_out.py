@@ -30,7 +30,6 @@ from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_rob
 from morphgen.benchmark.robot_factory import (
     Candidate,
     DerivedRecipe,
-    Progress,
     RobotFactory,
     SampledRecipe,
     UnfitRobotError,
@@ -45,6 +44,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, PartKind, parse_value
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
+from morphgen.progress import part_of
 
 MANUFACTURER = "manufacturer"
 """Key of conditions on the manufacturer of a part."""
@@ -546,13 +546,13 @@ class HoldOutSearch:
     """Reason by number of the robot."""
     _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
 
-    def run(self, jobs: int, progress: Progress) -> tuple[list[Candidate], list[Candidate]]:
+    def run(self, jobs: int) -> tuple[list[Candidate], list[Candidate]]:
         """Return the test and the train robots."""
         while True:
             test, train = self._choose()
             unknown = [number for number in (*test, *train) if number not in self.robots]
             self._require_enough(test, train, unknown)
-            self._compose(unknown, len(test) + len(train), jobs, progress)
+            self._compose(unknown, len(test) + len(train), jobs)
             num_rejected = len(self.rejected)
             self._reject_repeated([*test, *train])
             self._reject_near(test, train)
@@ -561,17 +561,12 @@ class HoldOutSearch:
                 self._require_covered(test, train)
                 return [self.robots[i] for i in test], [self.robots[i] for i in train]
 
-    def _compose(
-        self, unknown: Sequence[int], num_chosen: int, jobs: int, progress: Progress
-    ) -> None:
+    def _compose(self, unknown: Sequence[int], num_chosen: int, jobs: int) -> None:
         """Compose robots, or reject them."""
         num_known = num_chosen - len(unknown)
-
-        def report(done: int, total: int) -> None:
-            progress(num_known + done)
-
         drafts = [self.pool[number] for number in unknown]
-        results = parallel_map(self.compose, drafts, jobs, report)
+        with part_of(None, num_known):
+            results = list(parallel_map(self.compose, drafts, jobs))
         for number, result in zip(unknown, results, strict=True):
             if isinstance(result, _Unfit):
                 self.rejected[number] = result.reason
@@ -831,7 +826,6 @@ def hold_out(
     patterns: Sequence[str] = (),
     grammars: Sequence[Grammar] = (),
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have held-out parts, and whose train robots have none.
 
@@ -851,7 +845,7 @@ def hold_out(
     factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
     pool = dict(enumerate(make_pool(request, maker, patterns, grammars)))
     search = HoldOutSearch(request, maker, ComposeDraft(factory), pool)
-    test, train = search.run(jobs, progress)
+    test, train = search.run(jobs)
     robots = [*train, *test]
     names = unique_names(robot.derivation for robot in robots)
     named = [replace(robot, name=name) for robot, name in zip(robots, names, strict=True)]

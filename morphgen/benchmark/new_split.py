@@ -15,11 +15,11 @@ from morphgen.benchmark.generate import (
     parse_bound,
 )
 from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.robot_factory import Progress
 from morphgen.benchmark.split import HOLD_OUT, REGIMES, Regime, Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.library import Library
+from morphgen.progress import part_of
 
 MAX_WORD = 60
 """Largest number of characters of what is held out in the name of a split."""
@@ -103,29 +103,26 @@ def choose_robots(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
     """Return a split for each size of a request."""
     grammars, train, test = (
         [load_sound_grammar(name, library) for name in names]
         for names in (choice.grammar, choice.train_category, choice.test_category)
     )
-    if choice.regime == "interpolation":
-        (grammar,), hull = grammars, choice.hull or "any"
-        return interpolation(request, grammar, library, hull=hull, jobs=jobs, progress=progress)
-    if choice.regime == "composition":
-        return composition(request, choice.robots, library, jobs=jobs, progress=progress)
-    if choice.regime == "extrapolation":
-        bound = parse_bound(choice.similarity) if choice.similarity else None
-        return extrapolation(
-            request, train, test, library, similarity=bound, jobs=jobs, progress=progress
+    with part_of(request.train[-1] + request.test if request.train else None):
+        if choice.regime == "interpolation":
+            (grammar,), hull = grammars, choice.hull or "any"
+            return interpolation(request, grammar, library, hull=hull, jobs=jobs)
+        if choice.regime == "composition":
+            return composition(request, choice.robots, library, jobs=jobs)
+        if choice.regime == "extrapolation":
+            bound = parse_bound(choice.similarity) if choice.similarity else None
+            return extrapolation(request, train, test, library, similarity=bound, jobs=jobs)
+        return hold_out(
+            request,
+            choice.hold_out,
+            library,
+            patterns=choice.robots,
+            grammars=grammars,
+            jobs=jobs,
         )
-    return hold_out(
-        request,
-        choice.hold_out,
-        library,
-        patterns=choice.robots,
-        grammars=grammars,
-        jobs=jobs,
-        progress=progress,
-    )

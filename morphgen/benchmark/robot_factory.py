@@ -153,10 +153,9 @@ def make_robots(
     factory: RobotFactory,
     *,
     jobs: int = 1,
-    progress: Progress = lambda done: None,
 ) -> list[Candidate]:
     """Make robots and return them in the order of their recipes."""
-    return list(parallel_map(factory, recipes, jobs, lambda done, _: progress(done)))
+    return list(parallel_map(factory, recipes, jobs))
 
 
 def category_of(words: Sequence[str], library: Library) -> str:

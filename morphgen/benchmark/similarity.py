@@ -18,6 +18,7 @@ from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Pose, Shap
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Joint, Robot
+from morphgen.progress import report
 from morphgen.typing import Array
 
 KIND, AXIS, LENGTH, SHAPE, SIZE = 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 16
@@ -335,7 +336,6 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
 def similarity_matrix(
     robots: Sequence[Features],
     measure: str,
-    progress: Callable[[int], None] = lambda pairs: None,
 ) -> Array:
     """Compare all pairs of robots.
 
@@ -344,10 +344,11 @@ def similarity_matrix(
     """
     function = get_measure(measure).function
     values = np.empty((len(robots), len(robots)))
+    num_pairs = len(robots) * (len(robots) + 1) // 2
     for i, robot in enumerate(robots):
         for j in range(i + 1):
             values[i, j] = values[j, i] = function(robot, robots[j])
-        progress(i + 1)
+        report((i + 1) * (i + 2) // 2, num_pairs)
     return values
 
 

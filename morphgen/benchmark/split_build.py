@@ -47,7 +47,7 @@ from morphgen.formats.files import (
     write_atomic,
 )
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,6 @@ def build_split(
     *,
     jobs: int = 1,
     settings: BuildSettings = BUNDLED,
-    progress: Progress = no_progress,
 ) -> BuildReport:
     """Write a split and all its robots to ``folder / split.name``.
 
@@ -84,7 +83,7 @@ def build_split(
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
                 shutil.rmtree(leftover, ignore_errors=True)
             writer = _RobotWriter(library.folders, split_folder, settings, split.max_links)
-            results = parallel_map(writer, members, jobs, progress)
+            results = parallel_map(writer, members, jobs)
             robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
             _finish(split_folder, split, settings, robots)
     num_written = sum(robot.is_new for robot in robots.values())

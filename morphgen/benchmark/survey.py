@@ -24,7 +24,8 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.values import RobotProperties
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
+from morphgen.progress import part_of
 from morphgen.typing import Array
 
 
@@ -142,26 +143,21 @@ def survey_split(
     *,
     within_train: bool = False,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once in each side."""
     train_members, test_members = _firsts(split.train), _firsts(split.test)
     done_first = len(train_members) + len(test_members)
     total = done_first + within_train * len(train_members)
     measurement = _Measurement(library.folders, split.max_links)
-    test_robots = list(
-        parallel_map(measurement, test_members, jobs, lambda done, _: progress(done, total))
-    )
+    with part_of(total):
+        test_robots = list(parallel_map(measurement, test_members, jobs))
     compare = _Comparison(
         measurement,
         tuple(None if isinstance(robot, Fault) else robot.features for robot in test_robots),
         keep_features=within_train,
     )
-    train_robots = list(
-        parallel_map(
-            compare, train_members, jobs, lambda done, _: progress(len(test_members) + done, total)
-        )
-    )
+    with part_of(total, len(test_members)):
+        train_robots = list(parallel_map(compare, train_members, jobs))
     rows = _first_indices(split.train, train_members)
     columns = _first_indices(split.test, test_members)
     shape = (len(train_members), len(test_members), len(MEASURES))
@@ -169,7 +165,8 @@ def survey_split(
     pairs = None
     if within_train:
         compared = tuple(robot.features for robot in train_robots)
-        pairs = _compare_pairs(compared, jobs, lambda done, _: progress(done_first + done, total))
+        with part_of(total, done_first):
+            pairs = _compare_pairs(compared, jobs)
         pairs = pairs[rows][:, rows]
     return SplitSurvey(
         split,
@@ -264,10 +261,10 @@ def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Ar
     return values
 
 
-def _compare_pairs(robots: tuple[Features | None, ...], jobs: int, progress: Progress) -> Array:
+def _compare_pairs(robots: tuple[Features | None, ...], jobs: int) -> Array:
     """Return the similarity of n robots to each other, shape (n, n, n_measures); NaN to itself."""
     values = np.full((len(robots), len(robots), len(MEASURES)), np.nan)
-    rows = parallel_map(_PairComparison(robots), range(len(robots)), jobs, progress)
+    rows = parallel_map(_PairComparison(robots), range(len(robots)), jobs)
     for i, row in enumerate(rows):
         values[i, :i] = values[:i, i] = row
     return values
@@ -285,14 +282,13 @@ def statistics(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> dict[str, object]:
     """Compute the statistics that the file of a split contains.
 
     Returns:
         Plain data; see ``summarize_survey``.
     """
-    return summarize_survey(survey_split(split, library, jobs=jobs, progress=progress))
+    return summarize_survey(survey_split(split, library, jobs=jobs))
 
 
 def summarize_survey(survey: SplitSurvey) -> dict[str, object]:

@@ -59,7 +59,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import file_sha256, folder_hashes
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 from morphgen.typing import Array
 
 TABLE_TOLERANCE = 1e-3
@@ -79,7 +79,6 @@ def release_differences(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> Iterator[tuple[str, str]]:
     """Yield what a release states otherwise than its split: a file, and what is wrong with it."""
     try:
@@ -93,7 +92,7 @@ def release_differences(
     except MorphgenError as error:
         yield RELEASE_FILE, str(error)
     if (folder / DIFFICULTY_FILE).exists():  # releases of versions before 0.3 have none
-        survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
+        survey = survey_split(split, library, within_train=True, jobs=jobs)
         for why in _difficulty_differences(folder / DIFFICULTY_FILE, survey):
             yield DIFFICULTY_FILE, why
 
@@ -190,7 +189,6 @@ def verify(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> Verification:
     """Compare a split with the robots that its derivations give today.
 
@@ -201,7 +199,7 @@ def verify(
     folder = Path(name_or_path)
     if is_archive(folder):
         with opened_folder(folder) as unpacked:
-            return verify(unpacked, library, jobs=jobs, progress=progress)
+            return verify(unpacked, library, jobs=jobs)
     is_built = folder.is_dir()
     if is_built:
         require_split_folder(folder)
@@ -213,14 +211,12 @@ def verify(
         why = f"its id is {split_file.id}, but that of its robots is {computed_id}"
         differences.append(Difference(str(path), why))
     if is_built:
-        differences += _folder_differences(folder, split_file.split, library, jobs, progress)
+        differences += _folder_differences(folder, split_file.split, library, jobs)
         if is_release(folder):
-            found = release_differences(
-                folder, split_file.split, library, jobs=jobs, progress=progress
-            )
+            found = release_differences(folder, split_file.split, library, jobs=jobs)
             differences += itertools.starmap(Difference, found)
     else:
-        differences += compare_robots(split_file.split, library, jobs=jobs, progress=progress)
+        differences += compare_robots(split_file.split, library, jobs=jobs)
     content = file_sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
     return Verification(split_file.split, computed_id, tuple(differences), content)
 
@@ -234,12 +230,10 @@ def require_unchanged(folder: Path, name: str) -> None:
         raise BenchmarkError(f"{name}: {first}{more}; get it again, or see morphgen split verify")
 
 
-def compare_robots(
-    split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
-) -> tuple[Difference, ...]:
+def compare_robots(split: Split, library: Library, *, jobs: int = 1) -> tuple[Difference, ...]:
     """Compose every robot of a split and compare its hash; see ``verify``."""
     inspector = _Inspector(library.folders, split.max_links)
-    return tuple(_robot_differences(split, _inspect(split, inspector, jobs, progress)))
+    return tuple(_robot_differences(split, _inspect(split, inspector, jobs)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,13 +272,11 @@ class _Inspector:
             return _Inspection((str(error),))
 
 
-def _inspect(
-    split: Split, inspector: _Inspector, jobs: int, progress: Progress
-) -> dict[tuple[str, str], _Inspection]:
+def _inspect(split: Split, inspector: _Inspector, jobs: int) -> dict[tuple[str, str], _Inspection]:
     """Inspect each different robot once; return the results by derivation and hash."""
     members = [member for _, member in reversed(sided_members(split))]
     firsts = {(member.derivation, member.robot_hash): member for member in members}
-    inspections = parallel_map(inspector, list(firsts.values()), jobs, progress)
+    inspections = parallel_map(inspector, list(firsts.values()), jobs)
     return dict(zip(firsts, inspections, strict=True))
 
 
@@ -297,7 +289,7 @@ def _robot_differences(
 
 
 def _folder_differences(
-    folder: Path, split: Split, library: Library, jobs: int, progress: Progress
+    folder: Path, split: Split, library: Library, jobs: int
 ) -> Iterator[Difference]:
     id_, light = read_settings(folder / BUILD_FILE)
     if id_ != split_id(split):
@@ -310,7 +302,7 @@ def _folder_differences(
     files = list(_file_differences(folder))
     yield from files
     inspector = _Inspector(library.folders, split.max_links, folder, light, paths)
-    inspected = _inspect(split, inspector, jobs, progress)
+    inspected = _inspect(split, inspector, jobs)
     # A changed file explains the differences of its robot.
     explained = {difference.where for difference in files}
     for difference in _robot_differences(split, inspected):

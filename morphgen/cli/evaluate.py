@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
-from morphgen.cli.progress import TrainingProgress
+from morphgen.cli.progress import training_progress
 from morphgen.cli.train import (
     GOAL_SEED,
     SIDES,
@@ -21,6 +20,7 @@ from morphgen.cli.train import (
     split_option,
 )
 from morphgen.errors import TaskError
+from morphgen.progress import stage
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
 from morphgen.tasks.registry import DEFAULT_SIMULATOR
@@ -172,15 +172,15 @@ def evaluate(args: argparse.Namespace) -> None:
     is_baseline = args.checkpoint in BASELINES
     if args.submission is not None and not is_baseline:
         args.mode = args.mode or "deterministic"
-    with closing(TrainingProgress()) as display:
-        scores = (_baseline_scores if is_baseline else _policy_scores)(args, display)
+    with training_progress():
+        scores = (_baseline_scores if is_baseline else _policy_scores)(args)
     data = {mode: scores_to_json(results) for mode, results in scores.items()}
     opt.print_result(args, data, lambda: f"{score_table(scores)}\n{summary(scores)}")
     if args.out is not None:
         write_scores(args.out, scores)
 
 
-def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
+def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, no_record
     from morphgen.tasks.scenes.env_specs import default_configs
 
@@ -198,12 +198,12 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
         _with_goal(default_configs(), sources, args),
     )
     plan = plan_submission(args, sources[0], config, method=name)
-    _prepare(sources, config, display)
+    _prepare(sources, config)
     record = plan.record if plan else no_record
     scores: list[Score] = []
     for source in sources:
-        progress = display.evaluation(source.side)
-        scores += evaluate_baseline(name, source, config, progress=progress, record=record)
+        with stage(source.side):
+            scores += evaluate_baseline(name, source, config, record=record)
     if plan:
         plan.write()
     return {name: scores}
@@ -215,16 +215,16 @@ def _sources_of(source: RobotSource, sides: Sequence[Side]) -> list[RobotSource]
     return [other_side(source, side) for side in sides]
 
 
-def _prepare(sources: Sequence[RobotSource], config: EvalConfig, display: TrainingProgress) -> None:
+def _prepare(sources: Sequence[RobotSource], config: EvalConfig) -> None:
     """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
     from morphgen.rl.runs.robot_source import specs_of
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
     for source in sources:
-        specs_of(source, GoalConfig(tasks=config.tasks), display.goal_sets)
+        specs_of(source, GoalConfig(tasks=config.tasks))
 
 
-def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
+def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import (
         eval_config_of,
         evaluate_checkpoints,
@@ -253,7 +253,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
         run = read_config(path)
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
-    given = _given_robots(args, run, files[0].parent, config, display)
+    given = _given_robots(args, run, files[0].parent, config)
     sources = given or [run.source]
     require_trained_tasks(run, sources, args.checkpoint)
     tasks = _with_goal(config.tasks, sources, args)
@@ -270,7 +270,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
     record = plan.record if plan else no_record
-    _prepare(given or _sources_of(run.source, sides), config, display)
+    _prepare(given or _sources_of(run.source, sides), config)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
         _warn_of_drawn(files[0].parent, sources)
@@ -278,22 +278,14 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
         scores = results[mode] = []
         if given:
             for source in given:
-                progress = display.evaluation(f"{mode} on {source.side}")
-                scores += evaluate_checkpoints(
-                    files,
-                    source,
-                    config,
-                    mode,
-                    device=args.device,
-                    progress=progress,
-                    record=record,
-                )
+                with stage(f"{mode} on {source.side}"):
+                    scores += evaluate_checkpoints(
+                        files, source, config, mode, device=args.device, record=record
+                    )
             continue
         for side in sides:
-            progress = display.evaluation(f"{mode} on {side}")
-            scores += evaluate_run(
-                path, side, config, mode, device=args.device, progress=progress, record=record
-            )
+            with stage(f"{mode} on {side}"):
+                scores += evaluate_run(path, side, config, mode, device=args.device, record=record)
     if plan:
         plan.write()
     return results
@@ -304,7 +296,6 @@ def _given_robots(
     run: RunConfig,
     folder: Path,
     config: EvalConfig,
-    display: TrainingProgress,
 ) -> list[RobotSource]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
     from morphgen.rl.runs.drawn_robots import fresh_source
@@ -325,7 +316,6 @@ def _given_robots(
         GoalConfig(tasks=tasks),
         args.seed,
         jobs=args.workers,
-        progress=display.goal_sets,
     )
     print(f"morphgen: {line}", file=sys.stderr)
     return [fresh]

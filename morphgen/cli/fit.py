@@ -247,10 +247,8 @@ def _fit_robot(
     from morphgen.formats.bundle import write_bundle
 
     folders = opt.library_of(args).folders
-    with bar(args, f"fitting {target.label}", "link") as shown:
-        fit = fit_robot(
-            target.robot, options, folders, visual=args.visual, jobs=args.jobs, progress=shown
-        )
+    with bar(args, f"fitting {target.label}", "link"):
+        fit = fit_robot(target.robot, options, folders, visual=args.visual, jobs=args.jobs)
     report = fit.report
     if not args.json:
         print(_report_text(report))

@@ -93,7 +93,7 @@ def play(args: argparse.Namespace) -> None:
             f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}"
         )
 
-    with bar(args, f"preparing {robot} and its goals") as progress:
+    with bar(args, f"preparing {robot} and its goals"):
         env, controller = make_env_and_controller(
             spec,
             robot,
@@ -102,7 +102,6 @@ def play(args: argparse.Namespace) -> None:
             sim=args.sim,
             obstacles=args.obstacles,
             config=config,
-            progress=progress,
             library=args.library,
             render_mode=None if args.out is None else "rgb_array",
         )
@@ -155,7 +154,7 @@ def speed(args: argparse.Namespace) -> None:
         from morphgen.tasks.speed import measure_speed
 
     robot, sim = " ".join(args.words), args.sim or DEFAULT_SIMULATOR
-    with bar(args, f"preparing {robot} and its goals") as progress:
+    with bar(args, f"preparing {robot} and its goals"):
         batch = make_batch(
             args.task,
             [robot],
@@ -165,7 +164,6 @@ def speed(args: argparse.Namespace) -> None:
             device=args.device or SIMULATORS[sim].devices[0],
             obstacles=args.obstacles,
             max_links=None,
-            progress=progress,
             library=args.library,
         )
     with closing(batch), status(args, "measuring"):
@@ -251,13 +249,8 @@ def zeroshot(args: argparse.Namespace) -> None:
     config = eval_config_of(run, args.episodes, seed=args.seed, workers=args.workers)
     tasks = opt.with_goal(config.tasks, args.goal, [args.task])
     config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)
-    with bar(args, "running the episodes") as progress:
-        results = zero_shot(
-            source,
-            policy,
-            config,
-            progress=lambda name, done, total: progress(int(done), total),
-        )
+    with bar(args, "running the episodes"):
+        results = zero_shot(source, policy, config)
     rows = [finite_or_none(asdict(result)) for result in results]
     opt.print_result(args, rows, lambda: _table(results, args.task))
     if args.out is not None:

@@ -11,11 +11,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
+from morphgen.progress import Progress, show_progress
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
     from morphgen.rl.distributed import UpdateMetrics
-    from morphgen.rl.evaluation import Progress
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
 T = TypeVar("T")
@@ -62,6 +63,15 @@ class Bar:
 
 @contextmanager
 def bar(
+    args: argparse.Namespace, title: str, unit: str = "robot", total: int | None = None
+) -> Iterator[None]:
+    """Show the progress of this block in a bar; see ``_bar``."""
+    with _bar(args, title, unit, total) as shown, show_progress(shown):
+        yield
+
+
+@contextmanager
+def _bar(
     args: argparse.Namespace,
     title: str,
     unit: str = "robot",
@@ -121,7 +131,7 @@ def track(
     items: Iterable[T], args: argparse.Namespace, title: str, unit: str, total: int
 ) -> Iterator[T]:
     """Yield the items, and show in a bar how many of them are finished."""
-    with bar(args, title, unit, total) as shown:
+    with _bar(args, title, unit, total) as shown:
         for item in items:
             raise_if_interrupted()
             yield item
@@ -139,17 +149,20 @@ def print_line(line: str) -> None:
 @contextmanager
 def status(args: argparse.Namespace, text: str) -> Iterator[None]:
     """Show on a terminal what the command does and for how long, until the work is done."""
-    with bar(args, text, layout="{desc} [{elapsed}]"):
+    with _bar(args, text, layout="{desc} [{elapsed}]"):
         yield
 
 
 @contextmanager
-def training_progress(how_to_resume: str = "with --resume") -> Iterator[TrainingProgress]:
+def training_progress(how_to_resume: str | None = None) -> Iterator[TrainingProgress]:
     """Yield a display of trainings and evaluations; Ctrl-C says how to resume them."""
     display = TrainingProgress()
     try:
-        yield display
+        with show_progress(display):
+            yield display
     except KeyboardInterrupt as interrupt:
+        if how_to_resume is None:
+            raise
         text = f"it continues from its last checkpoint, if there is one, {how_to_resume}"
         raise KeyboardInterrupt(text) from interrupt
     finally:
@@ -165,26 +178,26 @@ class TrainingProgress:
         self._goal_bar: Bar | None = None
         self._last_line: float | None = None
 
-    def goal_sets(self, done: int, total: int) -> None:
+    def __call__(self, done: float, total: int | None) -> None:
         """Show how many of the robots have their goal set."""
         raise_if_interrupted()
         if not sys.stderr.isatty():
             now = time.monotonic()
             if self._last_line is None:
                 self._last_line = now
-            if done < total and now - self._last_line > GOAL_LINE_INTERVAL:
+            if total and done < total and now - self._last_line > GOAL_LINE_INTERVAL:
                 self._last_line = now
                 print(f"goal sets: {done} of {total} robots", file=sys.stderr, flush=True)
             return
         if self._goal_bar is None:
             self.close()
-            self._goal_bar = self._shown.enter_context(bar(argparse.Namespace(), "goal sets"))
+            self._goal_bar = self._shown.enter_context(_bar(argparse.Namespace(), "goal sets"))
         self._goal_bar(done, total)
         if done == total:
             self.close()
             self._shown.enter_context(status(argparse.Namespace(), "preparing"))
 
-    def __call__(self, subrun: Subrun) -> ShowMetrics:
+    def training(self, subrun: Subrun) -> ShowMetrics:
         """Begin with a subrun; return the function that shows its metrics.
 
         A line at its end says how many of its episodes diverged, if any did.
@@ -209,16 +222,19 @@ class TrainingProgress:
         self._shown.callback(shown.close)
         return lambda report, total: _draw_update(shown, _counted(report, diverged))
 
-    def evaluation(self, name: str) -> Progress:
-        """Begin with an evaluation; return the function that shows how many episodes ended."""
+    @contextmanager
+    def stage(self, title: str) -> Iterator[None]:
+        """Show how many episodes of an evaluation ended."""
         raise_if_interrupted()
         self.close()
         if not sys.stderr.isatty():
-            return _print_each_minute(name)
+            with show_progress(_print_each_minute(title)):
+                yield
+            return
         layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
-        return self._shown.enter_context(
-            bar(argparse.Namespace(), name, "episode", layout=layout, delay=0)
-        )
+        shown = _bar(argparse.Namespace(), title, "episode", layout=layout, delay=0)
+        with shown as show, show_progress(show):
+            yield
 
     def close(self) -> None:
         """Finish the bar that is shown."""
@@ -251,7 +267,7 @@ def _print_update(name: str, report: UpdateMetrics, num_updates: int) -> None:
 def _print_each_minute(name: str) -> Progress:
     last = time.monotonic()
 
-    def update(done: float, total: int) -> None:
+    def update(done: float, total: int | None) -> None:
         nonlocal last
         if time.monotonic() - last > LINE_INTERVAL:
             last = time.monotonic()

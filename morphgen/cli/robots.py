@@ -61,8 +61,8 @@ def compose(args: argparse.Namespace) -> int:
     if args.geometry != "mesh":
         from morphgen.fitting.collision_geometry import with_geometry
 
-        with bar(args, "replacing collision meshes", "shape") as shown:
-            robot = with_geometry(robot, args.geometry, library.folders, progress=shown)
+        with bar(args, "replacing collision meshes", "shape"):
+            robot = with_geometry(robot, args.geometry, library.folders)
     return write_and_report(robot, args)
 
 

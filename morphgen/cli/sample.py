@@ -177,8 +177,8 @@ def sample(args: argparse.Namespace) -> None:
         work = make_on_ray(args.ray or None)
     elif args.jobs > 1:
         work = make_in_processes(args.jobs)
-    with bar(args, "sampling", total=args.n) as update:
-        report = make_set(config, args.n, work, lambda done: update(min(done, args.n)))
+    with bar(args, "sampling", total=args.n):
+        report = make_set(config, args.n, work)
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]

@@ -14,6 +14,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option
 from morphgen.cli.progress import bar, track
 from morphgen.errors import BenchmarkError
+from morphgen.progress import part_of
 
 if TYPE_CHECKING:
     from morphgen.benchmark.similarity import Features
@@ -117,8 +118,12 @@ def _matrices(
     from morphgen.benchmark.similarity import similarity_matrix
 
     pairs = len(measures) * len(robots) * (len(robots) + 1) // 2
-    with bar(args, "comparing", "pair", pairs) as shown:
-        return {name: similarity_matrix(robots, name, shown.add) for name in measures}
+    matrices: dict[str, Array] = {}
+    with bar(args, "comparing", "pair", pairs):
+        for name in measures:
+            with part_of(pairs, len(matrices) * pairs // len(measures)):
+                matrices[name] = similarity_matrix(robots, name)
+    return matrices
 
 
 def _text(names: Sequence[str], measure: str, values: Array) -> str:

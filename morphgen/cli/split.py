@@ -101,9 +101,9 @@ def make_goals(
     """Sample the goal sets of a split's robots, or read them from the cache."""
     from morphgen.tasks.goals.split_goals import sample_split_goals
 
-    with bar(args, "sampling goals") as update:
+    with bar(args, "sampling goals"):
         return sample_split_goals(
-            split, opt.library_of(args), config, jobs=args.jobs, certified=certify, progress=update
+            split, opt.library_of(args), config, jobs=args.jobs, certified=certify
         )
 
 
@@ -196,8 +196,8 @@ def audit(args: argparse.Namespace) -> int:
     near = _near(args.near)
     split, folder = read_split_or_folder(args.split)
     library = opt.library_of(args)
-    with bar(args, "auditing") as update:
-        result = audit(split, library, near=near, jobs=args.jobs, progress=update)
+    with bar(args, "auditing"):
+        result = audit(split, library, near=near, jobs=args.jobs)
     result, goals = _audit_goals(args, result, split, folder)
     passed = result.passed(strict=args.strict)
     sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
@@ -243,9 +243,9 @@ def _audit_goals(
     goals = goals_to_audit(folder, args.goal_seed, sample)
     findings = None
     if goals is not None:
-        with bar(args, "auditing goals") as update:
+        with bar(args, "auditing goals"):
             library = opt.library_of(args)
-            findings = audit_goals(split, goals, library, jobs=args.jobs, progress=update)
+            findings = audit_goals(split, goals, library, jobs=args.jobs)
     return with_goal_findings(result, split, findings), goals
 
 
@@ -323,7 +323,7 @@ def build(args: argparse.Namespace) -> None:
         opt.reject_idle({"--goal-seed": args.goal_seed is not None}, "only with --goals")
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     goals = make_goals(args, split, config) if args.goals else []
-    with bar(args, "building") as update:
+    with bar(args, "building"):
         report = build_with_goals(
             split,
             args.out,
@@ -332,7 +332,6 @@ def build(args: argparse.Namespace) -> None:
             goals,
             config,
             jobs=args.jobs,
-            progress=update,
         )
     written, kept = report.num_written, report.num_kept
     data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
@@ -363,8 +362,8 @@ def verify(args: argparse.Namespace) -> int:
     """Verify a split and print what differs."""
     from morphgen.benchmark.verify import verify
 
-    with bar(args, "verifying") as update:
-        result = verify(args.path, opt.library_of(args), jobs=args.jobs, progress=update)
+    with bar(args, "verifying"):
+        result = verify(args.path, opt.library_of(args), jobs=args.jobs)
     differences, split = result.differences, result.split
     data = {
         "split": split.name,
@@ -424,8 +423,8 @@ def difficulty(args: argparse.Namespace) -> None:
     library = opt.library_of(args)
     rows: list[RobotDifficulty] = []
     for split, known in zip(splits, results, strict=True):
-        with bar(args, split.name) as update:
-            rows += split_difficulty(split, library, results=known, jobs=args.jobs, progress=update)
+        with bar(args, split.name):
+            rows += split_difficulty(split, library, results=known, jobs=args.jobs)
     baselines = _baselines(results)
     if args.csv is not None:
         write_file(args.csv, difficulty_csv(rows, baselines))
@@ -618,10 +617,8 @@ def stats(args: argparse.Namespace) -> None:
     groups = _by_robots([read_split(name) for name in args.splits or split_names()])
     statistics_by_title: dict[str, dict[str, Any]] = {}
     for title, splits in groups.items():
-        with bar(args, title) as update:
-            statistics_by_title[title] = statistics(
-                splits[0], library, jobs=args.jobs, progress=update
-            )
+        with bar(args, title):
+            statistics_by_title[title] = statistics(splits[0], library, jobs=args.jobs)
     limits = {
         title: restricted(licenced_parts(splits[0], library)) for title, splits in groups.items()
     }

@@ -33,8 +33,8 @@ def new_split(args: argparse.Namespace) -> None:
     require_split_name(request.name)
     library = opt.library_of(args)
     total = request.train[-1] + request.test if request.train else None
-    with bar(args, "sampling", total=total) as update:
-        splits = choose_robots(_choice(args), request, library, jobs=args.jobs, progress=update)
+    with bar(args, "sampling", total=total):
+        splits = choose_robots(_choice(args), request, library, jobs=args.jobs)
     if args.statistics:
         splits = tuple(
             replace(split, statistics=statistics(split, library, jobs=args.jobs))

@@ -103,7 +103,7 @@ def release(args: argparse.Namespace) -> None:
         goals=not args.no_goals,
         settings=BuildSettings(light=args.light),
     )
-    with bar(args, "releasing") as update:
+    with bar(args, "releasing"):
         report = release_split(
             split,
             args.out,
@@ -112,7 +112,6 @@ def release(args: argparse.Namespace) -> None:
             extra=extra,
             results=results,
             jobs=args.jobs,
-            progress=update,
         )
     notes = _notes(args, split, extra)
     data = {
@@ -196,8 +195,8 @@ def score(args: argparse.Namespace) -> None:
     name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
     with ExitStack() as stack:
         split, protocol, references, version = _open(name, stack)
-    with bar(args, "composing robots") as update:
-        expected = expected_robots(split, protocol, library, jobs=args.jobs, progress=update)
+    with bar(args, "composing robots"):
+        expected = expected_robots(split, protocol, library, jobs=args.jobs)
     named = [
         *((f"{name}: reference {each.method}", each) for each in references.submissions),
         *zip(map(str, args.submissions), submissions, strict=True),

@@ -184,7 +184,7 @@ def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
     execution = execution_config(args)
     with training_progress("if the same command is given again") as show:
         if args.ray is None:
-            outcomes = run_cells(cells, execution, show, show.evaluation, show.goal_sets)
+            outcomes = run_cells(cells, execution, show.training)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
             outcomes = run_cells_on_ray(args.ray or None, gpus=gpus)(cells, execution)

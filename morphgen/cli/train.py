@@ -6,7 +6,6 @@ import argparse
 import re
 import shlex
 import sys
-from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
 from morphgen.cli.options import reject_idle
-from morphgen.cli.progress import TrainingProgress, status, training_progress
+from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.runs.presets import PRESETS, preset_of
@@ -222,8 +221,8 @@ def draw_robots(
     from morphgen.benchmark.tokens import default_max_links
     from morphgen.rl.runs.drawn_robots import draw
 
-    with closing(TrainingProgress()) as display:
-        robots = draw(source, config, jobs=args.workers, progress=display.goal_sets)
+    with training_progress():
+        robots = draw(source, config, jobs=args.workers)
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
@@ -369,7 +368,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
     from morphgen.rl.runs.checkpoint import CHECKPOINT
     from morphgen.rl.runs.training import is_done, train
 
-    with training_progress() as show:
+    with training_progress("with --resume") as show:
         execution = execution_config(args)
         if config.source.grammars and not SIMULATORS[config.sim].takes_workers:
             execution = replace(execution, workers=1)  # those of --workers have drawn the robots
@@ -378,8 +377,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
             config,
             resume=args.resume,
             execution=execution,
-            show=show,
-            prepare=show.goal_sets,
+            show=show.training,
         )
     for subrun in subruns:
         if (subrun.folder / CHECKPOINT).is_file():

@@ -19,7 +19,6 @@ from morphgen.formats.fits import FITTER_VERSION, MAX_PRIMITIVES, find_fit, read
 from morphgen.formats.srdf import BoundingSphere, LinkSpheres
 from morphgen.model.geometry import Shape, Sphere
 from morphgen.model.robot import Link, Robot
-from morphgen.processes import Progress, no_progress
 
 SPHERES = 8
 """Default number of spheres per link."""
@@ -36,7 +35,6 @@ def as_spheres(
     spheres: int = SPHERES,
     cover: float | None = None,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> Robot:
     """Return the robot with spheres as its collision shapes.
 
@@ -54,7 +52,7 @@ def as_spheres(
     kind = f"{_CACHE}-{spheres}" if cover is None else f"{_CACHE}-{spheres}-{cover!r}"
     fits = cached_fits(others, kind)
     if missing := [link for link in others if link.name not in fits]:
-        fits |= fit_and_keep(robot, missing, options, kind, stored, jobs=jobs, progress=progress)
+        fits |= fit_and_keep(robot, missing, options, kind, stored, jobs=jobs)
     for link in links:
         if has_only_spheres(link.collisions) and (fit := find_fit(link.collisions, robot, stored)):
             fits[link.name] = fit
@@ -92,18 +90,16 @@ pieces. ``sphere``: spheres in place of all shapes."""
 GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
 
 
-def with_geometry(
-    robot: Robot, geometry: str, folders: Sequence[Path], *, progress: Progress = no_progress
-) -> Robot:
+def with_geometry(robot: Robot, geometry: str, folders: Sequence[Path]) -> Robot:
     """Return the robot with the collision shapes of a geometry."""
     if geometry not in GEOMETRIES:
         raise FitError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
     if geometry == "primitive":
-        return as_primitives(robot, folders, progress=progress)
+        return as_primitives(robot, folders)
     if geometry == "convex":
         from morphgen.fitting.convex_pieces import as_convex  # imports trimesh
 
-        return as_convex(robot, folders, progress=progress)
+        return as_convex(robot, folders)
     if geometry == "sphere":
-        return as_spheres(robot, folders, progress=progress)
+        return as_spheres(robot, folders)
     return robot

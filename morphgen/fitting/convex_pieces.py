@@ -31,7 +31,7 @@ from morphgen.formats.fits import find_fit, has_meshes, read_stored_fits, shapes
 from morphgen.model.geometry import Mesh, Shape, StoredFit
 from morphgen.model.mesh import convex_hull, is_flat, load_mesh
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
+from morphgen.progress import report
 from morphgen.typing import Array
 
 MAX_PIECES = 16
@@ -65,9 +65,7 @@ _CACHE_DIR = "convex-1"
 _PIECE = "piece-{:02d}.stl"
 
 
-def as_convex(
-    robot: Robot, folders: Sequence[Path] = (), *, progress: Progress = no_progress
-) -> Robot:
+def as_convex(robot: Robot, folders: Sequence[Path] = ()) -> Robot:
     """Return the robot with convex pieces in place of its collision meshes.
 
     Pieces are kept in the user's cache under the content of the mesh file, so a mesh is decomposed
@@ -96,9 +94,9 @@ def as_convex(
             robot.name,
         )
     for done, mesh in enumerate(missing):
-        progress(done, len(missing))
+        report(done, len(missing))
         _write_pieces(decompose(mesh), folder_of[mesh])
-    progress(len(missing), len(missing))
+    report(len(missing), len(missing))
     pieces = {mesh: sorted(folder.iterdir()) for mesh, folder in folder_of.items()}
     collisions = {
         link.name: tuple(piece for shape in link.collisions for piece in _pieces_of(shape, pieces))

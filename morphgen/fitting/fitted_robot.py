@@ -14,7 +14,6 @@ from morphgen.fitting.replace_collision import with_fits, with_primitives
 from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.formats.fits import read_stored_fits, shapes_to_fit
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ def fit_robot(
     *,
     visual: bool = False,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> FittedRobot:
     """Fit primitives to a robot's links.
 
@@ -74,5 +72,5 @@ def fit_robot(
     """
     if not any(map(shapes_to_fit, robot.links)):
         raise FitError(f"robot {robot.name!r}: no link has a shape")
-    report = fit_links(robot, options, jobs=jobs, progress=progress)
+    report = fit_links(robot, options, jobs=jobs)
     return FittedRobot(robot, report, folders, visual)

@@ -26,7 +26,6 @@ from morphgen.formats.fits import (
 from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
-from morphgen.processes import Progress, no_progress
 
 if TYPE_CHECKING:
     from morphgen.fitting.link_fit import FitOptions
@@ -63,7 +62,6 @@ def fit_and_keep(
     stored: StoredFits,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> dict[str, StoredFit]:
     """Fit primitives to links, say so, and keep the fits in the cache.
 
@@ -82,7 +80,7 @@ def fit_and_keep(
         robot.name,
     )
     names = [link.name for link in links]
-    report = fit_links(robot, options, only=names, jobs=jobs, progress=progress)
+    report = fit_links(robot, options, only=names, jobs=jobs)
     for finding in report.findings:
         if finding.severity != "info":
             raise FitError(f"{finding.where}: {finding.why}")
@@ -102,9 +100,7 @@ _CACHE = f"fits-{FITTER_VERSION}"
 """Folder of the fits in the user's cache."""
 
 
-def as_primitives(
-    robot: Robot, folders: Sequence[Path], *, progress: Progress = no_progress
-) -> Robot:
+def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     """Return the robot as tasks use it: fitted collision primitives, numbers rounded as in a file.
 
     Fits that the robot carries or that the folders store are used. Other links with meshes are
@@ -118,7 +114,7 @@ def as_primitives(
     if missing := _meshed_links(robot, fits):
         from morphgen.fitting.part_fits import COLLISION_OPTIONS  # imports torch, which takes long
 
-        fits |= fit_and_keep(robot, missing, COLLISION_OPTIONS, _CACHE, {}, progress=progress)
+        fits |= fit_and_keep(robot, missing, COLLISION_OPTIONS, _CACHE, {})
     fitted = with_primitives(robot, {link: fit.collision for link, fit in fits.items()})
     return replace(
         with_fits(fitted, fits),

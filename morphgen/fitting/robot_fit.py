@@ -18,7 +18,7 @@ from morphgen.formats.fits import shapes_to_fit
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Link, Robot
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,6 @@ def fit_links(
     *,
     only: Collection[str] | None = None,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> FitReport:
     """Fit the collision shapes of every link, or its visuals if it has no collision shapes.
 
@@ -114,7 +113,7 @@ def fit_links(
     shared = representatives([solids[link.name].mesh for link in solid_links])
     unique = [link for i, link in enumerate(solid_links) if shared[i][0] == i]
     inputs = [(shapes_to_fit(link), solids[link.name]) for link in unique]
-    attempts = parallel_map(partial(_try_fit, options), inputs, jobs, progress, chunk=1)
+    attempts = parallel_map(partial(_try_fit, options), inputs, jobs, chunk=1)
     fits = {link.name: fit for link, fit in zip(unique, attempts, strict=True)}
     reports = []
     for i, link in enumerate(solid_links):

@@ -42,7 +42,7 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.inertia import union_integrals
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
+from morphgen.progress import report
 from morphgen.typing import Array
 
 Parameters = tuple[float, ...]
@@ -361,9 +361,7 @@ DOMINANT_SHARE = 0.95
 the union, so this is also their intersection over union."""
 
 
-def token_shapes(
-    robot: Robot, folders: Sequence[Path] = (), *, progress: Progress = no_progress
-) -> dict[str, Shape]:
+def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
     """Return the box, cylinder or sphere that overlaps the collision shapes of each link most.
 
     A token describes collision geometry: a link with visuals only, such as a rail or a mast, has
@@ -407,11 +405,11 @@ def token_shapes(
             robot.name,
         )
     for done, (name, shapes, path) in enumerate(missing):
-        progress(done, len(missing))
+        report(done, len(missing))
         primitives[name] = fit_primitive(shapes)
         _write_cached(path, primitives[name], shapes_scale(shapes))
     if missing:
-        progress(len(missing), len(missing))
+        report(len(missing), len(missing))
     return {name: shape for name, shape in primitives.items() if shape}
 
 

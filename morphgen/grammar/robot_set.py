@@ -42,6 +42,7 @@ from morphgen.grammar.sampling import Sample, sample_robot
 from morphgen.grammar.syntax import MAX_TEXT, parse_condition
 from morphgen.model.robot import Robot
 from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ray
+from morphgen.progress import own_progress
 
 INDEX = "index.jsonl"
 SETTINGS = "set.json"
@@ -99,22 +100,20 @@ class SetReport:
     """Robots with the derivation of an earlier one: (name, name of the earlier one)."""
 
 
-def make_set(
-    config: SetConfig, n: int, work: SetWorker, progress: Callable[[int], None] = lambda done: None
-) -> SetReport:
+def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
     """Make the robots 0 to n - 1 of a set, except those that exist."""
     _prepare(config)
-    with locked_folder(config.folder):
+    with locked_folder(config.folder), own_progress() as show:
         finished = _finished(config)
         missing = [i for i in range(n) if i not in finished]
-        progress(n - len(missing))
+        show(n - len(missing), n)
         path = config.folder / JOURNAL
         with naming(path), path.open("a", encoding="utf-8") as journal:
             journal.write("\n")  # ends a line that an interruption cut short
             for made, record in enumerate(work(config, missing), 1):
                 journal.write(json.dumps(record) + "\n")
                 journal.flush()
-                progress(n - len(missing) + made)
+                show(n - len(missing) + made, n)
         report = _write_index(config, len(missing), len(finished))
         path.unlink()
     return report

@@ -28,7 +28,8 @@ from morphgen.formats.files import write_atomic
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.library import default_library
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
+from morphgen.progress import own_progress
 from morphgen.rl.config import read_fields
 from morphgen.rl.runs.robot_source import RobotSource
 from morphgen.rl.runs.robot_source import members as source_members
@@ -119,16 +120,14 @@ def num_drawn(source: RobotSource) -> int:
     return sum(count for _, count in source.grammars)
 
 
-def draw(
-    source: RobotSource, config: GoalConfig, *, jobs: int = 1, progress: Progress = no_progress
-) -> DrawnRobots:
+def draw(source: RobotSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobots:
     """Return the robots of a source, which are drawn once per process.
 
     Goal sets are kept in the cache, so that an interrupted call continues.
     """
     key = replace(source, drawn_hash=""), config
     if key not in _drawn:
-        robots = _draw_all(*key, jobs, progress)
+        robots = _draw_all(*key, jobs)
         while len(_drawn) >= _MAX_DRAWN:
             del _drawn[next(iter(_drawn))]
         _drawn[key] = robots
@@ -154,7 +153,6 @@ def fresh_source(
     seed: int,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> tuple[RobotSource, str]:
     """Draw robots to evaluate a run of drawn robots on, other ones than it was trained on.
 
@@ -166,7 +164,7 @@ def fresh_source(
     counts = tuple((name, min(count, MAX_FRESH)) for name, count in source.grammars)
     fresh = replace(source, grammars=counts, draw_seed=draw_seed, drawn_hash="")
     hashes = frozenset(member.robot_hash for member in trained)
-    robots = _draw_all(fresh, config, jobs, progress, hashes)
+    robots = _draw_all(fresh, config, jobs, hashes)
     request = ",".join(f"{Path(name).stem}:{count}" for name, count in counts)
     line = f"fresh robots {request}, drawn with seed {draw_seed}, hash {robots.hash}"
     split = Split("fresh", "interpolation", line, trained, robots.members)
@@ -252,7 +250,6 @@ def _draw_all(
     source: RobotSource,
     config: GoalConfig,
     jobs: int,
-    progress: Progress,
     others: frozenset[str] = frozenset(),
 ) -> DrawnRobots:
     """Draw the robots of a source, without those of test sides and those with other hashes."""
@@ -268,29 +265,30 @@ def _draw_all(
     kept: dict[str, _Draw] = {}
     skipped: Counter[str] = Counter()
     fault = ""
-    progress(0, total)
-    for name, count in source.grammars:
-        grammar = load_sound_grammar(name, library)
-        wanted, tried = len(kept) + count, 0
-        while missing := wanted - len(kept):
-            if tried >= max(MAX_DRAWS * count, MIN_DRAWS):
-                raise TaskError(
-                    f"--robots {source.name}: {count - missing} of {tried} robots of "
-                    f"{grammar.name} can be used, expected {count}{fault}"
-                )
-            numbers, tried = range(tried, tried + missing), tried + missing
-            recipes = [
-                SampledRecipe(grammar, i, source.draw_seed, numbered_name(grammar.name, i))
-                for i in numbers
-            ]
-            for result in parallel_map(drawer, recipes, jobs, chunk=ROBOTS_PER_JOB):
-                reason = DRAWN_BEFORE if result.member.robot_hash in kept else result.skipped
-                if reason:
-                    skipped[reason] += 1
-                    fault = f"; {result.member.name}: {result.fault or reason}"
-                else:
-                    kept[result.member.robot_hash] = result
-                    progress(len(kept), total)
+    with own_progress() as show:
+        show(0, total)
+        for name, count in source.grammars:
+            grammar = load_sound_grammar(name, library)
+            wanted, tried = len(kept) + count, 0
+            while missing := wanted - len(kept):
+                if tried >= max(MAX_DRAWS * count, MIN_DRAWS):
+                    raise TaskError(
+                        f"--robots {source.name}: {count - missing} of {tried} robots of "
+                        f"{grammar.name} can be used, expected {count}{fault}"
+                    )
+                numbers, tried = range(tried, tried + missing), tried + missing
+                recipes = [
+                    SampledRecipe(grammar, i, source.draw_seed, numbered_name(grammar.name, i))
+                    for i in numbers
+                ]
+                for result in parallel_map(drawer, recipes, jobs, chunk=ROBOTS_PER_JOB):
+                    reason = DRAWN_BEFORE if result.member.robot_hash in kept else result.skipped
+                    if reason:
+                        skipped[reason] += 1
+                        fault = f"; {result.member.name}: {result.fault or reason}"
+                    else:
+                        kept[result.member.robot_hash] = result
+                        show(len(kept), total)
     specs = tuple(result.spec for result in kept.values() if result.spec is not None)
     robots = tuple(result.member for result in kept.values())
     return DrawnRobots(robots, specs, dict(sorted(skipped.items())), held_out)

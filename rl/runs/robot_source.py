@@ -15,7 +15,7 @@ from morphgen.benchmark.tokens import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.processes import Progress, no_progress
+from morphgen.progress import own_progress, show_progress
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.task import EnvSpec, GoalSet
@@ -173,9 +173,7 @@ def require_links(source: RobotSource, max_links: int) -> None:
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
-def specs_of(
-    source: RobotSource, config: GoalConfig, progress: Progress = no_progress
-) -> list[EnvSpec]:
+def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
     """Return the robots with their tasks and scenes; each is built once per process."""
     if source.grammars:
         raise _without_sides(source)
@@ -183,14 +181,16 @@ def specs_of(
     if source.split:
         own, meant = replace(source, split="", member=None), members(source)
         specs: list[EnvSpec] = []
-        for member in meant:
-            progress(len(specs), len(meant))
-            specs.append(_of_member(member, own, config))
-        progress(len(specs), len(meant))
+        with own_progress() as show:
+            for member in meant:
+                show(len(specs), len(meant))
+                specs.append(_of_member(member, own, config))
+            show(len(specs), len(meant))
         return specs
     if source.task is None:
         raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
-    robot = load_robot(source.name, library=map(Path, source.library))
+    with show_progress(None):
+        robot = load_robot(source.name, library=map(Path, source.library))
     if source.robot_hash not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: the robot has changed since the run began")
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]

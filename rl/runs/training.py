@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -21,7 +21,7 @@ from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
-from morphgen.processes import Progress, no_progress
+from morphgen.progress import show_progress
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, policy_from
 from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
@@ -226,7 +226,6 @@ class TrainingBatches:
         envs: range | None = None,
         device: str | None = None,
         workers: int = 1,
-        progress: Progress = no_progress,
     ) -> None:
         """Build the robots and their goal sets."""
         self._config, self._workers = config, workers
@@ -236,8 +235,8 @@ class TrainingBatches:
         self._batch: TaskBatch | None = None
         self.drawn: DrawnRobots | None = None
         if config.source.grammars:
-            self.drawn = draw(config.source, goals, progress=progress)
-        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals, progress)
+            self.drawn = draw(config.source, goals)
+        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals)
         for spec in self._specs:
             links = len(spec.robot.links)
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
@@ -413,7 +412,6 @@ def train(
     resume: bool = False,
     execution: ExecutionConfig | None = None,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    prepare: Progress = no_progress,
     hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
 ) -> list[Subrun]:
     """Train all parts of a run to their end; see ``subruns_of``.
@@ -442,13 +440,10 @@ def train(
             if not holds:
                 require_links(config.source, config.max_links)
             envs = processes.share(part.config.num_envs, "--envs")
-            batches = TrainingBatches(
-                part.config,
-                envs=envs,
-                device=device,
-                workers=execution.workers,
-                progress=prepare if processes.is_first else no_progress,
-            )
+            with nullcontext() if processes.is_first else show_progress(None):
+                batches = TrainingBatches(
+                    part.config, envs=envs, device=device, workers=execution.workers
+                )
             with _learner(part, batches, processes, device) as learner:
                 if not processes.is_first:
                     if _learn(learner, batches, part, None, None, stop):

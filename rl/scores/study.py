@@ -17,22 +17,20 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from morphgen import processes
 from morphgen.benchmark.split import Side, Split, split_id
 from morphgen.benchmark.split_file import parse_split
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.processes import ray_cluster, require_ray
+from morphgen.progress import stage
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.aliases import renamed
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
     EvalConfig,
-    Progress,
     evaluate_baseline,
     evaluate_run,
-    no_progress,
 )
 from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig, require_open, require_same_run
@@ -179,10 +177,6 @@ class Cell:
         return ("test",) if self.source.side == "test" else ("train", "test")
 
 
-StartProgress = Callable[[str], Progress]
-"""Called with the name of an evaluation when it starts; returns the callback for its progress."""
-
-
 def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -> list[Cell]:
     """Return the cells of the baselines for the tasks of a split."""
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
@@ -275,8 +269,6 @@ def do_cell(
     cell: Cell,
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    progress: StartProgress = lambda name: no_progress,
-    prepare: processes.Progress = processes.no_progress,
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
@@ -294,7 +286,6 @@ def do_cell(
             resume=True,
             execution=execution,
             show=show,
-            prepare=prepare,
             hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
         )
 
@@ -313,17 +304,15 @@ def do_cell(
         recorder = SubmissionRecorder(split)
         records: list[Score] = []
         for side in sides:
-            shown = progress(f"{cell.agent}{f' {name}' if mode else ''} on {side}")
+            title = f"{cell.agent}{f' {name}' if mode else ''} on {side}"
             if config is not None and mode is not None:
-                records += evaluate_run(
-                    folder, side, eval_config, mode, progress=shown, record=recorder
-                )
+                with stage(title):
+                    records += evaluate_run(folder, side, eval_config, mode, record=recorder)
             # A baseline is not evaluated on a side without a robot for it.
             elif BASELINES[cell.agent].suits(tasks_of(other_side(cell.source, side))):
                 source = other_side(cell.source, side)
-                records += evaluate_baseline(
-                    cell.agent, source, eval_config, progress=shown, record=recorder
-                )
+                with stage(title):
+                    records += evaluate_baseline(cell.agent, source, eval_config, record=recorder)
         scores[name] = records
         _write_episodes(cell, name, split, recorder)
         _write_scores(cell, scores)
@@ -398,8 +387,6 @@ def run_cells(
     cells: Sequence[Cell],
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    progress: StartProgress = lambda name: no_progress,
-    prepare: processes.Progress = processes.no_progress,
 ) -> Iterator[Outcome]:
     """Train and evaluate cells one after another, and yield their outcomes.
 
@@ -410,7 +397,7 @@ def run_cells(
     skipped = 0
     while waiting:
         cell = waiting.popleft()
-        outcome = _do_locked(cell, execution, show, progress, prepare)
+        outcome = _do_locked(cell, execution, show)
         if outcome is not None:
             skipped = 0
             yield outcome
@@ -456,14 +443,12 @@ def _do_locked(
     cell: Cell,
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None,
-    progress: StartProgress,
-    prepare: processes.Progress,
 ) -> Outcome | None:
     """Train and evaluate a cell and return its outcome; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
-            do_cell(cell, execution, show, progress, prepare)
+            do_cell(cell, execution, show)
     except Timeout:
         return None
     except MorphgenError as error:

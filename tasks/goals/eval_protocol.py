@@ -12,7 +12,7 @@ from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.kinematics import reach
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 from morphgen.tasks.goals.goal_sets import goal_set_key
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import (
@@ -105,12 +105,11 @@ def expected_robots(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> list[ExpectedRobot]:
     """Return what a submission must hold for every member, train robots first."""
     expect = _Expect(library.folders, protocol.goals)
     members = [(side, member) for side in SIDES for member in split.side(side)]
-    return list(parallel_map(expect, members, jobs, progress))
+    return list(parallel_map(expect, members, jobs))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from morphgen.benchmark.split import Member, Side, Split, sided_members
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 from morphgen.tasks.goals.goal_sets import arrays_of
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
@@ -92,7 +92,6 @@ def audit_goals(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> tuple[Finding, ...]:
     """Find goals that leak, and sets that do not match the split's robots.
 
@@ -106,7 +105,7 @@ def audit_goals(
     """
     members = sided_members(split)
     examiner = _MemberExaminer(library.folders, goals)
-    examined = list(parallel_map(examiner, members, jobs, progress))
+    examined = list(parallel_map(examiner, members, jobs))
     return (
         *_set_findings(split, goals, members, examined),
         *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),

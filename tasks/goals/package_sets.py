@@ -24,7 +24,8 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
+from morphgen.progress import show_progress
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX, packaged_index, set_npz
 from morphgen.tasks.goals.split_goals import certify_goal_set
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
@@ -49,13 +50,13 @@ def _members(name: str) -> Iterator[Member]:
     yield from split.test
 
 
-def write_sets(folder: Path = FOLDER, jobs: int = 1, progress: Progress = no_progress) -> None:
+def write_sets(folder: Path = FOLDER, jobs: int = 1) -> None:
     """Sample and certify the sets of all shipped splits, and write them with their index."""
     members = list(shipped_members().values())
     sampler = _Sampler(default_library(()).folders)
     records: dict[str, dict[str, object]] = {}
     for member, (key, content) in zip(
-        members, parallel_map(sampler, members, jobs, progress, chunk=1), strict=True
+        members, parallel_map(sampler, members, jobs, chunk=1), strict=True
     ):
         file = f"{key[:16]}.npz.xz"
         compressed = lzma.compress(content, preset=9)
@@ -124,12 +125,13 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     args = parser.parse_args()
     if not args.sizes:
-        write_sets(jobs=args.jobs, progress=_show)
+        with show_progress(_show):
+            write_sets(jobs=args.jobs)
         packaged_index.cache_clear()
     print(sizes_text())
 
 
-def _show(done: int, total: int) -> None:
+def _show(done: float, total: int | None) -> None:
     if sys.stderr.isatty() or done == total:
         end = "\n" if done == total else "\r"
         print(f"{done} of {total} goal sets", end=end, file=sys.stderr, flush=True)

@@ -27,7 +27,7 @@ from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress, parallel_map
+from morphgen.processes import parallel_map
 from morphgen.tasks.goals.goal_sets import goals_from_npz, set_npz
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import (
@@ -153,7 +153,6 @@ def sample_split_goals(
     jobs: int = 1,
     certified: bool = False,
     cache: Path | None = None,
-    progress: Progress = no_progress,
 ) -> list[GoalResult]:
     """Sample the goal sets of all members, train first, or take them from the cache.
 
@@ -161,7 +160,7 @@ def sample_split_goals(
     in the cache.
     """
     sampler = _MemberSampler(library.folders, config or GoalConfig(), certified, cache)
-    return list(parallel_map(sampler, sided_members(split), jobs, progress, chunk=1))
+    return list(parallel_map(sampler, sided_members(split), jobs, chunk=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,6 @@ from morphgen.formats.files import file_sha256, write_atomic
 from morphgen.formats.records import read_record
 from morphgen.formats.zip_files import write_zip
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, no_progress
 from morphgen.tasks.goals.eval_protocol import EvalProtocol
 from morphgen.tasks.goals.split_goals import (
     GOALS,
@@ -64,7 +63,6 @@ def build_with_goals(
     config: GoalConfig | None = None,
     *,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> BuildReport:
     """Write a split, all its robots and, if there are any, its goal sets; see ``build_split``."""
     require_goal_sets(goals)
@@ -74,7 +72,7 @@ def build_with_goals(
             f"{built} was built with goals: ask for goals (--goals), delete {built / GOALS}, or "
             "name another folder"
         )
-    report = build_split(split, folder, library, jobs=jobs, settings=settings, progress=progress)
+    report = build_split(split, folder, library, jobs=jobs, settings=settings)
     if goals:
         write_goals(report.folder, goals, config or GoalConfig())
     return report
@@ -126,22 +124,19 @@ def release_split(
     extra: Mapping[str, bytes] | None = None,
     results: BaselineResults | None = None,
     jobs: int = 1,
-    progress: Progress = no_progress,
 ) -> ReleaseReport:
     """Write the archive of a release into a folder."""
     parts = licenced_parts(split, library)
     require_allowed(split, parts, request.allowed_licences)
     release = _release(split, request, {})
-    survey = survey_split(split, library, within_train=True, jobs=jobs, progress=progress)
+    survey = survey_split(split, library, within_train=True, jobs=jobs)
     audited = audit_survey(survey, library)
     require_passed(audited)
     rows = survey_difficulty(survey, results)
     release = _release(split, request, _difficulty(survey, audited))
     goals: list[GoalResult] = []
     if request.goals:
-        goals = sample_split_goals(
-            split, library, request.protocol.goals, jobs=jobs, progress=progress
-        )
+        goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)
         require_goal_sets(goals)
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".release-", dir=out) as temporary:
@@ -153,7 +148,6 @@ def release_split(
             goals,
             request.protocol.goals,
             jobs=jobs,
-            progress=progress,
         )
         texts = {
             RELEASE_FILE: release_text(release),

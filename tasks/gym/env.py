@@ -29,7 +29,6 @@ from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import BINS, ActionKind, decode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
@@ -306,7 +305,6 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         cache: str | PathLike[str] | None = None,
         library: LibraryFolders = (),
         max_links: int | None = None,
-        progress: Progress = no_progress,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
         goal_env: bool = False,
@@ -359,7 +357,6 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             observe=observe,
             contacts=contacts,
             max_links=max_links,
-            progress=progress,
         )
         self.env_spec = self.batch.specs[0]
         robot_links = self.env_spec.robot.joints

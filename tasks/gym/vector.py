@@ -130,7 +130,7 @@ class TextSpec(EnvSpec):
 
         A robot that is no text is named only: ``gym.make`` of the JSON refuses it.
         """
-        kwargs = {name: _plain(value) for name, value in self.kwargs.items() if name != "progress"}
+        kwargs = {name: _plain(value) for name, value in self.kwargs.items()}
         return EnvSpec.to_json(replace(self, kwargs=kwargs))
 
 

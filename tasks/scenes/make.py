@@ -27,7 +27,7 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library, LibraryFolders, default_library, library_folders
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, no_progress
+from morphgen.progress import own_progress, show_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.device import require_simulator_device
@@ -127,7 +127,6 @@ def make_batch(
     configs: Sequence[TaskConfig] = (),
     cache: str | PathLike[str] | None = None,
     library: LibraryFolders = (),
-    progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of robots at tasks; environment i has robot i modulo their number.
@@ -142,8 +141,6 @@ def make_batch(
         configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
         cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
-        progress: Called with the number of robots whose goal set is ready, and their total;
-            sampling a set that is not in the cache takes seconds.
         **options: Arguments of ``batch_from_specs``.
 
     Raises:
@@ -161,13 +158,14 @@ def make_batch(
     tasks: list[str] = _one_for_each("task", task, robots)
     with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
     config = GoalConfig(goal_seed, configs)
-    loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
     specs: list[EnvSpec] = []
-    for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
-        progress(len(specs), len(robots))
-        robot = loaded[source]
-        specs.append(env_spec(robot, name, config, obstacles=has_obstacles, cache=cache))
-    progress(len(specs), len(robots))
+    with own_progress() as show:
+        loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
+        for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
+            show(len(specs), len(robots))
+            robot = loaded[source]
+            specs.append(env_spec(robot, name, config, obstacles=has_obstacles, cache=cache))
+        show(len(specs), len(robots))
     return batch_from_specs(specs, num_envs, library=folders, **options)
 
 
@@ -181,7 +179,6 @@ def make_split_batch(
     goals: Path | None = None,
     cache: str | PathLike[str] | None = None,
     library: LibraryFolders = (),
-    progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of a split's robots, at the tasks and with the obstacles of the split.
@@ -195,8 +192,6 @@ def make_split_batch(
         goals: Folder of a split built with goals, whose goal sets are used.
         cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
-        progress: Called with the number of robots whose goal set is ready, and their total;
-            sampling a set that is not in the cache takes seconds.
         **options: Arguments of ``batch_from_specs``.
 
     Raises:
@@ -214,14 +209,16 @@ def make_split_batch(
     num_envs = _env_for_each(num_envs, len(members))
     sets = read_goals(goals, side) if goals is not None else None
     specs: list[EnvSpec] = []
-    for member in members:
-        progress(len(specs), len(members))
-        shipped = shipped_goal_set(sets, member.name, goals)
-        specs.append(member_spec(member, parts, config, cache=cache, shipped=shipped))
-    progress(len(specs), len(members))
+    with own_progress() as show:
+        for member in members:
+            show(len(specs), len(members))
+            shipped = shipped_goal_set(sets, member.name, goals)
+            specs.append(member_spec(member, parts, config, cache=cache, shipped=shipped))
+        show(len(specs), len(members))
     return batch_from_specs(specs, num_envs, library=folders, **options)
 
 
+@show_progress(None)  # the fits of a robot's links are not robots whose goals are ready
 def batch_from_specs(
     specs: Sequence[EnvSpec],
     num_envs: int,

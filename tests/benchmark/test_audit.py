@@ -17,6 +17,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
+from morphgen.progress import show_progress
 
 
 def finding_keys(example_split, **options):
@@ -280,7 +281,8 @@ def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
         train=[*TRAIN, *(member(each, f"cube-{i}") for i, each in enumerate(words))]
     )
     seen = []
-    one = audit(example_split, LIBRARY, progress=lambda done, total: seen.append((done, total)))
+    with show_progress(lambda *now: seen.append(now)):
+        one = audit(example_split, LIBRARY)
     assert seen == [(i, 13) for i in range(1, 14)]
     assert audit(example_split, LIBRARY, jobs=2) == one
 
@@ -288,7 +290,8 @@ def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
 def test_a_derivation_shared_by_two_members_is_composed_once():
     example_split = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
     seen = []
-    survey_split(example_split, LIBRARY, progress=lambda done, total: seen.append(total))
+    with show_progress(lambda done, total: seen.append(total)):
+        survey_split(example_split, LIBRARY)
     assert seen == [4] * 4
     both = survey_split(example_split, LIBRARY)
     assert both.train[0] == both.train[3]

@@ -32,6 +32,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.model.findings import Finding
+from morphgen.progress import show_progress
 
 
 def points(members):
@@ -118,11 +119,13 @@ def test_the_number_of_processes_does_not_matter():
 
 def test_progress_reaches_the_total():
     told = []
-    interpolation(order(3, test=2), shipped("cubes"), LIBRARY, progress=told.append)
+    with show_progress(lambda done, total: told.append(done)):
+        interpolation(order(3, test=2), shipped("cubes"), LIBRARY)
     assert told == [1, 2, 3, 4, 5]
     told.clear()
     patterns = ["base=gantry ee={plane,cube}", "base=fixed arm=lwr ee={plane,cube}"]
-    composition(order(2), patterns, LIBRARY, progress=told.append)
+    with show_progress(lambda done, total: told.append(done)):
+        composition(order(2), patterns, LIBRARY)
     assert told == [1, 2, 3]
 
 

@@ -22,6 +22,7 @@ from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
+from morphgen.progress import show_progress
 
 LIGHT = BuildSettings(light=True)
 
@@ -178,13 +179,8 @@ def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
 
 def test_progress_counts_distinct_robots(tmp_path, example_split):
     seen = []
-    build_split(
-        example_split,
-        tmp_path,
-        LIBRARY,
-        settings=LIGHT,
-        progress=lambda *counts: seen.append(counts),
-    )
+    with show_progress(lambda *counts: seen.append(counts)):
+        build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
@@ -201,8 +197,8 @@ def test_files_written_before_an_interruption_are_kept(tmp_path, example_split, 
         if number == done:
             raise Killed
 
-    with pytest.raises(Killed):
-        build_split(example_split, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
+    with pytest.raises(Killed), show_progress(stop):
+        build_split(example_split, tmp_path / "own", LIBRARY, settings=settings)
     own = tmp_path / "own" / "mine" / "some"
     with pytest.raises(BenchmarkError, match="is not finished: it has no SHA256SUMS; build it"):
         load_split_folder(own)
@@ -328,7 +324,8 @@ def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, example_spl
         with pytest.raises(FormatError, match="is being written by another run"):
             build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
 
-    report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT, progress=again)
+    with show_progress(again):
+        report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
     assert len(load_split_folder(report.folder)) == 4
 
 

@@ -16,6 +16,7 @@ from morphgen.benchmark.split_folder import BuildSettings
 from morphgen.benchmark.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
+from morphgen.progress import show_progress
 
 LIGHT = BuildSettings(light=True)
 
@@ -111,9 +112,8 @@ def test_every_member_with_a_wrong_derivation_is_reported(tmp_path):
 def test_a_moved_split_folder_passes(whole, tmp_path):
     whole.rename(tmp_path / "elsewhere")
     seen = []
-    assert (
-        difference_keys(tmp_path / "elsewhere", progress=lambda *counts: seen.append(counts)) == []
-    )
+    with show_progress(lambda *counts: seen.append(counts)):
+        assert difference_keys(tmp_path / "elsewhere") == []
     assert seen == [(i, 4) for i in (1, 2, 3, 4)]
 
 

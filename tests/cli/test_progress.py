@@ -1,7 +1,6 @@
 """Progress output: bars on a terminal, lines in a file, failures in both."""
 
 import sys
-from contextlib import closing
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
@@ -9,7 +8,8 @@ import pytest
 
 from helpers.runs import small_config
 from morphgen.cli import progress
-from morphgen.cli.progress import TrainingProgress
+from morphgen.cli.progress import training_progress
+from morphgen.progress import report, stage
 from morphgen.rl.distributed import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
@@ -33,8 +33,8 @@ def test_diverged_episodes_are_one_line_at_the_end(
     on_terminal, unstable, line, capsys, monkeypatch
 ):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: on_terminal)
-    with closing(TrainingProgress()) as display:
-        show = display(SimpleNamespace(config=small_config()))
+    with training_progress() as display:
+        show = display.training(SimpleNamespace(config=small_config()))
         for update, count in enumerate(unstable, start=1):
             show(replace(REPORT, update=update, transitions=32 * update, unstable=count), 3)
         assert "diverged" not in capsys.readouterr().err
@@ -46,8 +46,7 @@ def test_diverged_episodes_are_one_line_at_the_end(
 def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    with closing(TrainingProgress()) as display:
-        report = display.evaluation("stochastic on test")
+    with training_progress(), stage("stochastic on test"):
         for i in range(1, 13):
             now[0] += 11
             report(i / 2, 6)
@@ -60,11 +59,12 @@ def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
 
 def test_terminal_progress_bar_is_removed_at_the_end(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with closing(TrainingProgress()) as display:
-        report = display.evaluation("train")
-        report(0.5, 2)
-        report(2, 2)
-        display.evaluation("test")(1, 2)
+    with training_progress():
+        with stage("train"):
+            report(0.5, 2)
+            report(2, 2)
+        with stage("test"):
+            report(1, 2)
     err = capsys.readouterr().err
     assert "train" in err
     assert "test" in err
@@ -76,10 +76,10 @@ def test_goal_sets_are_counted_until_all_are_ready(terminal, monkeypatch, capsys
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     monkeypatch.setattr(progress, "GOAL_LINE_INTERVAL", -1.0)
     monkeypatch.setattr(progress, "REDRAW_INTERVAL", 0.01)
-    with closing(TrainingProgress()) as display:
-        display.goal_sets(3, 10)
+    with training_progress() as display:
+        report(3, 10)
         bar = display._goal_bar
-        display.goal_sets(10, 10)
+        report(10, 10)
         assert display._goal_bar is None
     lines = [line for line in capsys.readouterr().err.splitlines() if "goal sets: 3 of 10" in line]
     assert (bar is None, len(lines)) == ((False, 0) if terminal else (True, 1))
@@ -89,12 +89,12 @@ def test_a_ctrl_c_that_an_import_lost_ends_the_next_progress(capsys):
     nothing = SimpleNamespace()
 
     def shown():
-        with closing(TrainingProgress()) as display:
-            yield lambda: display.goal_sets(1, 2)
-            yield lambda: display.evaluation("test")
-            yield lambda: display(SimpleNamespace(config=small_config()))
-        with progress.bar(nothing, "reading") as bar:
-            yield lambda: bar(1)
+        with training_progress() as display:
+            yield lambda: report(1, 2)
+            yield lambda: stage("test").__enter__()
+            yield lambda: display.training(SimpleNamespace(config=small_config()))
+        with progress.bar(nothing, "reading"):
+            yield lambda: report(1, None)
         yield lambda: list(progress.track([1], nothing, "reading", "robot", 1))
         yield lambda: progress.status(nothing, "reading").__enter__()
 

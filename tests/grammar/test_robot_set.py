@@ -27,6 +27,7 @@ from morphgen.grammar.robot_set import (
     read_index,
 )
 from morphgen.grammar.sampling import SamplingError
+from morphgen.progress import show_progress
 
 
 def plan(folder, category="cubes", **changes):
@@ -91,11 +92,10 @@ def test_a_full_set_consists_of_bundles(tmp_path):
 
 def test_progress_reaches_the_number_of_robots(tmp_path):
     seen = []
-    make_set(plan(tmp_path / "s"), 3, make_serially, seen.append)
-    assert seen == [0, 1, 2, 3]
-    seen.clear()
-    make_set(plan(tmp_path / "s"), 5, make_serially, seen.append)
-    assert seen == [3, 4, 5]
+    for n, work in ((3, make_serially), (5, make_in_processes(2))):
+        with show_progress(lambda *now: seen.append(now)):
+            make_set(plan(tmp_path / "s"), n, work)
+    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (3, 5), (4, 5), (5, 5)]
 
 
 @pytest.mark.parametrize("light", [True, False])

@@ -13,6 +13,7 @@ from morphgen.benchmark.split_file import read_split, split_names, write_split
 from morphgen.errors import GrammarError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robots
+from morphgen.progress import show_progress
 from morphgen.rl.runs import drawn_robots
 from morphgen.rl.runs.drawn_robots import (
     FILE,
@@ -98,7 +99,8 @@ def test_robots_do_not_depend_on_the_processes(monkeypatch):
     monkeypatch.setattr(drawn_robots, "_drawn", {})
     monkeypatch.setattr(drawn_robots, "ROBOTS_PER_JOB", 2)
     progress = []
-    again = draw(source, FEW, jobs=2, progress=lambda done, total: progress.append((done, total)))
+    with show_progress(lambda *now: progress.append(now)):
+        again = draw(source, FEW, jobs=2)
     assert (hashes(again), again.hash) == (hashes(robots), robots.hash)
     assert progress == [(0, 3), (1, 3), (2, 3), (3, 3)]
 

@@ -10,6 +10,7 @@ import pytest
 from helpers.runs import EVAL, QUIET, small_config, small_source
 from helpers.splits import member, split
 from morphgen.errors import TaskError
+from morphgen.progress import show_progress
 from morphgen.rl import evaluation
 from morphgen.rl.evaluation import (
     EvalConfig,
@@ -175,7 +176,8 @@ def test_progress_counts_finished_and_partial_episodes(monkeypatch, limit, value
         monkeypatch.setattr(evaluation, limit, value)
     seen = []
     config = replace(EVAL, episodes=3)
-    evaluate_baseline("zero", small_source(), config, progress=lambda *now: seen.append(now))
+    with show_progress(lambda *now: seen.append(now)):
+        evaluate_baseline("zero", small_source(), config)
     parts = [done for done, _ in seen]
     assert {total for _, total in seen} == {whole}
     assert len(parts) == calls
@@ -187,7 +189,8 @@ def test_progress_counts_finished_and_partial_episodes(monkeypatch, limit, value
 def test_progress_of_se_policies_covers_all_policies(tmp_path):
     train(tmp_path, small_config(small_source(), agent="se", total_timesteps=64), execution=QUIET)
     seen = []
-    evaluate_run(tmp_path, "test", EVAL, "deterministic", progress=lambda *now: seen.append(now))
+    with show_progress(lambda *now: seen.append(now)):
+        evaluate_run(tmp_path, "test", EVAL, "deterministic")
     assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
 
 

@@ -13,6 +13,7 @@ from helpers.runs import QUIET, equal, small_config, weights
 from helpers.splits import member, split
 from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.errors import BenchmarkError, TaskError
+from morphgen.progress import show_progress
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.drawn_robots import FILE, draw, drawn_source
@@ -242,9 +243,11 @@ def test_goal_sets_are_reported_robot_by_robot():
         reports.append((done, total))
 
     source = split_source(read_split("extrapolation/primitives/reach"), side="test")
-    specs = specs_of(source, GoalConfig(), report)
+    with show_progress(report):
+        specs = specs_of(source, GoalConfig())
     assert reports == [(0, 2), (1, 2), (2, 2)]
     reports.clear()
-    TrainingBatches(replace(small_config(), source=source), progress=report)
+    with show_progress(report):
+        TrainingBatches(replace(small_config(), source=source))
     assert reports == [(0, 2), (1, 2), (2, 2)]
     assert [spec.robot.name for spec in specs] == ["chain-000000", "chain-000001"]

@@ -354,7 +354,7 @@ def rows_of_seed(env):
     [
         {"config": ReachConfig(max_episode_steps=5, obstacle_size=(0.05, 0.06)), "obstacles": True},
         {"observe": observation_config(["jacobian"]), "contacts": Contacts(self_collision=False)},
-        {"cache": Path("cache"), "library": (), "progress": lambda done, total: None},
+        {"cache": Path("cache"), "library": ()},
     ],
 )
 def test_specs_are_json(options, tmp_path, monkeypatch):

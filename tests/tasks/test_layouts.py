@@ -11,6 +11,7 @@ from helpers.resets import reset_envs
 from helpers.scenes import robot
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
+from morphgen.progress import show_progress
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.tasks.batch_observation import NOISE
@@ -237,16 +238,16 @@ def test_a_set_of_one_goal_may_have_obstacles(specs, tmp_path):
 @pytest.mark.parametrize("side", ["train", "eval"])
 def test_a_gymnasium_environment_observes_the_obstacles_of_its_episode(side, tmp_path):
     reports = []
-    env = TaskEnv(
-        "reach",
-        robot("arm3"),
-        obstacles=True,
-        layouts=side,
-        config=replace(REACH, max_episode_steps=2),
-        sim="mujoco",
-        cache=tmp_path,
-        progress=lambda done, total: reports.append((done, total)),
-    )
+    with show_progress(lambda *now: reports.append(now)):
+        env = TaskEnv(
+            "reach",
+            robot("arm3"),
+            obstacles=True,
+            layouts=side,
+            config=replace(REACH, max_episode_steps=2),
+            sim="mujoco",
+            cache=tmp_path,
+        )
     assert reports == [(0, 1), (1, 1)]
     drawn = set()
     for episode in range(24):

@@ -18,6 +18,7 @@ from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_folder import BuildSettings, load_split_folder
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
+from morphgen.progress import show_progress
 from morphgen.tasks import free_space
 from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import arrays_of, goals_from_npz, set_npz
@@ -148,8 +149,8 @@ def test_interrupted_run_reuses_completed_sets(cache, monkeypatch):
         if done == 2:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        sample_sets(reaching(), cache, progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), show_progress(interrupt):
+        sample_sets(reaching(), cache)
     assert len(list(cache.iterdir())) == 2
     member_sets = sample_sets(reaching(), cache)
     monkeypatch.setattr(reach_goals, "FreeSpace", forbidden)

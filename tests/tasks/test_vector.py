@@ -15,6 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.progress import show_progress
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.sb3 import sb3_vector
@@ -244,7 +245,8 @@ def test_gymnasium_makes_vector_envs_of_several_robots(cache):
 def test_goal_sampling_reports_its_progress(cache):
     calls = []
     options = {"sim": "mujoco", "configs": (REACH,), "cache": cache}
-    batch = make_batch("reach", ROBOTS, 2, progress=lambda *call: calls.append(call), **options)
+    with show_progress(lambda *call: calls.append(call)):
+        batch = make_batch("reach", ROBOTS, 2, **options)
     batch.close()
     assert calls == [(0, 2), (1, 2), (2, 2)]
 

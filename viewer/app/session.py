@@ -9,6 +9,7 @@ import traceback
 import uuid
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -16,6 +17,7 @@ import msgspec
 import viser
 
 from morphgen.errors import MorphgenError
+from morphgen.progress import show_progress
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, AddressError, require_few_chosen
 from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
@@ -171,11 +173,21 @@ class Session:
         """Run a function in a worker process and return its result."""
         return self.workers.result(self.workers.submit(work, *arguments))
 
-    def cached(self, key: str, make: Callable[[], T]) -> T:
-        """Return the result of slow work, which is done once for all browsers."""
+    def progress(self, text: str) -> AbstractContextManager[None]:
+        """Show the progress of a block; the text has a field for the number of items."""
+
+        def show(done: float, total: int | None) -> None:
+            if total:
+                self.set_status(text.format(total), done / total)
+
+        return show_progress(show)
+
+    def cached(self, key: str, make: Callable[[], T], text: str) -> T:
+        """Return the result of slow work, which is done once for all browsers; see ``progress``."""
 
         def made() -> T:
-            result = make()
+            with self.progress(text):
+                result = make()
             self.set_status("")
             return result
 

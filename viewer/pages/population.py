@@ -212,13 +212,10 @@ def _current_q(page: PopulationPage) -> Array:
 def _free_configurations(page: PopulationPage) -> tuple[Array, NDArray[np.bool_]]:
     """Return ``load_free_configurations``, once for all browsers."""
     session, population = page.session, page.population
-
-    def progress(done: int, total: int) -> None:
-        session.set_status(f"testing {total} robots for collisions", done / total)
-
     return session.cached(
         f"free {page.source.key}",
-        lambda: load_free_configurations(population, session.workers, progress),
+        lambda: load_free_configurations(population, session.workers),
+        "testing {} robots for collisions",
     )
 
 
@@ -233,13 +230,10 @@ def _positions(page: PopulationPage) -> population_layout.Layout:
         return population_layout.scatter(rows, page.axes[0].value, page.axes[1].value, cell)
     if key != "map":
         return population_layout.sorted_grid(rows, key, page.population.home_bounds)
-
-    def progress(done: int, total: int) -> None:
-        session.set_status(f"comparing {total} robots", done / total)
-
     points = session.cached(
         f"map {page.source.key}",
-        lambda: load_map(page.population, session.files, session.workers, progress),
+        lambda: load_map(page.population, session.files, session.workers),
+        "comparing {} robots",
     )
     return population_layout.similarity_map(points, cell)
 
@@ -519,13 +513,10 @@ def _gallery_address(subject: str, source: Source) -> Address:
 
 def _load(session: Session, source: Source) -> None:
     """Read the robots, once for all browsers, and show them."""
-
-    def progress(done: int, total: int) -> None:
-        session.set_status(f"reading {total} robots", done / total)
-
     population, faults = session.cached(
         f"population {source.key}",
-        lambda: load_population(source, session.files, session.workers, progress),
+        lambda: load_population(source, session.files, session.workers),
+        "reading {} robots",
     )
     if not session.closed.is_set():
         session.enqueue(lambda: _show_population(session, source, population, faults))

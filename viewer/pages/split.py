@@ -146,14 +146,11 @@ def _format(value: object) -> str:
 def _study(page: SplitPage) -> None:
     """Study the split in the worker processes, once for all browsers, and show the results."""
     session = page.session
-
-    def progress(done: int, total: int) -> None:
-        session.set_status(f"comparing {total} robots", done / total)
-
     folders = session.files.library_folders
     page.study = session.cached(
         f"study {split_id(page.split)}",
-        lambda: study_split(page.split, folders, session.workers, progress),
+        lambda: study_split(page.split, folders, session.workers),
+        "comparing {} robots",
     )
     if page.study.statistics:
         table = statistics_table(page.study.statistics)

@@ -1,0 +1,85 @@
+"""Progress of long work: functions report how far they are, and callers that show it listen.
+
+The listener is in a context variable. A new thread or process has none: its reports go nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from typing import Protocol, runtime_checkable
+
+
+class Progress(Protocol):
+    """Function that receives the number of finished items, and of all; None if it is unknown."""
+
+    def __call__(self, done: float, total: int | None, /) -> None:
+        """Receive the numbers."""
+
+
+@runtime_checkable
+class StagedProgress(Progress, Protocol):
+    """A listener that shows stages of work by their titles."""
+
+    def stage(self, title: str) -> AbstractContextManager[None]:
+        """Show the reports of a block as a stage."""
+
+
+_listener: ContextVar[Progress | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def show_progress(listener: Progress | None) -> Iterator[None]:
+    """Send the reports of this block, or of a decorated function, to a listener, if there is one.
+
+    Examples:
+        >>> with show_progress(lambda done, total: print(done, "of", total)):
+        ...     report(1, 2)
+        1 of 2
+    """
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def report(done: float, total: int | None) -> None:
+    """Report the number of finished items, and of all."""
+    if listener := _listener.get():
+        listener(done, total)
+
+
+@contextmanager
+def own_progress() -> Iterator[Progress]:
+    """Yield the function to report with; the functions that are called in this block are silent.
+
+    Else the parts of an item, such as the links of a robot, would be shown as items.
+    """
+    listener = _listener.get()
+    with show_progress(None):
+        yield listener or _ignore
+
+
+@contextmanager
+def part_of(total: int | None, first: int = 0) -> Iterator[None]:
+    """Count the items of this block from ``first`` on, of a total of all blocks."""
+    listener = _listener.get()
+
+    def show(done: float, _: int | None) -> None:
+        if listener is not None:
+            listener(first + done, total)
+
+    with show_progress(show):
+        yield
+
+
+def stage(title: str) -> AbstractContextManager[None]:
+    """Give the work of a block a title, for listeners that show stages."""
+    listener = _listener.get()
+    return listener.stage(title) if isinstance(listener, StagedProgress) else nullcontext()
+
+
+def _ignore(done: float, total: int | None) -> None:
+    pass
