@@ -1,8 +1,8 @@
 """Film the way from a gallery to a split in the viewer: python docs/viewer_film.py [--out FILE].
 
 Opens the gallery of a set of 24 arm3 in headless chromium, chooses three, compares them, edits one
-in Compose, evolves it twice, adds the result to a set, and makes a split of that set's robot and
-the chosen three. Each state of the page is shown for a second or two.
+in Compose, evolves it twice, writes the result to a folder, and makes a split of it and the
+chosen three. Each state of the page is shown for a second or two.
 Needs `pip install morphgen[test]` and chromium.
 """
 
@@ -78,7 +78,7 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     page.get_by_text(re.compile("changed: ")).first.wait_for()
     yield "edited"
     page.get_by_role("tab", name="Evolve").click()
-    page.get_by_role("button", name="Evolve this robot").click()
+    page.get_by_role("button", name="mutants").click()
     adopt.nth(8).wait_for()
     yield "nine mutants"
     adopt.nth(4).click()
@@ -89,11 +89,12 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     page.wait_for_url(re.compile("evolve=3"))
     adopt.nth(8).wait_for()
     yield "evolved twice"
-    page.get_by_role("button", name="Add to set").click()
+    page.get_by_role("tab", name="Get").click()
+    page.get_by_role("button", name="Write to robots/").click()
     page.get_by_text("Written", exact=True).wait_for()
-    yield "added to a set"
+    yield "written to a folder"
     page.locator("#morphgen-bar").get_by_role("link", name="Gallery", exact=True).click()
-    page.get_by_role("link", name=re.compile("evolved")).first.click()
+    page.get_by_role("link", name="robots", exact=True).click()
     page.locator(".card img").first.wait_for()
     page.locator("input[data-choose]").first.click()
     tray.get_by_text("4 chosen").wait_for()

@@ -26,7 +26,7 @@ from viewer_speed import started_browser
 PAGES = {
     "library": ("?library=", ".card img"),
     "gallery": ("?gallery=robots/arm3&sort=-reach", ".card img"),
-    "population": ("?population=robots/arm3&arrange=reach&pose=1&select=0-40", "text=41 selected"),
+    "population": ("?population=robots/arm3&arrange=reach&select=0-40", "text=41 selected"),
     "robot": (
         "?robot=words:arm=panda ee=panda_hand&show=x-ray,frames,joint axes,names&tab=Show",
         "text=centres of mass",
@@ -39,8 +39,8 @@ PAGES = {
     "evolve": ("?compose=arm3&seed=0&number=4&evolve=2&tab=Evolve", ".offspring"),
     "compare": (
         "?compare=words:arm=panda ee=panda_hand&compare=words:arm=ur5 ee=robotiq_2f85"
-        "&compare=words:arm=xarm7 ee=stick&tab=Tokens",
-        "img[src^='data:image/png']:visible",
+        "&compare=words:arm=xarm7 ee=stick",
+        "text=Similarity",
     ),
     "split": ("?split=extrapolation/arms/reach&tab=Map", "svg image"),
     "play": (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from itertools import combinations
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.benchmark.similarity import MEASURES, features
-from morphgen.benchmark.tokens import default_max_links, tokens
+from morphgen.benchmark.tokens import default_max_links
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
@@ -28,16 +27,6 @@ FitQuality = dict[str, tuple[float, tuple[Shape, ...]]]
 """By the name of a link: its primitives, and before them the intersection over union (IoU) of these
 with the shapes that they replace."""
 _RED_TO_GREEN = ((224, 49, 49), (250, 200, 30), (47, 158, 68))
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Tokens and similarity of robots."""
-
-    tables: tuple[Array, ...]
-    """Tokens at home by robot, shape (n_links, 48) each."""
-    values: dict[str, Array]
-    """Similarity of every pair by measure, shape (n, n)."""
 
 
 def joint_roles(robot: Robot) -> list[str]:
@@ -111,24 +100,26 @@ def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
     return np.asarray(np.clip(target, low, high))
 
 
-def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparison:
-    """Compute tokens and similarity of robots; takes seconds if primitives have to be fitted."""
+def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str, Array]:
+    """Return the similarity of every pair by measure, shape (n, n). Runs in a worker.
+
+    It takes seconds if primitives have to be fitted.
+    """
     library = Library(folders)
     shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
     # Splits fix the number of links; here the largest robot does.
     max_links = default_max_links(len(robot.links) for robot in robots)
-    pairs = list(zip(robots, shapes, strict=True))
-    all_features = [features(robot, shape, max_links=max_links) for robot, shape in pairs]
-    return Comparison(
-        tuple(tokens(robot, shape, max_links=max_links) for robot, shape in pairs),
-        {
-            name: np.array([[measure.function(a, b) for b in all_features] for a in all_features])
-            for name, measure in MEASURES.items()
-        },
-    )
+    compared = [
+        features(robot, shape, max_links=max_links)
+        for robot, shape in zip(robots, shapes, strict=True)
+    ]
+    return {
+        name: np.array([[measure.function(a, b) for b in compared] for a in compared])
+        for name, measure in MEASURES.items()
+    }
 
 
-def similarity_table(names: Sequence[str], comparison: Comparison) -> str:
+def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:
     """Return a table with a row for each pair of robots and a column for each measure."""
     header = [""]
     for name, measure in MEASURES.items():
@@ -137,7 +128,7 @@ def similarity_table(names: Sequence[str], comparison: Comparison) -> str:
     rows = [
         (
             f"{escape(names[i])} and {escape(names[j])}",
-            *(f"{comparison.values[name][i, j]:.3f}" for name in MEASURES),
+            *(f"{similarity[name][i, j]:.3f}" for name in MEASURES),
         )
         for i, j in combinations(range(len(names)), 2)
     ]

@@ -8,10 +8,10 @@ from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from morphgen.typing import Array
 from morphgen.viewer.app.address import Address
-from morphgen.viewer.population_layout import spread
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
 CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"
@@ -22,6 +22,8 @@ _WIDTH = 480
 """Width of an SVG in its own units."""
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
+_MAX_ROUNDS = 200
+"""Rounds in which the robots of a map move apart."""
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
 """White to dark blue."""
 
@@ -73,6 +75,27 @@ def map_svg(
         )
     rows = float(cells[:, 1].max()) + 1
     return _svg(rows * height + label, "".join(marks), _MAP_WIDTH)
+
+
+def spread(points: Array) -> Array:
+    """Move points (n, 2) apart until neighbours have about the distance 1; far ones stay."""
+    # A seeded offset, because points at the same place have no direction to part.
+    rng = np.random.default_rng(0)
+    points = points + rng.uniform(-0.05, 0.05, points.shape)
+    for _ in range(_MAX_ROUNDS):
+        pairs = cKDTree(points).query_pairs(0.98, output_type="ndarray")
+        if not len(pairs):
+            break
+        i, j = pairs.T
+        offset = points[i] - points[j]
+        length = np.linalg.norm(offset, axis=1, keepdims=True)
+        step = 0.5 * (1 - length) * offset / np.maximum(length, 1e-12)
+        shift, count = np.zeros_like(points), np.bincount(pairs.ravel(), minlength=len(points))
+        np.add.at(shift, i, step)
+        np.add.at(shift, j, -step)
+        # The square root keeps crowds from exploding, and is faster than the mean.
+        points = points + shift / np.sqrt(np.maximum(count, 1))[:, None]
+    return np.asarray(points)
 
 
 def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:

@@ -1,10 +1,7 @@
-"""A gallery of robots: cards with pictures, search, filters and order, and the contact sheet."""
+"""A gallery of robots: cards with pictures, search, filters and order."""
 
 from __future__ import annotations
 
-import base64
-import functools
-import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
@@ -12,27 +9,20 @@ from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
-import matplotlib
-import numpy as np
 import viser
-from matplotlib.figure import Figure
-from PIL import Image
 
-from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import PICTURE
-from morphgen.viewer import figures, markup, parallel_coordinates, robot_rows
+from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import WorkerDied
-from morphgen.viewer.population_layout import UNITS
 from morphgen.viewer.robot_files import (
     Thumbnail,
     make_thumbnail,
     measure_picture,
     thumbnail_of_picture,
 )
-from morphgen.viewer.robot_rows import Row, facts_line
-from morphgen.viewer.scene.stage import bar_length, length_text
+from morphgen.viewer.robot_rows import UNITS, Row
 
 SCALES = ("common", "own")
 """Scales of pictures: the same for all robots, or for each one that fills its picture."""
@@ -60,10 +50,6 @@ class Gallery:
     """Controls by their key in the address."""
     histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     """Distributions of the facts above their sliders."""
-    panel_width: float = 0.0
-    """Width of the panel of thumbnails [pixels]."""
-    coordinates: viser.GuiHtmlHandle | None = None
-    """Parallel coordinates, if at least two facts vary."""
     notices: list[str] = field(default_factory=list)
     """Messages about values of the address that were left out; cleared when a control changes."""
     empty: str = ""
@@ -229,29 +215,6 @@ def show_histograms(gallery: Gallery) -> None:
         handle.content = markup.framed(svg)
 
 
-def show_coordinates(gallery: Gallery) -> None:
-    """Show the facts that vary as parallel coordinates."""
-    if gallery.coordinates is None:
-        return
-    passing = {row.uri for row in passing_rows(gallery)}
-    svg = parallel_coordinates.parallel_svg(
-        gallery.rows, _axes(gallery), passing, gallery.panel_width
-    )
-    hint = (
-        f"{len(passing)} of {len(gallery.rows)} robots pass the filter. Drag along an axis to "
-        "choose a range, click it to clear the range, click a line to open its robot."
-    )
-    gallery.coordinates.content = markup.framed(markup.dim(hint), svg)
-
-
-def brush(gallery: Gallery, text: str) -> None:
-    """Set a range as the pointer has chosen it at an axis; see ``parse_brush``."""
-    fact, (low, high) = parallel_coordinates.parse_brush(text, _axes(gallery))
-    control = gallery.controls[fact]
-    low, high = (round(value / control.step) * control.step for value in (low, high))
-    control.value = (max(low, control.min), min(high, control.max))
-
-
 def parse_range(
     fact: str, text: str, limits: tuple[float, float] | None
 ) -> tuple[float, float] | None:
@@ -274,20 +237,6 @@ def parse_range(
             f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
         )
     return max(low, limits[0]), min(high, limits[1])
-
-
-def _axes(gallery: Gallery) -> dict[str, parallel_coordinates.Axis]:
-    """Return the axes of the facts that have a slider, with the range of the slider."""
-    return {
-        fact: parallel_coordinates.Axis(
-            _LABELS[fact],
-            (control.min, control.max),
-            fact in _COUNTS,
-            tuple(control.value) if _range_text(gallery, fact) else None,
-        )
-        for fact, control in gallery.controls.items()
-        if fact in robot_rows.NUMBERS
-    }
 
 
 def _current_filter(gallery: Gallery) -> robot_rows.Filter:
@@ -449,18 +398,14 @@ def open_panels(
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
     panel.dock_left()
-    gallery.panel_width = max(gallery.session.width - width - CANVAS_WIDTH, 400.0)
-    panel.set_width(gallery.panel_width)
+    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, 400.0))
     return panel
 
 
-def add_controls(gallery: Gallery, panel: viser.PanelHandle) -> None:
+def add_controls(gallery: Gallery) -> None:
     """Add the controls, in the state that the address gives, and show the first robots."""
     session = gallery.session
     add_filter(gallery)
-    if len(gallery.histograms) > 1:
-        with panel.add_tab("Parallel coordinates", viser.Icon.CHART_LINE):
-            gallery.coordinates = session.client.gui.add_html("")
     gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
     buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
 
@@ -475,14 +420,10 @@ def add_controls(gallery: Gallery, panel: viser.PanelHandle) -> None:
         clear_filter(gallery, key)
         changed()
 
-    def choose_range(text: str) -> None:
-        brush(gallery, text)
-        changed()
-
     for control in gallery.controls.values():
         session.on_change(control, changed, "filter")
     session.on_change(buttons, turn_page)
-    session.actions |= {"clear filter": clear, "brush": choose_range}
+    session.actions["clear filter"] = clear
     show_page(gallery, gallery.page_number)
 
 
@@ -499,114 +440,5 @@ def show_page(gallery: Gallery, number: int) -> None:
     gallery.empty = "" if rows else empty_text(gallery)
     load_bundle_pictures(gallery, gallery.page_rows)
     show_histograms(gallery)
-    show_coordinates(gallery)
     draw_cards(gallery)
     session.run_in_background(lambda: draw_missing(gallery), "thumbnails")
-
-
-_CELL_WIDTH, _PICTURE_HEIGHT, _TEXT_HEIGHT = 1.5, 1.125, 0.36
-"""Size of a cell, its picture above its text [inches]."""
-_TITLE_HEIGHT, _BORDER = 0.5, 0.2
-"""Height of the line with the title and the scale, and border around the sheet [inches]."""
-_DPI = 200
-_ASPECT = 1.4
-"""Width of a sheet divided by its height, about that of a slide."""
-_BOTTOM = 0.04
-"""Height within a picture at which robots stand, as a share of the picture."""
-_GREY = "0.45"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A robot on a sheet."""
-
-    image: str
-    """Picture as a ``data:`` URL; empty if it cannot be drawn."""
-    name: str
-    facts: str
-    share: float = 1.0
-    """Size of the picture within its cell, at most 1."""
-
-
-def contact_sheet(title: str, cells: Sequence[Cell], height: float, suffix: str) -> bytes:
-    """Draw a contact sheet.
-
-    height: Height that a whole picture shows [m]; NaN if the pictures have different scales.
-    """
-    columns = max(round(math.sqrt(_ASPECT * len(cells))), 1)
-    rows = math.ceil(len(cells) / columns)
-    cell_height = _PICTURE_HEIGHT + _TEXT_HEIGHT
-    width = columns * _CELL_WIDTH + 2 * _BORDER
-    total = rows * cell_height + _TITLE_HEIGHT + 2 * _BORDER
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # the same bytes whatever the user has configured
-        figure = Figure(figsize=(width, total), dpi=_DPI)
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(0, total))
-        axes.set_axis_off()
-        top = total - _BORDER
-        axes.text(_BORDER, top - 0.1, title, fontsize=11, va="top", weight="bold", parse_math=False)
-        if not math.isnan(height):
-            length = bar_length(0.6 * height)
-            bar = length / height * _PICTURE_HEIGHT
-            right, y = width - _BORDER, top - 0.28
-            axes.plot((right - bar, right), (y, y), color="black", linewidth=2)
-            axes.text(right - bar / 2, y + 0.05, length_text(length), fontsize=7, ha="center")
-        for i, cell in enumerate(cells):
-            row, column = divmod(i, columns)
-            left = _BORDER + column * _CELL_WIDTH
-            bottom = top - _TITLE_HEIGHT - (row + 1) * cell_height + _TEXT_HEIGHT
-            if cell.image:
-                w, h = cell.share * _CELL_WIDTH, cell.share * _PICTURE_HEIGHT
-                x = left + (_CELL_WIDTH - w) / 2
-                y = bottom + (1 - cell.share) * _BOTTOM * _PICTURE_HEIGHT
-                pixels = np.asarray(decode_picture(cell.image))
-                axes.imshow(pixels, extent=(x, x + w, y, y + h), interpolation="lanczos")
-            middle = left + _CELL_WIDTH / 2
-            words: dict[str, Any] = {"ha": "center", "va": "top", "parse_math": False}
-            axes.text(middle, bottom - 0.02, cell.name[:28], fontsize=6.5, **words)
-            axes.text(middle, bottom - 0.15, cell.facts, fontsize=5.5, color=_GREY, **words)
-        axes.set(xlim=(0, width), ylim=(0, total), aspect="auto")
-        content = io.BytesIO()
-        when = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None}}
-        figure.savefig(content, format=suffix, dpi=_DPI, metadata=when[suffix])
-    return content.getvalue()
-
-
-def decode_picture(url: str) -> Image.Image:
-    """Return the picture of a ``data:`` URL."""
-    data = base64.b64decode(url.partition(",")[2])
-    return Image.open(io.BytesIO(data)).convert("RGB")
-
-
-MAX_ROBOTS = 240
-"""Robots of one sheet."""
-
-
-def add_sheet_buttons(gallery: Gallery) -> None:
-    """Add buttons for a PNG and a PDF of the robots that pass the filter, on all pages."""
-    gui, session = gallery.session.client.gui, gallery.session
-    with gui.add_folder("Contact sheet", expand_by_default=False):
-        for suffix in ("png", "pdf"):
-            button = gui.add_button(f"Download as {suffix.upper()}", icon=viser.Icon.DOWNLOAD)
-            send = functools.partial(_send, gallery, suffix)
-            session.on_change(button, functools.partial(session.run_in_background, send))
-
-
-def _send(gallery: Gallery, suffix: str) -> None:
-    session, rows = gallery.session, shown_rows(gallery)
-    if not 1 <= len(rows) <= MAX_ROBOTS:
-        raise MorphgenError(
-            f"{len(rows)} robots for a contact sheet; expected 1 to {MAX_ROBOTS}: use the filter"
-        )
-    load_pictures(gallery, rows)
-    rows = shown_rows(gallery)  # with the facts that were measured meanwhile
-    sizes, height = shares(gallery, rows)
-    cells = [
-        Cell(gallery.thumbnails.get(row.uri, ""), row.name, facts_line(row), share)
-        for row, share in zip(rows, sizes, strict=True)
-    ]
-    session.set_status("drawing the sheet")
-    content = session.run_in_worker(contact_sheet, gallery.title, cells, height, suffix)
-    name = f"{gallery.title.strip('/').replace('/', '-')}.{suffix}"
-    session.client.send_file_download(name, content, save_immediately=True)
-    session.set_status("")

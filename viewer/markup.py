@@ -57,13 +57,6 @@ margin:4px 0 8px 0}
 .mg .offspring{display:grid;grid-template-columns:repeat(3,1fr);gap:8px;margin-top:.5em}
 .mg .offspring>div{border:1px solid #8883;border-radius:6px;padding:5px 8px;overflow-wrap:anywhere}
 .mg [data-do]{cursor:pointer}
-.mg .parallel{font-family:inherit;margin-top:8px}
-.mg .parallel text{fill:currentColor;font-size:12px;paint-order:stroke;
-stroke:var(--mantine-color-body);stroke-width:3px;stroke-linejoin:round}
-.mg .parallel .name{text-anchor:middle;font-weight:600}.mg .parallel .tick{text-anchor:end}
-.mg .parallel .lines a:hover path{stroke:#f76707;stroke-width:3;stroke-opacity:1}
-.mg .parallel .brush{fill:transparent;cursor:crosshair;touch-action:none}
-.mg .parallel .brush.drawn,.mg .parallel .chosen{fill:#339af0;fill-opacity:.3;pointer-events:none}
 .mg .dim{color:#868e96;font-size:11.5px}.mg .bar{height:3px;background:#8882;margin-top:3px}
 .mg .bar div{height:3px;background:#339af0}
 [data-mantine-color-scheme="dark"] .mg a{color:#74c0fc}

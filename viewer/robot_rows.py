@@ -35,8 +35,10 @@ T = TypeVar("T")
 PAGE_SIZES = (24, 48, 96)
 SORTS = ("order", "name", "category", "dof", "links", "reach", "mass", "role", "findings")
 """Keys by which rows can be sorted; ``order`` is the order of the set."""
+UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
+"""Facts that are numbers, and their units."""
 NUMBERS = ("dof", "links", "reach", "mass")
-"""Facts by whose range rows can be filtered."""
+"""Facts by whose range rows can be filtered, in the order of their sliders."""
 UNREADABLE = "unreadable"
 """Finding of a bundle whose card cannot be read."""
 

@@ -17,7 +17,6 @@ machine.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import tempfile
 from collections.abc import Iterable
@@ -42,7 +41,6 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
-from morphgen.grammar.robot_set import INDEX, SETTINGS
 from morphgen.grammar.robot_source import RobotSource, light_derivation, read_source
 from morphgen.model.robot import Robot
 
@@ -105,18 +103,6 @@ class FileAccess:
             text = re.sub(rf"{re.escape(str(root))}/(?=\w)", "", text)
             text = re.sub(rf"{re.escape(str(root))}(?![\w.-])", ".", text)
         return shorten(text, MAX_ERROR)
-
-
-def owned_set(text: str, files: FileAccess) -> Path:
-    """Return the folder of a robot set whose robots the viewer may delete."""
-    folder = Path() if ":" in text else files.path(text)
-    if not (folder / INDEX).is_file() or not (folder / SETTINGS).is_file():
-        raise UriError(
-            f"{shorten(text)}: robots are deleted from sets only, which morphgen sample makes"
-        )
-    if folder.stat().st_uid != os.geteuid() or not os.access(folder, os.W_OK):
-        raise UriError(f"{shorten(text)}: the set belongs to somebody else, or is read-only")
-    return folder.resolve()
 
 
 def shorten(text: str, limit: int = 100) -> str:

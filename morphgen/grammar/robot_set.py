@@ -15,7 +15,7 @@ import json
 import math
 import shutil
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -151,26 +151,6 @@ class RobotMaker:
     def make_all(self, indices: Sequence[int]) -> list[Record]:
         """Draw and write several robots."""
         return [self.make(index) for index in indices]
-
-
-def remove_robots(folder: Path, names: Collection[str]) -> None:
-    """Delete robots of a set: their lines of the index first, then their folders.
-
-    ``make_set`` would draw the same robots again.
-    """
-    with locked_folder(folder):
-        records = read_index(folder)
-        if unknown := set(names) - {record["name"] for record in records}:
-            raise FormatError(f"{folder} has no robot {min(unknown)!r}")
-        if links := [name for name in names if (folder / name).is_symlink()]:
-            raise FormatError(f"{folder / links[0]} is a link; expected a robot's own folder")
-        kept = [json.dumps(record) for record in records if record["name"] not in names]
-        try:
-            write_atomic(folder / INDEX, "".join(f"{line}\n" for line in kept))
-            for name in names:
-                shutil.rmtree(folder / name)
-        except OSError as error:
-            raise FormatError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
 def read_index(folder: Path) -> list[Record]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -32,8 +31,6 @@ from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
 """Draws for one robot before its conditions are considered unsatisfiable."""
-MUTATED_SHARE = 0.5
-"""Share of the children of two robots of which one choice is drawn again, as of a neighbour."""
 TOO_LARGE = f"more than {MAX_PARTS} parts"
 """Reason for rejecting a draw whose recursion exceeds the part limit."""
 UNCHANGED = "nothing changed"
@@ -124,81 +121,25 @@ def mutate(
     origin = derive(grammar, library, RecordedChooser(random, choices))
     if not choices:
         raise GrammarError(f"grammar {grammar.name!r} leaves nothing to choose: no neighbours")
-    yield from _others(
-        partial(_with_one_redrawn, choices=choices),
-        grammar,
-        library,
-        (*grammar.wheres, *where),
-        n,
-        seed,
-        f"{name}-m",
-        (origin,),
-        f"neighbour of {name!r}",
-    )
-
-
-def cross(
-    grammar: Grammar,
-    library: Library,
-    parents: tuple[Choices, Choices],
-    n: int,
-    *,
-    seed: int = 0,
-    name: str,
-) -> Iterator[Sample]:
-    """Draw children of two robots: a choice is that of one parent, or a value between both.
-
-    Alternatives and counts are those of one of the parents; other values are uniform between those
-    of both (arithmetic crossover). Choices that only one parent made are kept, and choices that
-    neither made, because their robots have no such part, are drawn. ``MUTATED_SHARE`` of the
-    children are mutated, too: similar parents have few other children.
-    """
-    random = RandomChooser(np.random.default_rng(seed))
-    origins = tuple(
-        derive(grammar, library, RecordedChooser(random, choices)) for choices in parents
-    )
-    yield from _others(
-        partial(_with_mixed_choices, parents=parents),
-        grammar,
-        library,
-        grammar.wheres,
-        n,
-        seed,
-        f"{name}-x",
-        origins,
-        f"child of two robots of {grammar.name!r}",
-    )
+    conditions = (*grammar.wheres, *where)
+    for index in range(n):
+        # A generator of its own, so that neighbour i does not depend on n.
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        choosers = islice(_with_one_redrawn(rng, choices), MAX_ATTEMPTS)
+        result = _first_valid(
+            choosers, grammar, library, conditions, f"{name}-m{index:04d}", index, (origin,)
+        )
+        if not isinstance(result, Sample):
+            raise SamplingError(
+                f"no neighbour of {name!r} in {MAX_ATTEMPTS} draws: "
+                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
+            )
+        yield result
 
 
 def robot_name(grammar: Grammar, index: int) -> str:
     """Return the default name of robot number ``index`` of a grammar."""
     return f"{grammar.name}-{index:06d}"
-
-
-def _others(
-    choosers_of: Callable[[np.random.Generator], Iterator[RecordedChooser]],
-    grammar: Grammar,
-    library: Library,
-    where: Sequence[Expression],
-    n: int,
-    seed: int,
-    prefix: str,
-    origins: tuple[Derivation, ...],
-    what: str,
-) -> Iterator[Sample]:
-    """Yield n valid robots other than ``origins``, the one of an index independent of n."""
-    for index in range(n):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-        choosers = islice(choosers_of(rng), MAX_ATTEMPTS)
-        result = _first_valid(
-            choosers, grammar, library, where, f"{prefix}{index:04d}", index, origins
-        )
-        if not isinstance(result, Sample):
-            raise SamplingError(
-                f"no {what} in {MAX_ATTEMPTS} draws: "
-                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
-            )
-        yield result
 
 
 def _with_one_redrawn(rng: np.random.Generator, choices: Choices) -> Iterator[RecordedChooser]:
@@ -208,25 +149,6 @@ def _with_one_redrawn(rng: np.random.Generator, choices: Choices) -> Iterator[Re
         forgotten = keys[int(rng.integers(len(keys)))]
         kept = {key: value for key, value in choices.items() if key != forgotten}
         yield RecordedChooser(RandomChooser(rng), kept)
-
-
-def _with_mixed_choices(
-    rng: np.random.Generator, parents: tuple[Choices, Choices]
-) -> Iterator[RecordedChooser]:
-    """Yield choosers that repeat mixtures of the choices of two robots."""
-    keys = sorted({*parents[0], *parents[1]})
-    while True:
-        mixed = {key: _mixed_choice(rng, [p[key] for p in parents if key in p]) for key in keys}
-        if keys and rng.random() < MUTATED_SHARE:
-            del mixed[keys[int(rng.integers(len(keys)))]]
-        yield RecordedChooser(RandomChooser(rng), mixed)
-
-
-def _mixed_choice(rng: np.random.Generator, values: Sequence[float]) -> float:
-    """Return one of two values, or if one of them is no whole number, a value between them."""
-    if all(float(value).is_integer() for value in values):
-        return values[int(rng.integers(len(values)))]
-    return float(rng.uniform(min(values), max(values)))
 
 
 def _first_valid(

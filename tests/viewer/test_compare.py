@@ -1,11 +1,9 @@
-"""Robots are compared joint by joint, token by token and shape by shape."""
+"""Robots are compared joint by joint, by their tokens and shape by shape."""
 
-import io
 import re
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from helpers.robots import arm
 from morphgen.grammar.compose import compose
@@ -25,8 +23,7 @@ from morphgen.viewer.comparison import (
     similarity_table,
     with_roles,
 )
-from morphgen.viewer.figures import heatmap_svg, map_svg
-from morphgen.viewer.token_picture import token_differences, tokens_png
+from morphgen.viewer.figures import heatmap_svg, map_svg, spread
 
 LIBRARY = default_library()
 
@@ -56,47 +53,13 @@ def test_joint_role_moves_every_robot_by_the_same_fraction():
         assert with_roles(robot, home, values) == pytest.approx(home)
 
 
-def test_token_differences_are_relative_to_the_first_robot():
-    a = np.zeros((2, 48))
-    b = np.zeros((3, 48))
-    b[1, 5] = 0.1
-    same, other = token_differences([a, b])
-    assert not same.any()
-    assert other[1].nonzero()[0].tolist() == [5]
-    assert other[2].all()
-
-
-def test_token_picture_is_reproducible():
-    tables = [np.linspace(-1, 1, 96).reshape(2, 48), np.zeros((3, 48))]
-    links = [["a", "b"], ["a", "$x$", "c"]]
-    first = tokens_png(["one", "two_$y"], links, tables)
-    assert first == tokens_png(["one", "two_$y"], links, tables)
-    width, height = Image.open(io.BytesIO(first)).size
-    assert width > 800
-    assert height > 200
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_token_picture_is_as_bright_as_its_page(dark):
-    links, tables = [["a", "b", "c"]], [np.zeros((3, 48))]
-    content = tokens_png(["one"], links, tables, dark=dark)
-    pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA")).astype(int)
-    assert pixels[0, 0, 3] == 0
-    solid = pixels[pixels[..., 3] == 255][:, :3]
-    colours, counts = np.unique(solid, axis=0, return_counts=True)
-    zero = colours[counts.argmax()]  # most of the picture
-    assert zero.max() < 70 if dark else zero.min() > 240
-    ink = solid.max() if dark else solid.min()
-    assert abs(ink - zero.mean()) > 150
-
-
 def test_robot_compared_with_itself_is_identical():
     robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
-    comparison = compare_robots(robots, LIBRARY.folders)
-    assert comparison.values["cosine"].diagonal() == pytest.approx([1, 1])
-    assert comparison.values["tree"].diagonal() == pytest.approx([0, 0])
-    assert comparison.values["tree"][0, 1] > 0
-    table = similarity_table(["<a>", "b"], comparison)
+    similarity = compare_robots(robots, LIBRARY.folders)
+    assert similarity["cosine"].diagonal() == pytest.approx([1, 1])
+    assert similarity["tree"].diagonal() == pytest.approx([0, 0])
+    assert similarity["tree"][0, 1] > 0
+    table = similarity_table(["<a>", "b"], similarity)
     assert "&lt;a&gt; and b" in table
 
 
@@ -136,6 +99,15 @@ def test_figures_link_to_robots_and_escape_names():
     heatmap = heatmap_svg(np.array([[1.0, 0.3], [0.3, 1.0]]), names, sides, larger=True)
     assert heatmap.count("<rect") == 4
     assert "b and &lt;a&gt;: 0.300" in heatmap
+
+
+def test_points_at_one_place_are_spread():
+    points = spread(np.zeros((300, 2)))
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2) + 9 * np.eye(300)
+    assert distance.min() > 0.6
+    assert np.abs(points).max() < 20
+    far = np.array([[0.0, 0.0], [10.0, 0.0]])
+    np.testing.assert_allclose(spread(far), far, atol=0.1)
 
 
 def test_coincident_points_are_drawn():

@@ -18,9 +18,6 @@ def test_robots_are_compared(see, viewer, picture):
     page.get_by_text("Similarity").wait_for()
     page.get_by_text(re.compile("gantry-plane and arm")).wait_for()
     picture(page, "compare")
-    page.get_by_role("tab", name="Tokens").click()
-    page.locator("img[alt=tokens]").wait_for()
-    picture(page, "compare-tokens")
     page.get_by_role("tab", name="Move").click()
     before = [node(on, f"/robot{i}/2").position.copy() for i in range(2)]
     row = page.get_by_text("joint 1", exact=True).locator("xpath=ancestor::*[.//input][1]")

@@ -8,7 +8,7 @@ from morphgen.grammar.grammar_file import find_grammar, grammar_from_text, load_
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request
 from morphgen.grammar.sampling import sample_robot
-from morphgen.viewer.pages.compose_grammar import grammar_around, make_individual, offspring
+from morphgen.viewer.pages.compose_grammar import grammar_around, make_individual, mutants
 
 LIBRARY = default_library()
 
@@ -71,8 +71,8 @@ def test_integers_change_by_one_or_two():
 
 def test_mutants_differ_from_the_robot_in_one_choice():
     grammar, _, parent = around(parse_request(["base=gantry", "ee=cube"], LIBRARY))
-    mutants = offspring(grammar, LIBRARY.folders, [parent.choices], 1)
-    assert len({mutant.derivation.digest for mutant in mutants} | {parent.derivation.digest}) > 5
+    generation = mutants(grammar, LIBRARY.folders, parent.choices, 1)
+    assert len({mutant.derivation.digest for mutant in generation} | {parent.derivation.digest}) > 5
 
 
 def test_a_body_of_a_grammar_has_one():

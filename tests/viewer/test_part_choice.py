@@ -7,16 +7,16 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.pages.compose_parts import with_parameter
-from morphgen.viewer.pages.part_choice import (
+from morphgen.viewer.pages.compose_grammar import first_parts
+from morphgen.viewer.pages.compose_parts import (
     NO_PART,
     choice_of,
     controls_of,
-    first_parts,
     node_controls,
     parse_choice,
     part_options,
     slots_of,
+    with_parameter,
     with_part,
     with_value,
 )

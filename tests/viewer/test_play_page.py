@@ -5,7 +5,6 @@ import threading
 import time
 
 import pytest
-import zstandard
 
 from helpers.runs import QUIET, small_config, small_source
 from morphgen.rl.runs.training import train
@@ -75,9 +74,7 @@ def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page.get_by_text("success", exact=True).wait_for()
 
 
-def test_episode_is_saved_opened_and_exported_as_scene_and_video(
-    see, viewer, folder, picture, tmp_path
-):
+def test_episode_is_saved_opened_and_exported_as_video(see, viewer, folder, picture, tmp_path):
     on = viewer()
     page = see(f"?play=reach&robot={CUBE}&robot=words:base=gantry ee=cube&seed=1", on=on)
     wait_for_end(page)
@@ -87,9 +84,6 @@ def test_episode_is_saved_opened_and_exported_as_scene_and_video(
     episode = read_episode(folder / "episode.npz", on.files)
     assert [len(track.q) for track in episode.tracks] == [301, 301]
     assert all(score_until(track, "reach", 300) > 100 for track in episode.tracks)
-    scene = download(page, "Scene (.viser)").path().read_bytes()
-    size = int.from_bytes(scene[:8], "little")
-    assert len(zstandard.ZstdDecompressor().decompressobj().decompress(scene[8:])) == size
     film = download(page, "Film (.mp4)").path().read_bytes()
     assert film[4:8] == b"ftyp"
     page.goto(f"http://127.0.0.1:{on.port}/?play=episode.npz")

@@ -1,4 +1,4 @@
-"""Plots beside numbers that move: curves of an episode, histograms of a gallery, tokens."""
+"""Plots beside numbers that move: curves of an episode, histograms of a gallery."""
 
 import re
 
@@ -64,17 +64,6 @@ def test_a_gallery_shows_the_distributions_of_its_facts(viewer):
     with PlainClient(viewer().port, "?gallery=robots/prims") as client:
         client.control("MultiSlider", "Reach (m)")
         client.shows("robots from")
-
-
-@pytest.mark.slow
-def test_tokens_are_shown_beside_the_robot(see, picture):
-    page = see("?robot=robots/some-arm")
-    page.get_by_text("no self-collision").wait_for()
-    page.get_by_role("tab", name="Links").click()
-    page.get_by_role("button", name="Show the tokens").click()
-    page.locator('img[alt="tokens"]').wait_for()
-    picture(page, "tokens")
-    assert page.failures == []
 
 
 @pytest.mark.slow

@@ -1,44 +1,21 @@
-"""The population page in a browser, and its actions."""
+"""The population page: its pointer, its addresses, and its actions."""
 
 import io
 import re
-import shutil
 import zipfile
 
+import numpy as np
 import pytest
 
 from helpers.viser_client import PlainClient
 from morphgen.benchmark.split_file import read_split
-from morphgen.grammar.robot_set import read_index
-
-CARD = "#morphgen-hover"
-
-
-@pytest.fixture
-def own_set(folder):
-    """A copy of the set that a test may change."""
-    copy = folder / "robots" / "own"
-    shutil.copytree(folder / "robots" / "prims", copy)
-    yield copy
-    shutil.rmtree(copy)
+from morphgen.viewer.scene.stage import camera_view, project_points
 
 
 def wait_until_shown(page):
     page.get_by_text("no robot is selected").or_(
         page.get_by_text(re.compile(r"\d selected"))
     ).wait_for()
-    page.wait_for_function("window.morphgenHover && window.morphgenHover.table")
-
-
-def robot_points(page):
-    """Return a point of the window on each robot: the middle of its first capsule."""
-    return page.evaluate("""() => {
-        const box = document.querySelector("canvas").getBoundingClientRect(), points = {};
-        const t = window.morphgenHover.table, unit = box.height / 8192;
-        for (let i = 0; i < t.length; i += 6) points[t[i + 5]] ??= [
-            box.left + (t[i] + t[i + 2]) / 2 * unit, box.top + (t[i + 1] + t[i + 3]) / 2 * unit];
-        return points;
-    }""")
 
 
 def test_unknown_populations_show_an_error(viewer):
@@ -46,28 +23,65 @@ def test_unknown_populations_show_an_error(viewer):
         client.shows("no such file or folder")
 
 
+def test_a_click_selects_a_robot_and_one_with_shift_adds_another(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?population=robots/prims&joint1=0.25") as client:
+        client.shows("no robot is selected")
+        batches = client.until(
+            lambda: [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
+        )
+        click = {
+            "type": "SceneNodeClickMessage",
+            "name": batches[0]["name"],
+            "instance_index": 0,
+            "ray_origin": [1.0, 0.0, 0.0],
+            "ray_direction": [-1.0, 0.0, 0.0],
+            "screen_pos": [0.5, 0.5],
+            "modifier": None,
+            "owner": batches[0]["owner"],
+        }
+        for index in (-1, 10**6, None):
+            client.send({**click, "instance_index": index})
+        client.send(click)
+        client.shows("1 selected")
+        client.shows("joint1=0.25&select=0")
+        (session,) = on.sessions.values()
+        drawn = session.client.scene._handle_from_node_name[batches[0]["name"]]
+        last = len(drawn.batched_positions) - 1
+        client.send({**click, "instance_index": last, "modifier": "shift"})
+        client.shows("2 selected")
+        client.change(client.control("ButtonGroup", "Select"), "invert")
+        client.shows("28 selected")
+        client.send({"type": "GuiUpdateMessage", "uuid": client.control("Button", "Choose"),
+                     "updates": {"value": True}})  # fmt: skip
+        client.shows("28 chosen")
+
+
 @pytest.mark.slow
-def test_hover_shows_a_card_and_a_click_opens_the_robot(see, picture):
-    page = see("?population=robots/prims")
+def test_a_click_of_the_pointer_selects_the_robot_under_it(see, viewer, picture):
+    on = viewer()
+    page = see("?population=robots/prims", on=on)
     wait_until_shown(page)
+    page.wait_for_timeout(3000)
     picture(page, "population")
-    points = robot_points(page)
-    assert len(points) == 30
-    page.mouse.move(*points["7"])
-    page.locator(CARD).wait_for()
-    name = page.locator(f"{CARD} b").inner_text()
-    assert name.startswith("prims-")
-    page.mouse.click(*points["7"])
+    (session,) = on.sessions.values()
+    handle = session.client.scene._handle_from_node_name["/population/0"]
+    view = camera_view(session.client)
+    (x, y), _ = project_points(view, np.array(handle.batched_positions[7], dtype=float))
+    box = page.locator("canvas").first.bounding_box()
+    page.mouse.click(box["x"] + x * box["height"], box["y"] + y * box["height"])
+    page.get_by_text("1 selected").wait_for()
+    link = page.get_by_role("link", name=re.compile("^prims-0"))
+    name = link.inner_text()
+    link.click()
     page.wait_for_url(re.compile(f"robot=robots/prims/{name}"))
     assert page.failures == []
 
 
 @pytest.mark.slow
-def test_a_rectangle_selects_and_the_address_keeps_arrangement_pose_and_selection(see, control):
+def test_a_rectangle_selects_and_the_address_keeps_arrangement_and_selection(see, control):
     page = see("?population=robots/prims&arrange=reach")
     wait_until_shown(page)
-    page.get_by_role("button", name="random free").click()
-    page.wait_for_url(re.compile("pose=1"))
     control.input(page, "joint 1").last.fill("0.25")
     page.wait_for_url(re.compile("joint1=0.25"))
     box = page.locator("canvas").first.bounding_box()
@@ -84,14 +98,14 @@ def test_a_rectangle_selects_and_the_address_keeps_arrangement_pose_and_selectio
     page.get_by_text("no robot is selected").wait_for()
     page.goto(re.sub("$", "&select=2,4-5", page.url))
     page.get_by_text("3 selected").wait_for()
-    assert all(part in page.url for part in ("arrange=reach", "pose=1", "joint1=0.25"))
-    page.get_by_role("button", name="Compare").click()
-    page.wait_for_url(re.compile("compare=.*prims-000002&compare=.*prims-000004&compare="))
+    assert all(part in page.url for part in ("arrange=reach", "joint1=0.25"))
+    page.get_by_role("button", name="Home").click()
+    page.wait_for_url(re.compile(r"arrange=reach&select=2,4-5$"))
 
 
 @pytest.mark.slow
-def test_selected_robots_are_exported_split_and_deleted(see, control, folder, own_set):
-    page = see("?population=robots/own&select=0-1")
+def test_selected_robots_are_exported_and_split(see, control, folder):
+    page = see("?population=robots/prims&select=0-1")
     page.get_by_text("2 selected").wait_for()
     with page.expect_download() as download:
         page.get_by_role("button", name="Export bundles").click()
@@ -105,30 +119,6 @@ def test_selected_robots_are_exported_split_and_deleted(see, control, folder, ow
     split = read_split(folder / "splits" / "from" / "population.yaml")
     assert [member.name for member in split.test] == ["prims-000000", "prims-000001"]
     assert len(split.train) == 28
-    page.get_by_role("button", name="Delete from the set").click()
-    page.get_by_role("button", name="Keep them").click()
-    page.get_by_role("button", name="Keep them").wait_for(state="hidden")
-    assert len(read_index(own_set)) == 30
-    page.get_by_role("button", name="Delete from the set").click()
-    page.get_by_role("button", name="Delete 2 robots").click()
-    page.get_by_text("28 robots", exact=True).wait_for()
-    assert len(read_index(own_set)) == 28
-    assert not (own_set / "prims-000000").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("query", ["&arrange=scatter&x=dof&y=mass", "&arrange=map", "@test"])
-def test_arrangements_of_a_split(see, query, picture):
-    page = see(f"?population=extrapolation/primitives/reach{query}")
-    wait_until_shown(page)
-    # The camera moves at first; the points of all robots follow.
-    page.wait_for_function(
-        "n => new Set(window.morphgenHover.table.filter((_, i) => i % 6 == 5)).size == n",
-        arg=2 if query == "@test" else 12,
-    )
-    assert page.get_by_role("button", name="Delete from the set").count() == 0
-    picture(page, "population-" + query.strip("&@").replace("=", "-").replace("&", "-"))
-    assert page.failures == []
 
 
 @pytest.mark.slow

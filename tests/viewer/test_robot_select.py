@@ -12,10 +12,10 @@ from morphgen.model.geometry import Box, Sphere
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.rotation import to_matrix
 from morphgen.viewer.pages.robot_show import joint_of_link, turn_towards
-from morphgen.viewer.population_pick import View, project_points
 from morphgen.viewer.robot_tables import is_about, link_card, rounded
+from morphgen.viewer.scene.overlays import outline_triangles, range_lines
 from morphgen.viewer.scene.robot import RED
-from morphgen.viewer.scene.selection import outline_triangles, range_lines
+from morphgen.viewer.scene.stage import View, project_points
 
 ARM = "?robot=robots/some-arm"
 

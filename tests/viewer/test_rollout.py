@@ -3,10 +3,8 @@
 import json
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
-import zstandard
 
 from helpers.robots import arm
 from helpers.runs import QUIET, small_config
@@ -28,7 +26,6 @@ from morphgen.viewer.scene.rollout import (
     episode_page,
     grid_positions,
     make_renderer,
-    record_scene,
     track_area,
 )
 
@@ -295,17 +292,6 @@ def test_robots_do_not_overlap(episode):
                 low + spots[i] - (other_high + spots[k]), other_low + spots[k] - (high + spots[i])
             )
             assert apart[:2].max() >= GAP - 1e-9
-
-
-def test_a_recording_has_all_shown_steps(beginning):
-    content = record_scene(beginning)
-    payload = zstandard.ZstdDecompressor().decompressobj().decompress(content[8:])
-    assert len(payload) == int.from_bytes(content[:8], "little")
-    length = int.from_bytes(payload[:8], "little")
-    content_info = msgspec.msgpack.decode(payload[8 : 8 + length])
-    assert content_info["durationSeconds"] == pytest.approx((10 + 1) * 2 * beginning.period)
-    kinds = {message["type"] for _, message in content_info["messages"]}
-    assert {"SetPositionMessage", "SetOrientationMessage", "MeshMessage"} <= kinds
 
 
 def test_a_web_page_plays_the_episode(beginning):

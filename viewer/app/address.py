@@ -14,12 +14,12 @@ from urllib.parse import parse_qsl, quote, urlencode
 from morphgen.errors import MorphgenError, nearest
 
 PAGES: Mapping[str, str] = {
-    "library": "morphgen.viewer.pages.library:show",
+    "library": "morphgen.viewer.pages.gallery:show_library",
     "gallery": "morphgen.viewer.pages.gallery:show",
     "population": "morphgen.viewer.pages.population:show",
     "robot": "morphgen.viewer.pages.robot:show",
     "compose": "morphgen.viewer.pages.compose:show",
-    "chosen": "morphgen.viewer.pages.chosen:show",
+    "chosen": "morphgen.viewer.pages.gallery:show_chosen",
     "compare": "morphgen.viewer.pages.compare:show",
     "split": "morphgen.viewer.pages.split:show",
     "play": "morphgen.viewer.pages.play:show",

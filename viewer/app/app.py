@@ -13,20 +13,28 @@ from urllib.parse import parse_qsl
 
 import viser
 
-from morphgen.errors import MorphgenError
+from morphgen.benchmark.split_file import split_names
+from morphgen.benchmark.split_folder import SPLIT_FILE
+from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.urdf.read import UnsoundError
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
+from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
 from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session, read_location
-from morphgen.viewer.app.start_address import start_address
 from morphgen.viewer.app.viser_internals import clear_page
 from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_files import change_tray
 from morphgen.viewer.robot_uri import (
+    CHECKPOINT,
+    EPISODE_SUFFIX,
+    WORDS,
     FileAccess,
+    UriError,
+    resolve_words,
 )
 from morphgen.viewer.scene.stage import BRAND, set_stage
 
@@ -225,3 +233,41 @@ def _require_local_address(host: str) -> None:
             probe.bind(address)
     except OSError as error:
         raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
+
+
+def start_address(words: Sequence[str], files: FileAccess) -> Address:
+    """Return the page that ``morphgen view`` opens."""
+    if not words:
+        return Address("library")
+    if len(words) > 1 or "=" in words[0]:
+        resolve_words(" ".join(words), files)
+        return Address("robot", (WORDS + " ".join(words),))
+    word = words[0]
+    if Path(word).exists():
+        return _path_address(word, files)
+    if word in split_names():
+        return Address("split", (word,))
+    if word in grammar_names():
+        return Address("compose", (word,))
+    valid = (*split_names(), *grammar_names())
+    raise UriError(f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}")
+
+
+def _path_address(text: str, files: FileAccess) -> Address:
+    """Return the page of a file or folder."""
+    path = files.path(text)
+    if path.suffix == EPISODE_SUFFIX:
+        from morphgen.viewer.episode import read_episode
+
+        read_episode(path, files)
+        return Address("play", (text,))
+    if path.suffix == ".pt" or (path / CHECKPOINT).is_file():
+        from morphgen.rl.runs.checkpoint import read_checkpoint
+
+        read_checkpoint(path)
+        return Address("play", state={"policy": text})
+    if path.is_file():
+        return Address({".yaml": "split", SUFFIX: "compose"}.get(path.suffix, "robot"), (text,))
+    if (path / SPLIT_FILE).is_file():
+        return Address("split", (text,))
+    return Address("robot" if is_robot_folder(path) else "gallery", (text,))

@@ -7,7 +7,7 @@ import sys
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -27,6 +27,8 @@ from morphgen.viewer.robot_uri import FileAccess
 
 DEFAULT_WIDTH = 1400
 """Width of a window that a browser does not tell [pixels]."""
+ADDRESS_DELAY = 0.5
+"""Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
 URL_TIMEOUT = 20.0
 """Time in which a browser has to report its URL [s]."""
 
@@ -137,6 +139,8 @@ class Session:
     called with the element's ``data-value``."""
     on_choice: Work | None = None
     """Called after the user has chosen other robots."""
+    state: Callable[[], Mapping[str, str]] = dict
+    """Returns the page's state as its controls have it; see ``show_state``."""
 
     @property
     def client(self) -> viser.ClientHandle:
@@ -306,6 +310,14 @@ class Session:
         """Change the page's state in the URL; see ``Address.with_state``."""
         self.address = self.address.with_state(**state)
         self.show_address(title)
+
+    def show_state(self) -> None:
+        """Show the page's state in the address and its title in the browser's tab."""
+        self.update_address(self.title, **self.state())
+
+    def show_state_later(self) -> None:
+        """Show the page's state soon; many changes in a short time are shown once."""
+        self.call_later(ADDRESS_DELAY, self.show_state, "address")
 
     def keep_tabs(self, titles: str) -> None:
         """Keep the open tabs in the address; see ``tabs``."""

@@ -1,4 +1,4 @@
-"""The page that compares robots side by side: joints, tokens, similarity, primitives."""
+"""The page that compares robots side by side: joints, similarity, primitives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
-from morphgen.viewer.token_picture import tokens_html
 
 PANEL_WIDTH = 520.0
 """Width of the panel [pixels]."""
@@ -30,8 +29,6 @@ EMPTY = (
 ONE_ROBOT = "Add a second robot to see how similar they are."
 PRIMITIVES = "primitives"
 """Value of ``show`` in the address when primitives are drawn."""
-ADDRESS_DELAY = 0.5
-"""Delay of URL updates after a move [s]."""
 GAP = 0.35
 """Distance between the bounding boxes of two robots [m]."""
 _CAMERA_DIRECTION = (0.74, 0.09, 0.28)
@@ -74,21 +71,23 @@ def show(session: Session) -> None:
         _add_robots_tab(page)
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
         _add_move_tab(page)
-    with tabs.add_tab("Tokens", viser.Icon.GRID_DOTS):
-        page.texts["tokens"] = gui.add_html("")
     with tabs.add_tab("Primitives", viser.Icon.CUBE):
         box = gui.add_checkbox("primitives in place of meshes, coloured by IoU", False)
         page.texts["fits"] = gui.add_html("")
 
     def toggle_primitives() -> None:
-        session.address = session.address.with_state(show=PRIMITIVES if box.value else "")
-        _show_in_address(page)
+        session.show_state()
         session.run_in_background(lambda: _show_fits(page, on=box.value))
 
     session.on_change(box, toggle_primitives)
     session.set_status("")
+    session.title = "compare " + ", ".join(robot.name for robot in robots)
+    session.state = lambda: {
+        "show": PRIMITIVES if box.value else "",
+        **comparison.format_moves(page.moved, tuple(page.sliders)),
+    }
     _apply_address(page, box)
-    _show_in_address(page)
+    session.show_state()
     session.run_in_background(lambda: _compare(page))
 
 
@@ -161,13 +160,6 @@ def _apply_address(page: ComparePage, box: viser.GuiCheckboxHandle) -> None:
         page.session.run_in_background(lambda: _show_fits(page, on=True))
 
 
-def _show_in_address(page: ComparePage) -> None:
-    page.session.update_address(
-        "compare " + ", ".join(robot.name for robot in page.robots),
-        **comparison.format_moves(page.moved, tuple(page.sliders)),
-    )
-
-
 def _add_move_tab(page: ComparePage) -> None:
     """Add a slider for each role of joints, and buttons that move all of them."""
     gui, session = page.session.client.gui, page.session
@@ -210,7 +202,7 @@ def _move(page: ComparePage) -> None:
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
             view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))
-    page.session.call_later(ADDRESS_DELAY, lambda: _show_in_address(page), "address")
+    page.session.show_state_later()
 
 
 def _show_fits(page: ComparePage, *, on: bool) -> None:
@@ -238,26 +230,18 @@ def _draw_fits(page: ComparePage, qualities: Sequence[comparison.FitQuality]) ->
 
 
 def _compare(page: ComparePage) -> None:
-    """Show tokens and similarity, or why the robots cannot be compared."""
-    session = page.session
-    names = [robot.name for robot in page.robots]
+    """Show how similar the robots are, or why they cannot be compared."""
+    session, names = page.session, [robot.name for robot in page.robots]
     if len(names) == 1:
         page.texts["similarity"].content = markup.framed(markup.dim(ONE_ROBOT))
+        return
     session.set_status("comparing")
     try:
         folders = session.files.library_folders
-        result = session.run_in_worker(comparison.compare_robots, page.robots, folders)
+        similarity = session.run_in_worker(comparison.compare_robots, page.robots, folders)
+        content = f"<h3>Similarity</h3>{comparison.similarity_table(names, similarity)}"
     except MorphgenError as error:
-        page.texts["similarity"].content = markup.framed(
-            markup.tag("cannot be compared", "warning"), escape(session.files.redact(error))
-        )
-        session.set_status("")
-        return
-    links = [[link.name for link in robot.links] for robot in page.robots]
-    if len(names) > 1:
-        table = comparison.similarity_table(names, result)
-        page.texts["similarity"].content = markup.framed("<h3>Similarity</h3>", table)
-    page.texts["tokens"].content = markup.framed(
-        tokens_html(names, links, result.tables, dark=session.dark)
-    )
+        tag = markup.tag("cannot be compared", "warning")
+        content = f"{tag}{escape(session.files.redact(error))}"
+    page.texts["similarity"].content = markup.framed(content)
     session.set_status("")

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -30,13 +30,12 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, Parameter
 from morphgen.grammar.part import load_part
 from morphgen.grammar.request import default_name
-from morphgen.grammar.sampling import cross, mutate, sample_robot
+from morphgen.grammar.sampling import mutate, sample_robot
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, AddressError, pack_text, parse_count, unpack_text
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.pages.part_choice import first_parts
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess, resolve_grammar, resolve_words
 
 _SHARE_OF_RANGE, _SHARE_OF_VALUE = 0.15, 0.3
@@ -158,7 +157,7 @@ def _item(part: str, arguments: dict[str, str]) -> str:
 
 
 NUM_OFFSPRING = 9
-"""Robots of a generation."""
+"""Mutants of a generation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,28 +167,6 @@ class Individual:
     robot: Robot
     derivation: Derivation
     choices: Choices
-
-
-@dataclass(eq=False)
-class History:
-    """Individuals that were adopted one after the other; a later one may be undone."""
-
-    individuals: list[Individual] = field(default_factory=list)
-    position: int = -1
-    """Index of the current individual."""
-
-    def add(self, individual: Individual) -> None:
-        """Adopt an individual in place of those that were undone."""
-        del self.individuals[self.position + 1 :]
-        self.individuals.append(individual)
-        self.position += 1
-
-    def go_to(self, position: int) -> Individual | None:
-        """Go to an individual; return it, or None if there is no such one."""
-        if not 0 <= position < len(self.individuals):
-            return None
-        self.position = position
-        return self.individuals[position]
 
 
 def make_individual(
@@ -207,16 +184,11 @@ def individual_name(grammar: Grammar, derivation: Derivation) -> str:
     return f"{grammar.name}-{derivation.digest[:8]}"
 
 
-def offspring(
-    grammar: Grammar, folders: tuple[Path, ...], parents: Sequence[Choices], seed: int
+def mutants(
+    grammar: Grammar, folders: tuple[Path, ...], parent: Choices, seed: int
 ) -> list[Individual]:
-    """Return the mutants of one parent, or the children of two. Runs in a worker."""
-    library = Library(folders)
-    if len(parents) == 1:
-        samples = mutate(grammar, library, parents[0], NUM_OFFSPRING, seed=seed, name=grammar.name)
-    else:
-        both = (parents[0], parents[1])
-        samples = cross(grammar, library, both, NUM_OFFSPRING, seed=seed, name=grammar.name)
+    """Return robots that differ from the parent in one choice. Runs in a worker."""
+    samples = mutate(grammar, Library(folders), parent, NUM_OFFSPRING, seed=seed, name=grammar.name)
     return [
         Individual(
             replace(sample.robot, name=individual_name(grammar, sample.derivation)),
@@ -481,6 +453,17 @@ def _draw(tab: GrammarTab, action: str) -> None:
     if action == "next":
         set_value(tab.number, tab.number.value + 1)
     show_grammar(tab, "typical" if action == "typical" else "drawn")
+
+
+def first_parts(derivation: Derivation, n: int) -> Derivation:
+    """Return a derivation of only the first ``n`` parts (at least 1), in order of attachment."""
+    kept_ids = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
+
+    def prune(node: Derivation) -> Derivation:
+        children = ((port, prune(child)) for port, child in node.children if id(child) in kept_ids)
+        return replace(node, children=tuple(children))
+
+    return prune(derivation)
 
 
 def _show_parts(tab: GrammarTab) -> None:

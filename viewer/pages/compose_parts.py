@@ -1,26 +1,202 @@
-"""The tab of the compose page on which parts are chosen for the base, arms and end-effectors."""
+"""The tabs of the compose page with dropdowns of parts, and with sliders of their parameters."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import viser
 
-from morphgen.errors import MorphgenError
+from morphgen.errors import CompositionError, MorphgenError, nearest
+from morphgen.formats.rounding import format_number
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.request import default_name
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import Manifest, Parameter, PartKind, parse_value
+from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, parse_request
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.pages import part_choice
 from morphgen.viewer.pages.compose_grammar import ShowRobot
-from morphgen.viewer.pages.part_choice import Control, node_controls
-from morphgen.viewer.robot_tables import part_title
+from morphgen.viewer.robot_tables import part_title, slider_step
 from morphgen.viewer.robot_uri import DERIVATION, WORDS, resolve_words
+
+NO_PART = "(none)"
+"""Option of a dropdown that leaves a slot empty."""
+
+
+@dataclass(frozen=True)
+class PartChoice:
+    """Parts by slot, and the parameters that differ from their defaults."""
+
+    parts: Mapping[str, str]
+    """Names of parts by slot, such as ``left.arm``."""
+    values: Mapping[str, float] = field(default_factory=dict)
+    """Parameters by ``slot.parameter``, in SI units."""
+
+    @property
+    def words(self) -> str:
+        """The words of ``morphgen compose`` for the same robot."""
+        parts = [f"{slot}={part}" for slot, part in self.parts.items() if part]
+        return " ".join(
+            [*parts, *(f"{key}={format_number(value)}" for key, value in self.values.items())]
+        )
+
+
+@dataclass(frozen=True)
+class Control:
+    """A slider for a parameter."""
+
+    key: str
+    """Slot and parameter, such as ``ee.size``."""
+    label: str
+    low: float
+    high: float
+    step: float
+    default: float
+    hint: str
+
+
+def parse_choice(words: Sequence[str], library: Library) -> PartChoice:
+    """Parse words of ``morphgen compose``."""
+    parts: dict[str, str] = {}
+    texts: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise CompositionError(f"{word!r} is not of the form key=value, such as arm=ur5")
+        (parts if key.rpartition(".")[2] in SLOTS else texts)[key] = value
+    parts = {"base": "fixed", **parts}
+    for slot, part in parts.items():
+        library.manifest(part, kind_of(slot))
+    values = {}
+    for key, text in texts.items():
+        slot, _, name = key.rpartition(".")
+        if slot not in parts:
+            raise CompositionError(f"{key}: no part is chosen for {slot!r}{nearest(slot, parts)}")
+        parameters = parameters_of(slot, library.manifest(parts[slot], kind_of(slot)))
+        if name not in parameters:
+            raise CompositionError(
+                f"{key}: {parts[slot]!r} has no such parameter{nearest(name, parameters)}"
+            )
+        values[key] = parse_value(text, parameters[name], key)
+    return PartChoice(parts, values)
+
+
+def kind_of(slot: str) -> PartKind:
+    """Return the kind of part that a slot takes."""
+    last = slot.rpartition(".")[2]
+    return next(kind for kind in SLOTS if kind == last)
+
+
+def slots_of(choice: PartChoice, library: Library) -> list[str]:
+    """Return the slots that the chosen parts offer, except the base's own slot.
+
+    Every port of the base takes an arm with an end-effector; an arm with several ports takes an
+    end-effector on each. If there is a main arm, an end-effector on another port of the base needs
+    an arm there.
+    """
+    base = library.manifest(choice.parts["base"], "base")
+    arm = choice.parts.get("arm")
+    ports = list(library.manifest(arm, "arm").ports) if arm else [MAIN_PORTS["arm"]]
+    slots = ["arm", *("ee" if port == MAIN_PORTS["arm"] else f"{port}.ee" for port in ports)]
+    for port in base.ports:
+        if port != MAIN_PORTS["base"]:
+            slots.append(f"{port}.arm")
+            if not arm or choice.parts.get(f"{port}.arm"):
+                slots.append(f"{port}.ee")
+    return list(dict.fromkeys(slots))
+
+
+def part_options(slot: str, library: Library) -> list[str]:
+    """Return the parts that fit a slot, after the option to leave it empty."""
+    return [NO_PART, *(name for name in library.names(kind_of(slot)) if name != "none")]
+
+
+def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
+    """Return the parameters of a part in a slot: its own, and the rotation of its mount."""
+    is_base = kind_of(slot) == "base"
+    return dict(manifest.parameters if is_base else manifest.attached_parameters)
+
+
+def controls_of(slot: str, manifest: Manifest) -> list[Control]:
+    """Return a slider for every parameter of a part in a slot."""
+    return [
+        _control(f"{slot}.{name}", name, parameter)
+        for name, parameter in parameters_of(slot, manifest).items()
+    ]
+
+
+def node_controls(node: Derivation, library: Library, *, is_root: bool) -> list[Control]:
+    """Return a slider for every parameter of a part of a derivation; the keys are their names."""
+    manifest = library.manifest(node.part)
+    parameters = manifest.parameters if is_root else manifest.attached_parameters
+    names = dict(node.parameters)
+    return [
+        _control(name, name, parameter) for name, parameter in parameters.items() if name in names
+    ]
+
+
+def _control(key: str, name: str, parameter: Parameter) -> Control:
+    return Control(
+        key,
+        name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
+        parameter.minimum,
+        parameter.maximum,
+        1.0 if parameter.integer else slider_step(parameter.minimum, parameter.maximum),
+        parameter.default,
+        parameter.summary or name,
+    )
+
+
+def choice_of(derivation: Derivation, library: Library) -> PartChoice | None:
+    """Return the parts that give a derivation; None if words cannot describe it."""
+    words = []
+    for node in derivation.walk():
+        limb, _, kind = node.label.rpartition("_")
+        if kind not in SLOTS:
+            return None
+        slot = f"{limb}.{kind}" if limb else kind
+        if node.part != "none":
+            words.append(f"{slot}={node.part}")
+        defaults = {
+            name: parameter.default
+            for name, parameter in parameters_of(slot, library.manifest(node.part)).items()
+        }
+        words += [
+            f"{slot}.{name}={format_number(value)}"
+            for name, value in node.parameters
+            if format_number(value) != format_number(defaults[name])
+        ]
+    try:
+        is_same = parse_request(words, library) == derivation
+        return parse_choice(words, library) if is_same else None
+    except MorphgenError:
+        return None  # labels that only look like slots
+
+
+def with_part(choice: PartChoice, slot: str, part: str, library: Library) -> PartChoice:
+    """Return the choice with another part in a slot, without parts whose slot no longer exists."""
+    chosen = {**choice.parts, slot: "" if part == NO_PART else part}
+    parts = {key: name for key, name in chosen.items() if name}
+    allowed = {"base", *slots_of(PartChoice(parts), library)}
+    parts = {key: name for key, name in parts.items() if key in allowed}
+    values = {
+        key: value
+        for key, value in choice.values.items()
+        if key.rpartition(".")[0] in parts and key.rpartition(".")[0] != slot
+    }
+    return PartChoice(parts, values)
+
+
+def with_value(choice: PartChoice, control: Control, value: float) -> PartChoice:
+    """Return the choice with another value of a parameter; default values are left out."""
+    values = {key: other for key, other in choice.values.items() if key != control.key}
+    if abs(value - control.default) > 1e-9:
+        values[control.key] = float(format_number(value))
+    return replace(choice, values=values)
 
 
 @dataclass(eq=False)
@@ -29,7 +205,7 @@ class PartsTab:
 
     session: Session
     show_robot: ShowRobot
-    choice: part_choice.PartChoice
+    choice: PartChoice
     fault: viser.GuiHtmlHandle
     folder: viser.GuiFolderHandle
     slots: dict[str, viser.GuiFolderHandle] = field(default_factory=dict)
@@ -39,7 +215,7 @@ class PartsTab:
 def add_parts_tab(
     session: Session,
     tabs: viser.GuiTabGroupHandle,
-    choice: part_choice.PartChoice,
+    choice: PartChoice,
     show_robot: ShowRobot,
 ) -> Callable[[], None]:
     """Add the tab with a dropdown for the base and the controls of its slots.
@@ -99,31 +275,29 @@ def _add_slots(tab: PartsTab) -> None:
         folder.remove()
     tab.slots.clear()
     with tab.folder:
-        for slot in ("base", *part_choice.slots_of(tab.choice, library)):
+        for slot in ("base", *slots_of(tab.choice, library)):
             folder = tab.slots[slot] = gui.add_folder(slot)
             with folder:
                 if slot != "base":
                     _add_part_dropdown(tab, slot)
                 if part := tab.choice.parts.get(slot):
-                    for control in part_choice.controls_of(
-                        slot, library.manifest(part, part_choice.kind_of(slot))
-                    ):
+                    for control in controls_of(slot, library.manifest(part, kind_of(slot))):
                         _add_slider(tab, control)
 
 
 def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
     session = tab.session
-    names = part_choice.part_options(slot, session.files.library)
+    names = part_options(slot, session.files.library)
     chosen = tab.choice.parts.get(slot)
     dropdown = session.client.gui.add_dropdown(
-        part_choice.kind_of(slot),
+        kind_of(slot),
         tuple(names),
-        initial_value=chosen if chosen in names else part_choice.NO_PART,
+        initial_value=chosen if chosen in names else NO_PART,
     )
     session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
 
 
-def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
+def _add_slider(tab: PartsTab, control: Control) -> None:
     """Add the slider of a part's parameter."""
     slider = tab.session.client.gui.add_slider(
         control.label,
@@ -135,7 +309,7 @@ def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
     )
 
     def set_parameter() -> None:
-        tab.choice = part_choice.with_value(tab.choice, control, slider.value)
+        tab.choice = with_value(tab.choice, control, slider.value)
         _show_choice(tab)
 
     tab.session.on_change(slider, set_parameter, control.key)
@@ -143,7 +317,7 @@ def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
 
 def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
     """Put a part into a slot, and show its controls and the robot."""
-    tab.choice = part_choice.with_part(tab.choice, slot, part, tab.session.files.library)
+    tab.choice = with_part(tab.choice, slot, part, tab.session.files.library)
     _add_slots(tab)
     _show_choice(tab)
 

@@ -1,26 +1,58 @@
-"""The page of a folder of robots, from which a new split can be made."""
+"""The pages that are galleries: a folder of robots, all parts (the first page), chosen robots."""
 
 from __future__ import annotations
 
-from morphgen.errors import BenchmarkError
+from dataclasses import replace
+
+import viser
+
+from morphgen.benchmark.split import SIDES
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.robot_set import INDEX
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address
+from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.gallery import (
-    Gallery,
-    add_controls,
-    add_sheet_buttons,
-    open_panels,
-    passing_rows,
-)
-from morphgen.viewer.pages.index import show_index
-from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
+from morphgen.viewer.app.uploads import store_upload
+from morphgen.viewer.gallery import Gallery, add_controls, open_panels, passing_rows, show_page
+from morphgen.viewer.pages.index import library_sections, section_links, show_index
+from morphgen.viewer.robot_rows import Row, folder_rows, part_rows, robot_subfolders, uri_rows
+from morphgen.viewer.robot_uri import DEFAULT_WORDS
 from morphgen.viewer.splits import ChooseSides, add_split_form
+
+_COMPOSE = Address("compose", (DEFAULT_WORDS,))
+INTRODUCTION = (
+    "<p>morphgen makes robots from a base, arms and end-effectors, and trains and tests policies "
+    f"on many of them.</p><p>{markup.button_link(_COMPOSE, 'Compose a robot')}</p>"
+)
+"""Text above the gallery of parts: the purpose of morphgen, and the link to Compose."""
+NONE_CHOSEN = (
+    "No robot is chosen: tick the box of cards in a gallery, or select robots of a population."
+)
+
+
+def show_library(session: Session) -> None:
+    """Build the first page: all parts, links to everything else, and the upload button."""
+    gallery = Gallery(session, "Parts", part_rows(session.files.library), noun="part")
+    open_panels(gallery, "", INTRODUCTION + section_links(library_sections(session.files)))
+    upload = session.client.gui.add_upload_button(
+        "Open a URDF, an MJCF or a zip", icon=viser.Icon.UPLOAD
+    )
+
+    async def uploaded(event: viser.GuiEvent[viser.GuiUploadButtonHandle]) -> None:
+        file = event.target.value
+
+        def open_upload() -> None:
+            uri = store_upload(file.name, file.content, session.files)
+            session.open_address(Address("robot", (uri,)))
+
+        session.enqueue(open_upload)
+
+    upload.on_upload(uploaded)
+    add_controls(gallery)
 
 
 def show(session: Session) -> None:
-    """Build the page."""
+    """Build the page of a folder of robots, from which a new split can be made."""
     if not session.address.subject:
         show_index(session)
         return
@@ -33,9 +65,8 @@ def show(session: Session) -> None:
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
     population = markup.link(Address("population", (folder,)), "see all on one ground")
     header = population + (f"<br>{links}" if links else "")
-    panel = open_panels(gallery, markup.breadcrumbs((folder, None)), header)
-    add_controls(gallery, panel)
-    add_sheet_buttons(gallery)
+    open_panels(gallery, markup.breadcrumbs((folder, None)), header)
+    add_controls(gallery)
     hint = "train: pass the filter; test: do not"
     add_split_form(session, lambda: _add_choice(gallery), hint)
 
@@ -62,3 +93,39 @@ def _add_choice(gallery: Gallery) -> ChooseSides:
     return lambda: choose_sides(
         gallery.rows, passing_rows(gallery), num_train.value, num_test.value
     )
+
+
+def show_chosen(session: Session) -> None:
+    """Build the page of the chosen robots, which become the two sides of a new split."""
+    if not session.chosen:
+        raise MorphgenError(NONE_CHOSEN)
+    rows = uri_rows(session.chosen, session.files)
+    gallery = Gallery(session, "Chosen robots", rows, SIDES, "common")
+    header = "The first robots that you chose are to train on, the others to test on."
+    open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
+    gui, n = session.client.gui, len(rows)
+    initial = min(parse_count(session.address.state.get("train", ""), max(n - 1, 1)), n)
+    num_train = gui.add_slider("to train on", 0, n, 1, initial)
+
+    def divide() -> None:
+        _set_sides(gallery.rows, num_train.value)
+        session.address = session.address.with_state(train=str(num_train.value))
+        show_page(gallery, 1)
+
+    def sides() -> tuple[list[Row], list[Row]]:
+        return gallery.rows[: num_train.value], gallery.rows[num_train.value :]
+
+    def leave_out() -> None:
+        address = replace(session.address, subjects=session.chosen or ("",))
+        session.open_address(address, instead=True)
+
+    _set_sides(gallery.rows, initial)
+    add_controls(gallery)
+    add_split_form(session, lambda: sides, expanded=True)
+    session.on_change(num_train, divide, "sides")
+    session.on_choice = leave_out
+
+
+def _set_sides(rows: list[Row], num_train: int) -> None:
+    """Give rows their sides: the first ones are to train on."""
+    rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]

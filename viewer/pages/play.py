@@ -39,7 +39,6 @@ from morphgen.viewer.scene.rollout import (
     RolloutScene,
     add_episode,
     episode_page,
-    record_scene,
     render_video,
     show_step,
 )
@@ -497,7 +496,7 @@ def _add_player(session: Session) -> tuple[PlayPage, Player]:
 
 
 def _add_downloads(page: PlayPage) -> None:
-    """Add buttons that send the episode as a file, a video or a recorded scene."""
+    """Add buttons that send the episode as a file, a film or a web page."""
     gui, session = page.session.client.gui, page.session
     downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
         (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
@@ -507,7 +506,6 @@ def _add_downloads(page: PlayPage) -> None:
             ".html",
             lambda episode: session.run_in_worker(episode_page, episode, session.dark),
         ),
-        ("Scene (.viser)", ".viser", functools.partial(session.run_in_worker, record_scene)),
     )
     for label, suffix, make in downloads:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)

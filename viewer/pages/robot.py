@@ -20,7 +20,7 @@ from morphgen.model.findings import Finding
 from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer import comparison, markup, robot_tables
+from morphgen.viewer import markup, robot_tables
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.web_page import robot_page
@@ -32,13 +32,13 @@ from morphgen.viewer.pages.robot_show import (
     add_toggles,
     apply_toggle,
     connect_links,
+    page_state,
     parse_joints,
     select_link,
     set_angles,
     set_configuration,
     set_findings,
     show_card,
-    show_in_address,
     update_scene,
 )
 from morphgen.viewer.robot_files import bundle_files, zip_files
@@ -56,7 +56,6 @@ from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 from morphgen.viewer.scene.overlays import Overlays
 from morphgen.viewer.scene.robot import turntable
-from morphgen.viewer.token_picture import tokens_html
 
 WEB_PAGE = "robot.html"
 """Name of the web page in a bundle."""
@@ -93,6 +92,7 @@ def show(session: Session) -> None:
         _add_downloads_tab(page)
     session.set_status("")
     connect_links(page)
+    session.title, session.state = robot.name, functools.partial(page_state, page)
     _apply_address(page)
     session.run_in_background(lambda: _check_robot(page))
 
@@ -150,21 +150,17 @@ def _apply_address(page: RobotPage) -> None:
     if q is not None:
         set_configuration(page, q)
     else:
-        show_in_address(page)
+        page.session.show_state()
 
 
 def _add_links_tab(page: RobotPage) -> None:
-    """Add a dropdown that selects a link with all its properties, the links, and their tokens."""
+    """Add a dropdown that selects a link with all its properties, and the tree of links."""
     gui = page.session.client.gui
     page.link_choice = gui.add_dropdown(
         "Link", (NO_LINK, *(link.name for link in page.robot.links))
     )
     page.texts["details"] = gui.add_html("")
     gui.add_html(markup.framed(robot_tables.link_table(page.robot)))
-    button = gui.add_button("Show the tokens", hint="48 numbers per link, as policies see them")
-    page.texts["tokens"] = gui.add_html("")
-    session = page.session
-    session.on_change(button, lambda: session.run_in_background(lambda: _show_tokens(page)))
     choice = page.link_choice
     page.session.on_change(
         choice, lambda: select_link(page, "" if choice.value == NO_LINK else choice.value)
@@ -188,23 +184,6 @@ def _check_robot(page: RobotPage) -> None:
         page.texts["collisions"].content = markup.framed(markup.dim(text))
         return
     session.enqueue(lambda: update_scene(page), "move")
-
-
-def _show_tokens(page: RobotPage) -> None:
-    """Show the robot's tokens as a heat map, or why it has none."""
-    session, robot = page.session, page.robot
-    try:
-        session.set_status("computing the tokens")
-        result = session.run_in_worker(
-            comparison.compare_robots, [robot], session.files.library_folders
-        )
-    except MorphgenError as error:
-        content = f"{markup.tag('no tokens', 'warning')} {escape(session.files.redact(error))}"
-    else:
-        links = [[link.name for link in robot.links]]
-        content = tokens_html([robot.name], links, result.tables, dark=session.dark)
-    session.set_status("")
-    page.texts["tokens"].content = markup.framed(content)
 
 
 def _show_findings(page: RobotPage, findings: list[Finding]) -> None:

@@ -35,7 +35,6 @@ from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
 from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
-from morphgen.viewer.scene import selection as scene_selection
 from morphgen.viewer.scene.overlays import (
     NUM_POINTS,
     OFTEN,
@@ -115,10 +114,6 @@ def _legend(points: Array | None) -> str:
             f"{sides} m. Slice: how many of them lead to each cell."
         )
     )
-
-
-ADDRESS_DELAY = 0.5
-"""Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
 
 
 @dataclass(eq=False)
@@ -207,21 +202,20 @@ def update_scene(page: RobotPage) -> None:
             if page.gizmo is not None and not page.is_dragging:
                 pose = Pose.from_matrix(T_root_tool)
                 page.gizmo.position, page.gizmo.wxyz = pose.position, pose.quaternion
-    page.session.call_later(ADDRESS_DELAY, lambda: show_in_address(page), "address")
+    page.session.show_state_later()
 
 
-def show_in_address(page: RobotPage) -> None:
-    """Put the configuration, toggles, unit and selected link into the page's address."""
+def page_state(page: RobotPage) -> dict[str, str]:
+    """Return the configuration, toggles, unit and selected link for the page's address."""
     at_home = np.allclose(page.q, page.robot.home)
     toggles = ",".join(name for name, box in page.toggles.items() if box.value)
-    page.session.update_address(
-        page.robot.name,
-        q="" if at_home else format_joints(page.q),
-        show="" if toggles == "visual" else toggles or "none",
-        angles="" if page.angles == "rad" else page.angles,
-        link=page.selected,
-        slice=slice_state(page.workspace) if is_on(page, "workspace") else "",
-    )
+    return {
+        "q": "" if at_home else format_joints(page.q),
+        "show": "" if toggles == "visual" else toggles or "none",
+        "angles": "" if page.angles == "rad" else page.angles,
+        "link": page.selected,
+        "slice": slice_state(page.workspace) if is_on(page, "workspace") else "",
+    }
 
 
 def format_joints(q: Array) -> str:
@@ -282,14 +276,14 @@ def select_link(page: RobotPage, name: str) -> None:
     page.selected = name
     page.outline = []
     if name:
-        page.outline = scene_selection.draw_outline(page.view, page.robot.link_index[name])
+        page.outline = scene_overlays.draw_outline(page.view, page.robot.link_index[name])
     if page.link_choice is not None:
         set_value(page.link_choice, name or NO_LINK)
         details = robot_tables.link_details(page.robot, name) if name else ""
         page.texts["details"].content = markup.framed(details)
     show_card(page)
     mark_slider(page)
-    show_in_address(page)
+    page.session.show_state()
 
 
 def show_card(page: RobotPage) -> None:
@@ -355,7 +349,7 @@ def show_range(page: RobotPage, row: int | None) -> None:
         page.range_row, page.range_nodes = row, []
         if row is not None:
             joint = page.robot.independent_joints[row]
-            page.range_nodes = scene_selection.draw_range(page.view, joint)
+            page.range_nodes = scene_overlays.draw_range(page.view, joint)
 
 
 def connect_links(page: RobotPage) -> None:
@@ -461,7 +455,7 @@ def set_angles(page: RobotPage, unit: str) -> None:
     page.angles = unit
     set_value(page.angle_choice, unit)
     _add_sliders(page)
-    show_in_address(page)
+    page.session.show_state()
 
 
 def _add_sliders(page: RobotPage) -> None:
@@ -570,7 +564,7 @@ def apply_toggle(page: RobotPage, name: str) -> None:
         remove_overlay(page.overlays, name)
     elif name in _SHOW_OVERLAY:
         _SHOW_OVERLAY[name](page.overlays)
-    show_in_address(page)
+    page.session.show_state()
 
 
 def _toggle_layer(page: RobotPage, layer: scene_robot.Layer, on: bool) -> None:
@@ -675,7 +669,7 @@ def _cut_workspace(page: RobotPage) -> None:
     with page.session.client.atomic():
         y = workspace.position.value
         scene_overlays.show_workspace(page.overlays, workspace.points, y)
-    page.session.call_later(ADDRESS_DELAY, lambda: show_in_address(page), "address")
+    page.session.show_state_later()
 
 
 def _toggle_gizmo(page: RobotPage, on: bool) -> None:

@@ -18,7 +18,6 @@ from morphgen.viewer.figures import heatmap_svg, map_svg
 from morphgen.viewer.gallery import (
     Gallery,
     add_controls,
-    add_sheet_buttons,
     load_pictures,
     open_panels,
     passing_rows,
@@ -64,8 +63,7 @@ def show(session: Session) -> None:
     panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
-        add_controls(gallery, panel)
-        add_sheet_buttons(gallery)
+        add_controls(gallery)
         _add_split_form(gallery, split)
     texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):

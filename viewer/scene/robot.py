@@ -248,7 +248,6 @@ class OffspringScene:
     """The offspring in a scene."""
 
     views: list[RobotView]
-    labels: list[viser.LabelHandle]
     boxes: Array
     """Lowest and highest corner of each robot in the world, shape (n, 2, 3) [m]."""
 
@@ -261,7 +260,7 @@ def add_offspring(
     sizes = (bounds[:, 1] - bounds[:, 0]).max(axis=0)
     step_x = _GAP * float(sizes[0])
     step_y = max(_GAP * float(sizes[1]), _ROW * float(sizes.max()))
-    views, labels = [], []
+    views = []
     boxes = np.empty((len(robots), 2, 3))
     with client.atomic():
         for i, robot in enumerate(robots):
@@ -270,16 +269,14 @@ def add_offspring(
             boxes[i] = bounds[i + 1] + position
             views.append(add_robot(client.scene, split_colours(robot), f"/offspring{i}", position))
             above = (0.0, 0.0, float(bounds[i + 1, 1, 2]) + 0.04 * step_x)
-            labels.append(
-                client.scene.add_label(
-                    f"/offspring{i}/label", str(i + 1), position=above, anchor="bottom-center"
-                )
+            client.scene.add_label(
+                f"/offspring{i}/label", str(i + 1), position=above, anchor="bottom-center"
             )
         low = np.minimum(boxes[:, 0].min(axis=0), bounds[0, 0])
         high = np.maximum(boxes[:, 1].max(axis=0), bounds[0, 1])
         add_ground(client.scene, float(np.linalg.norm(high - low)))
         look_at(client, low, high, CAMERA_DIRECTION)
-    return OffspringScene(views, labels, boxes)
+    return OffspringScene(views, boxes)
 
 
 def remove_offspring(scene: OffspringScene) -> None:

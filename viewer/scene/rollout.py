@@ -162,12 +162,6 @@ def render_video(episode: Episode) -> bytes:
         return path.read_bytes()
 
 
-def record_scene(episode: Episode) -> bytes:
-    """Return a ``.viser`` file for viser's own player: the scene with all its motions."""
-    with scene_server() as server:
-        return _record(server, episode).serialize()
-
-
 def episode_page(episode: Episode, dark: bool) -> bytes:
     """Return a web page that plays an episode without a server or a network."""
     with scene_server() as server:

@@ -16,6 +16,7 @@ from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Shap
 from morphgen.model.inertia import box_corners, solid_mesh
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Inertial
+from morphgen.model.rotation import to_matrix
 from morphgen.typing import Array
 from morphgen.viewer.app.viser_internals import remove_camera_callbacks
 
@@ -326,3 +327,46 @@ def fit_camera(points: Array, tangents: Array) -> Array:
     before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
     forward = float((-(after + before) / (2 * tangents)).min())
     return np.array([*((after - before) / 2), forward])
+
+
+_NEAR = 1e-3
+"""Smallest distance from the camera by which points are divided [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The camera of a browser."""
+
+    position: Array
+    """Position in the world, shape (3,) [m]."""
+    R_world_camera: Array
+    """Axes of the camera in the world: right, down, forward, shape (3, 3)."""
+    fov: float
+    """Vertical field of view [rad]."""
+    aspect: float
+    """Width of the picture divided by its height."""
+
+
+def camera_view(client: viser.ClientHandle) -> View:
+    """Return the camera of a browser."""
+    camera = client.camera
+    w, x, y, z = camera.wxyz.tolist()
+    rotation = np.array(to_matrix((w, x, y, z)))
+    return View(np.asarray(camera.position), rotation, camera.fov, camera.aspect)
+
+
+def project_points(view: View, points: Array) -> tuple[Array, Array]:
+    """Project points of the world.
+
+    points: Shape (..., 3) [m].
+
+    Returns:
+        Points of the picture, shape (..., 2), and depths, shape (...) [m]; points behind the camera
+        have a depth below 0 and meaningless coordinates.
+    """
+    local = (points - view.position) @ view.R_world_camera
+    depth = local[..., 2]
+    focal = 0.5 / np.tan(view.fov / 2)
+    safe = np.where(np.abs(depth) < _NEAR, _NEAR, depth)
+    middle = np.array([0.5 * view.aspect, 0.5])
+    return focal * local[..., :2] / safe[..., None] + middle, depth
