@@ -4,44 +4,30 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, Literal
 
+import msgspec
 import yaml
-from yaml.nodes import MappingNode, Node, SequenceNode
+from msgspec import Meta
 
 from morphgen.benchmark.robot_hash import HASH_LENGTH
-from morphgen.benchmark.split import FORMAT, REGIMES, Member, Regime, Split, split_id
-from morphgen.errors import BenchmarkError, FormatError, nearest
-from morphgen.formats.data_files import read_text, require_plain_yaml
+from morphgen.benchmark.split import FORMAT, SIDES, Member, Regime, Split, split_id
+from morphgen.errors import BenchmarkError, nearest
+from morphgen.formats.data_files import parse_yaml, read_text
 from morphgen.formats.files import write_atomic
+from morphgen.formats.records import Record, read_record
 
-FIELDS = (
-    "format",
-    "morphgen",
-    "name",
-    "id",
-    "regime",
-    "summary",
-    "reference",
-    "made",
-    "accepted",
-    "statistics",
-    "train",
-    "test",
-)
-"""Keys of the file, in order."""
-OPTIONAL = ("reference", "made", "accepted", "statistics")
 MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
 """Keys of a robot, in order."""
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}")
 _ROBOT_RULE = "use letters, digits, '-', '_', '+' and '.'"
 TASK_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 _BODY = re.compile(rf"[0-9a-f]{{{HASH_LENGTH}}}")
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 SUFFIX = ".yaml"
 _HEAD = (
     "# Robots to train and to test on, by their derivations; `morphgen split verify` with this\n"
@@ -53,184 +39,79 @@ _QUOTED = frozenset(("id", "body", "derivation"))
 """Keys whose values are always quoted, as some hashes must be."""
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][\w.-]*(?:/[A-Za-z0-9][\w.-]*)*")
 _NAME_RULE = "use letters, digits, '-', '_' and '.', in words parted by '/'"
+_Text = Annotated[str, Meta(min_length=1)]
+
+
+class _Robot(Record, frozen=True):
+    """An entry of ``train`` or ``test``."""
+
+    name: _Text
+    category: _Text
+    derivation: _Text
+    task: _Text
+    obstacles: bool
+    robot_hash: _Text = msgspec.field(name="body")
+
+    def __post_init__(self) -> None:
+        if not ROBOT_NAME.fullmatch(self.name):
+            raise ValueError(f"name: {self.name!r}: {_ROBOT_RULE}")
+        if not TASK_NAME.fullmatch(self.task):
+            rule = "expected a name of lower-case letters, digits, '-' and '_'"
+            raise ValueError(f"task: {self.task!r}: {rule}")
+        if not _BODY.fullmatch(self.robot_hash):
+            raise ValueError(
+                f"body: {self.robot_hash!r} is no hash of {HASH_LENGTH} hexadecimal digits"
+            )
+
+
+class _Content(Record, frozen=True):
+    """The content of a split file under its keys."""
+
+    format: Literal[1]
+    version: _Text = msgspec.field(name="morphgen")
+    name: _Text
+    id: _Text
+    regime: Regime
+    summary: _Text
+    train: Annotated[tuple[_Robot, ...], Meta(min_length=1)]
+    test: Annotated[tuple[_Robot, ...], Meta(min_length=1)]
+    provenance: dict[str, Any] = msgspec.field(name="made", default_factory=dict)
+    accepted: dict[str, _Text] = msgspec.field(default_factory=dict)
+    reference: str = ""
+    statistics: dict[str, Any] = msgspec.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not is_split_name(self.name):
+            raise ValueError(f"name: {self.name!r}: {_NAME_RULE}")
+        for side, robots in (("train", self.train), ("test", self.test)):
+            for name, count in Counter(robot.name for robot in robots).items():
+                if count > 1:
+                    raise ValueError(f"{side}: {count} robots are named {name!r}")
 
 
 @dataclass(frozen=True)
 class SplitFile:
     """The content of a split file; its id may be wrong."""
 
-    path: Path
     split: Split
     id: str
     """Id of the split when it was written."""
-    id_line: int
-    """Line of the id in the file."""
-
-    @property
-    def is_whole(self) -> bool:
-        """True if the id matches the robots: the file was not changed since it was written."""
-        return self.id == split_id(self.split)
 
 
 def parse_split(text: str, path: Path) -> SplitFile:
     """Parse the text of a split file."""
-    try:
-        require_plain_yaml(text, str(path))
-        loader = _Loader(text)
-        try:
-            return _Reader(path, loader).file(loader.get_single_node())
-        finally:
-            loader.dispose()
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
-    except yaml.MarkedYAMLError as error:
-        raise BenchmarkError(f"{path}{_yaml_problem(error)}") from error
-    except yaml.YAMLError as error:
-        raise BenchmarkError(f"{path}: invalid YAML: {error}") from error
-
-
-def _yaml_problem(error: yaml.MarkedYAMLError) -> str:
-    """Return line and problem of a YAML error, and the line where its context begins."""
-    mark = error.problem_mark or error.context_mark
-    line = f":{mark.line + 1}" if mark else ""
-    began = error.context_mark.line + 1 if error.context and error.context_mark else 0
-    context = f" ({error.context} from line {began})" if began else ""
-    return f"{line}: invalid YAML: {error.problem}{context}"
-
-
-class _Reader:
-    """Convert YAML nodes, which know their lines, to a split."""
-
-    def __init__(self, path: Path, loader: Any) -> None:  # noqa: ANN401
-        self._path, self._loader = path, loader
-
-    def file(self, node: Node | None) -> SplitFile:
-        if node is None:
-            raise BenchmarkError(f"{self._path}: is empty; expected a split")
-        self._require_format(node)
-        fields = self._fields(node, FIELDS, "a split", optional=OPTIONAL)
-        names = {key: self._text(fields[key], key) for key in ("morphgen", "name", "id", "summary")}
-        if not is_split_name(names["name"]):
-            raise self._fail(fields["name"], f"name: {names['name']!r}: {_NAME_RULE}")
-        split = Split(
-            names["name"],
-            cast(Regime, self._choice(fields["regime"], "regime", REGIMES)),
-            names["summary"],
-            self._members(fields["train"], "train"),
-            self._members(fields["test"], "test"),
-            self._free(fields.get("made"), "made"),
-            self._reasons(fields.get("accepted")),
-            self._text(fields["reference"], "reference") if "reference" in fields else "",
-            self._free(fields.get("statistics"), "statistics"),
-            names["morphgen"],
+    data = parse_yaml(text, str(path))
+    if not isinstance(data, dict):
+        raise BenchmarkError(
+            f"{path}: no split: expected 'format: {FORMAT}', 'name: ...' and so on"
         )
-        return SplitFile(self._path, split, names["id"], fields["id"].start_mark.line + 1)
-
-    def _fail(self, node: Node, what: str) -> BenchmarkError:
-        return BenchmarkError(f"{self._path}:{node.start_mark.line + 1}: {what}")
-
-    def _require_format(self, node: Node) -> None:
-        """Check the version of the format before anything else."""
-        if not isinstance(node, MappingNode):
-            raise self._fail(node, "no split: expected 'format: 1', 'name: ...' and so on")
-        for key, value in node.value:
-            if key.value == "format" and self._value(value) != FORMAT:
-                raise self._fail(
-                    value, f"format: {value.value!r} is not known to this morphgen; valid: {FORMAT}"
-                )
-
-    def _fields(
-        self, node: Node, known: Sequence[str], what: str, optional: Sequence[str] = ()
-    ) -> dict[str, Node]:
-        if not isinstance(node, MappingNode):
-            raise self._fail(node, f"expected {what} with {', '.join(known)}")
-        fields: dict[str, Node] = {}
-        for key, value in node.value:
-            if key.value not in known:
-                raise self._fail(key, f"unknown key {key.value!r}{nearest(str(key.value), known)}")
-            if key.value in fields:
-                raise self._fail(key, f"key {key.value!r} is there twice")
-            fields[key.value] = value
-        missing = [key for key in known if key not in fields and key not in optional]
-        if missing:
-            raise self._fail(node, f"{what} lacks {', '.join(map(repr, missing))}")
-        return fields
-
-    def _members(self, node: Node, side: str) -> tuple[Member, ...]:
-        if not isinstance(node, SequenceNode) or not node.value:
-            raise self._fail(node, f"{side}: expected a list of robots, one at least")
-        members: dict[str, Member] = {}
-        for entry in node.value:
-            member = self._member(entry, side)
-            if member.name in members:
-                raise self._fail(entry, f"{side}: two robots are named {member.name!r}")
-            members[member.name] = member
-        return tuple(members.values())
-
-    def _member(self, node: Node, side: str) -> Member:
-        fields = self._fields(node, MEMBER, f"a robot of {side}")
-        name = self._text(fields["name"], "name")
-        if not ROBOT_NAME.fullmatch(name):
-            raise self._fail(fields["name"], f"name: {name!r}: {_ROBOT_RULE}")
-        body = self._text(fields["body"], "body")
-        if not _BODY.fullmatch(body):
-            raise self._fail(
-                fields["body"], f"body: {body!r} is no hash of {HASH_LENGTH} hexadecimal digits"
-            )
-        task = self._text(fields["task"], "task")
-        if not TASK_NAME.fullmatch(task):
-            raise self._fail(
-                fields["task"],
-                f"task: {task!r}: expected a name of lower-case letters, digits, '-' and '_'",
-            )
-        obstacles = self._value(fields["obstacles"])
-        if not isinstance(obstacles, bool):
-            raise self._fail(fields["obstacles"], f"obstacles: {obstacles!r}; valid: false, true")
-        return Member(
-            name,
-            self._text(fields["category"], "category"),
-            self._text(fields["derivation"], "derivation"),
-            task,
-            obstacles,
-            body,
-        )
-
-    def _text(self, node: Node, key: str) -> str:
-        value = self._value(node)
-        if not isinstance(value, str) or not value:
-            raise self._fail(node, f"{key}: expected text, not {value!r}")
-        return value
-
-    def _choice(self, node: Node, key: str, valid: Sequence[str]) -> str:
-        value = self._text(node, key)
-        if value not in valid:
-            raise self._fail(node, f"{key}: unknown {value!r}{nearest(value, valid)}")
-        return value
-
-    def _free(self, node: Node | None, key: str) -> dict[str, object]:
-        """Return the keys and values of a mapping whose content is not checked."""
-        if node is None:
-            return {}
-        if not isinstance(node, MappingNode):
-            raise self._fail(node, f"{key}: expected keys and values")
-        return {str(key.value): self._value(value) for key, value in node.value}
-
-    def _reasons(self, node: Node | None) -> dict[str, str]:
-        if node is None:
-            return {}
-        if not isinstance(node, MappingNode):
-            raise self._fail(node, "accepted: expected a reason for every code of a finding")
-        return {
-            str(key.value): self._text(value, f"accepted {key.value}") for key, value in node.value
-        }
-
-    def _value(self, node: Node) -> object:
-        if node.tag == "tag:yaml.org,2002:str":
-            return node.value
-        try:
-            return self._loader.construct_object(node, deep=True)
-        except (ValueError, KeyError) as error:  # such as a date with a thirteenth month
-            raise self._fail(node, f"{node.value!r:.60}: no valid {node.tag[18:]}") from error
+    content = read_record(data, _Content, str(path), BenchmarkError, yaml_text=text)
+    fields: dict[str, Any] = msgspec.structs.asdict(content)
+    for side in SIDES:
+        robots = map(msgspec.structs.asdict, fields[side])
+        fields[side] = tuple(Member(**robot) for robot in robots)
+    del fields["format"], fields["id"]
+    return SplitFile(Split(**fields), content.id)
 
 
 def split_names() -> list[str]:
@@ -241,7 +122,7 @@ def split_names() -> list[str]:
     )
 
 
-def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
+def find_split(name_or_path: str | Path) -> Path:
     """Return the path of a split file."""
     name = str(name_or_path)
     path = Path(name)
@@ -249,35 +130,30 @@ def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
         if not path.is_file():
             raise BenchmarkError(f"{path}: no such file")
         return path
-    if is_split_name(name):
-        for folder in (*folders, _shipped()):
-            candidate = folder / f"{name}{SUFFIX}"
-            if candidate.is_file():
-                return candidate
+    shipped = _shipped() / f"{name}{SUFFIX}"
+    if is_split_name(name) and shipped.is_file():
+        return shipped
     raise BenchmarkError(
         f"{name}: no such file, and no split of this name{nearest(name, split_names())}"
     )
 
 
-def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
+def read_split(name_or_path: str | Path) -> Split:
     """Read a split by its name or file; see ``find_split``."""
-    stored = read_split_file(find_split(name_or_path, folders))
-    if not stored.is_whole:
+    path = find_split(name_or_path)
+    stored = read_split_file(path)
+    computed = split_id(stored.split)
+    if stored.id != computed:
         raise BenchmarkError(
-            f"{stored.path}:{stored.id_line}: id: {stored.id} is not that of its robots, which is "
-            f"{split_id(stored.split)}; the file was changed since it was written (if on purpose, "
-            "write the new id)"
+            f"{path}: id: {stored.id} is not that of its robots, which is {computed}; the file was "
+            "changed since it was written (if on purpose, write the new id)"
         )
     return stored.split
 
 
 def read_split_file(path: Path) -> SplitFile:
     """Read a split file without checking its id."""
-    try:
-        text = read_text(path)
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
-    return parse_split(text, path)
+    return parse_split(read_text(path), path)
 
 
 def write_split(split: Split, path: Path) -> None:

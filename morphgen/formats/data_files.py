@@ -111,6 +111,32 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
             raise FormatError(f"{origin}: holds more than {MAX_YAML_VALUES} values")
 
 
+class _RepeatedKeysLoader(_Loader):  # type: ignore[misc]
+    """Safe loader that refuses repeated keys."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in keys:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is given twice", key.start_mark
+                )
+            keys.add(key.value)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+def parse_yaml(text: str | bytes, origin: str) -> Any:  # noqa: ANN401
+    """Return the value of a YAML text, whose mappings may not repeat a key."""
+    try:
+        require_plain_yaml(text, origin)
+        return yaml.load(text, Loader=_RepeatedKeysLoader)
+    except yaml.YAMLError as error:
+        raise FormatError(f"{origin}{yaml_problem(error)}") from error
+    except (ValueError, KeyError) as error:  # such as a date with a thirteenth month
+        raise FormatError(f"{origin}: invalid YAML: {' '.join(str(error).split())}") from error
+
+
 def yaml_problem(error: yaml.YAMLError) -> str:
     """Return what is wrong with YAML, with its location: text to append to the file's name."""
     if not isinstance(error, yaml.MarkedYAMLError):

@@ -9,12 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from msgspec import field
 from msgspec.structs import fields, replace
 
 from morphgen.errors import FormatError, PartError, nearest
-from morphgen.formats.data_files import read_bytes, require_plain_yaml, yaml_problem
+from morphgen.formats.data_files import parse_yaml, read_bytes
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.rounding import format_number
 
@@ -273,26 +272,6 @@ def _load_yaml(path: Path) -> tuple[bytes, Any]:
     """Return the text and the content of a YAML file."""
     try:
         text = read_bytes(path)
-        require_plain_yaml(text, str(path))
-        return text, yaml.load(text, Loader=_Loader) or {}
-    except yaml.YAMLError as error:
-        raise PartError(f"{path}{yaml_problem(error)}") from error
-    except (ValueError, KeyError) as error:
-        raise PartError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
+        return text, parse_yaml(text, str(path)) or {}
     except FormatError as error:
         raise PartError(str(error)) from error
-
-
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Safe loader that refuses repeated keys."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys: set[str] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in keys:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key.value!r} is given twice", key.start_mark
-                )
-            keys.add(key.value)
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping

