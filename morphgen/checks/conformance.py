@@ -7,7 +7,10 @@ loader must agree with morphgen's reading of the file that the cause has changed
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,7 +20,8 @@ from lxml import etree
 
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
-from morphgen.checks.readers import LOADERS, Loader, Quirk, Reading, compare_joints, refusal_causes
+from morphgen.checks.quirks import REFUSALS, Quirk
+from morphgen.checks.readers import LOADERS, Loader, Reading
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.formats.description import read_description
@@ -25,10 +29,20 @@ from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
-from morphgen.model.dynamics import gravity_load, mass_matrix
+from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
-from morphgen.model.robot import TOOL, Frame, Inertial, Joint, Link, Robot
+from morphgen.model.robot import (
+    DEFAULT_EFFORT,
+    DEFAULT_VELOCITY,
+    TOOL,
+    Frame,
+    Inertial,
+    Joint,
+    Link,
+    Mimic,
+    Robot,
+)
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5
@@ -44,6 +58,12 @@ In addition, MuJoCo may add ``BOUND_MASS`` per link.
 """
 
 
+RELATIVE_TOLERANCE = 1e-5
+"""Largest accepted relative difference of a joint's value: gains are written with 6 digits."""
+ABSOLUTE_TOLERANCE = 1e-9
+"""Largest accepted difference of a joint's value near zero, in its SI unit."""
+_WITHOUT_VELOCITY = (None, 0.0, math.inf)
+"""Velocity limits that loaders read where a file names none."""
 GRAVITY_TOLERANCE = 1e-6
 """Largest accepted difference of a force that holds the weight, relative to the robot's largest one
 or to ``MIN_FORCE``."""
@@ -182,9 +202,12 @@ def compare_file(
                 continue
             row, reading = _row(loader, robot, folder, frame, q, has_gains=False)
             if row.passed is False:
-                text = (folder / loader.file).read_bytes()
-                causes = _causes(loader, reading, text, folder, frame, _positions(robot, q))
-                row = replace(row, causes=causes or refusal_causes(row.message))
+                known = (folder, frame, _positions(robot, q))
+                if reading is None:
+                    causes = _refused(loader, row.message, *known)
+                else:
+                    causes = _differing(loader, reading, *known)
+                row = replace(row, causes=causes)
             rows.append(replace(row, source=FILE))
     return tuple(rows)
 
@@ -215,16 +238,24 @@ def _row(
     """
     if find_spec(loader.module) is None:
         return ConformanceRow(loader.name, None, message="not installed"), None
-    try:
-        reading = loader.read(folder, frame, _positions(robot, q), len(q))
-    except FormatError as error:
-        return ConformanceRow(loader.name, False, message=str(error)), None
-    except Exception as error:  # whatever a library of others raises is its refusal
-        message = f"{type(error).__name__}: {one_line(str(error))}"
-        return ConformanceRow(loader.name, False, message=message), None
+    reading = _read(loader, folder, frame, _positions(robot, q), len(q))
+    if isinstance(reading, str):
+        return ConformanceRow(loader.name, False, message=reading), None
     if not has_gains:
         reading = replace(reading, has_actuators=False)
     return _compared(loader, robot, reading, frame, q), reading
+
+
+def _read(
+    loader: Loader, folder: Path, frame: str, positions: Mapping[str, Array], n: int
+) -> Reading | str:
+    """Return what a loader reads, or the message with which it refuses the file."""
+    try:
+        return loader.read(folder, frame, positions, n)
+    except FormatError as error:
+        return str(error)
+    except Exception as error:  # whatever a library of others raises is its refusal
+        return f"{type(error).__name__}: {one_line(str(error))}"
 
 
 def _compared(
@@ -274,6 +305,130 @@ def _compared(
         inertia_error=inertia_error,
         message="; ".join(faults),
     )
+
+
+@dataclass(frozen=True)
+class JointAgreement:
+    """Whether a loader's joints agree with the robot's; None if the loader reads no such value."""
+
+    limits: bool | None
+    """Position, effort and velocity limits."""
+    mimic: bool | None
+    """Leader, multiplier and offset of mimic joints."""
+    damping: bool | None
+    """Damping and friction."""
+    gains: bool | None
+    """Gains and armature of position actuators."""
+    faults: tuple[str, ...]
+    """Description of each difference."""
+
+
+def compare_joints(robot: Robot, reading: Reading) -> JointAgreement:
+    """Compare the joints of a robot with a loader's; joints that only one has are left out.
+
+    A chain of mimic joints counts as its product.
+    """
+    movable = [robot.joints[k].name for k in robot.movable_joints]
+    shared = [name for name in movable if name in reading.joints]
+    gains = {gain.joint: gain for gain in actuation(robot)} if reading.has_actuators else {}
+    faults: dict[str, list[str]] = {name: [] for name in ("limits", "damping", "gains")}
+    for name in shared:
+        joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
+        lower, upper = (-math.inf, math.inf) if joint.is_continuous else joint.effective_limits
+        faults["limits"] += _differences(
+            name, ("lower limit", read.limits[0], lower), ("upper limit", read.limits[1], upper)
+        )
+        if read.effort not in _accepted_efforts(joint):
+            faults["limits"] += _differences(name, ("effort", read.effort, joint.effort or 0.0))
+        if joint.velocity is not None or read.velocity not in _WITHOUT_VELOCITY:
+            velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
+            faults["limits"] += _differences(name, ("velocity", read.velocity, velocity))
+        faults["damping"] += _differences(
+            name,
+            ("damping", read.damping, joint.damping),
+            ("friction", read.friction, joint.friction),
+        )
+        if name in gains:
+            gain = gains[name]
+            faults["gains"] += _differences(
+                name,
+                ("stiffness", _or_nan(read.stiffness), gain.stiffness),
+                ("derivative gain", _or_nan(read.derivative_gain), gain.damping),
+                ("armature", _or_nan(read.armature), gain.armature),
+            )
+    mimic_faults = list(_mimic_differences(robot, reading.mimics, shared))
+    reads_damping = any(reading.joints[name].damping is not None for name in shared)
+    return JointAgreement(
+        limits=not faults["limits"],
+        mimic=None if reading.mimics is None else not mimic_faults,
+        damping=not faults["damping"] if reads_damping else None,
+        gains=not faults["gains"] if reading.has_actuators else None,
+        faults=(*faults["limits"], *mimic_faults, *faults["damping"], *faults["gains"]),
+    )
+
+
+def _accepted_efforts(joint: Joint) -> tuple[float | None, ...]:
+    """Return the efforts that a loader may read besides the joint's own.
+
+    Where the source names none, the URDF of a bundle has the default and its MJCF no limit.
+    """
+    if joint.effort in (None, 0.0, DEFAULT_EFFORT):
+        return (None, 0.0, DEFAULT_EFFORT, math.inf)
+    return (None,)
+
+
+def _or_nan(value: float | None) -> float:
+    """Return a value that is required; a missing one differs from every number."""
+    return math.nan if value is None else value
+
+
+def _differences(name: str, *values: tuple[str, float | None, float]) -> Iterator[str]:
+    """Describe values that differ, each given as its name, the loader's and the robot's."""
+    for quantity, read, expected in values:
+        if read is not None and not _is_close(read, expected):
+            yield f"joint {name}: {quantity} {read:.6g}, not {expected:.6g}"
+
+
+def _is_close(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE)
+
+
+def _mimic_differences(
+    robot: Robot, mimics: Mapping[str, Mimic] | None, shared: list[str]
+) -> Iterator[str]:
+    if mimics is None:
+        return
+    known = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
+    independent = {robot.joints[k].name for k in robot.independent_joints}
+    for name in shared:
+        read = _follow(name, mimics, independent)
+        expected = _follow(name, known, independent)
+        is_same = (
+            read.joint == expected.joint
+            and _is_close(read.multiplier, expected.multiplier)
+            and _is_close(read.offset, expected.offset)
+        )
+        if not is_same:
+            yield f"joint {name}: {_formula(read)}, not {_formula(expected)}"
+
+
+def _follow(name: str, mimics: Mapping[str, Mimic], independent: set[str]) -> Mimic:
+    """Return a joint's coupling to the independent joint at the end of its chain of leaders.
+
+    A fixed joint at the end stays at zero: its name is empty and only the offset counts.
+    """
+    joint, multiplier, offset = name, 1.0, 0.0
+    for _ in range(len(mimics)):
+        if joint not in mimics:
+            break
+        mimic = mimics[joint]
+        offset += multiplier * mimic.offset
+        joint, multiplier = mimic.joint, multiplier * mimic.multiplier
+    return Mimic(joint, multiplier, offset) if joint in independent else Mimic("", 0.0, offset)
+
+
+def _formula(mimic: Mimic) -> str:
+    return f"{mimic.multiplier:.6g} {mimic.joint} {mimic.offset:+.6g}"
 
 
 def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, list[str]]:
@@ -334,19 +489,36 @@ def _with_bounds(robot: Robot) -> Robot:
     return replace(robot, links=(*robot.links, *bodies), joints=(*robot.joints, *joints), frames=())
 
 
-def _causes(
-    loader: Loader,
-    reading: Reading | None,
-    text: bytes,
-    folder: Path,
-    frame: str,
-    positions: dict[str, Array],
+def _refused(
+    loader: Loader, message: str, folder: Path, frame: str, positions: Mapping[str, Array]
+) -> tuple[str, ...]:
+    """Return what a loader refuses in a file: without all of it, it reads the file."""
+    file = folder / loader.file
+    words: list[str] = []
+    text, first = file.read_bytes(), {name: q[:1] for name, q in positions.items()}
+    root, left = etree.fromstring(text), [*REFUSALS]
+    try:
+        while refusal := next((each for each in left if re.search(each.pattern, message)), None):
+            left.remove(refusal)
+            changed = deepcopy(root)
+            refusal.change(changed, file)
+            file.write_bytes(etree.tostring(changed))
+            result = _read(loader, folder, frame, first, 1)
+            if isinstance(result, Reading):
+                return (*words, refusal.words)
+            if not re.search(refusal.pattern, result):
+                words.append(refusal.words)
+                root, message = changed, result
+    finally:
+        file.write_bytes(text)
+    return ()
+
+
+def _differing(
+    loader: Loader, reading: Reading, folder: Path, frame: str, positions: Mapping[str, Array]
 ) -> tuple[str, ...]:
     """Return the fewest quirks of a loader that explain what it read; none if they do not."""
-    if reading is None:
-        return ()
-
-    n = len(reading.T_root_frame)
+    text, n = (folder / loader.file).read_bytes(), len(reading.T_root_frame)
 
     def explain(quirks: Sequence[Quirk]) -> bool:
         root = etree.fromstring(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,16 +11,22 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from lxml import etree
 
+from morphgen.checks.quirks import (
+    MUJOCO_QUIRKS,
+    PINOCCHIO_QUIRKS,
+    PYBULLET_QUIRKS,
+    USD_QUIRKS,
+    YOURDFPY_QUIRKS,
+    Quirk,
+)
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
-from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.formats.usd import convert_urdf, prim_name
-from morphgen.model.dynamics import GRAVITY, actuation
+from morphgen.model.dynamics import GRAVITY
 from morphgen.model.geometry import Pose
-from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Mimic, Robot
+from morphgen.model.robot import Mimic
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -30,14 +35,6 @@ if TYPE_CHECKING:
     import yourdfpy
 
 
-RELATIVE_TOLERANCE = 1e-5
-"""Largest accepted relative difference of a joint's value: gains are written with 6 digits."""
-ABSOLUTE_TOLERANCE = 1e-9
-"""Largest accepted difference of a joint's value near zero, in its SI unit."""
-
-
-_WITHOUT_VELOCITY = (None, 0.0, math.inf)
-"""Velocity limits that loaders read where a file names none."""
 DYNAMICS_SAMPLES = 20
 """Number of configurations in which forces and inertia are compared."""
 
@@ -87,130 +84,6 @@ class Reading:
     kg m or kg], without armature and with mimic joints uncoupled."""
 
 
-@dataclass(frozen=True)
-class JointAgreement:
-    """Whether a loader's joints agree with the robot's; None if the loader reads no such value."""
-
-    limits: bool | None
-    """Position, effort and velocity limits."""
-    mimic: bool | None
-    """Leader, multiplier and offset of mimic joints."""
-    damping: bool | None
-    """Damping and friction."""
-    gains: bool | None
-    """Gains and armature of position actuators."""
-    faults: tuple[str, ...]
-    """Description of each difference."""
-
-
-def compare_joints(robot: Robot, reading: Reading) -> JointAgreement:
-    """Compare the joints of a robot with a loader's; joints that only one has are left out.
-
-    A chain of mimic joints counts as its product.
-    """
-    movable = [robot.joints[k].name for k in robot.movable_joints]
-    shared = [name for name in movable if name in reading.joints]
-    gains = {gain.joint: gain for gain in actuation(robot)} if reading.has_actuators else {}
-    faults: dict[str, list[str]] = {name: [] for name in ("limits", "damping", "gains")}
-    for name in shared:
-        joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
-        lower, upper = (-math.inf, math.inf) if joint.is_continuous else joint.effective_limits
-        faults["limits"] += _differences(
-            name, ("lower limit", read.limits[0], lower), ("upper limit", read.limits[1], upper)
-        )
-        if read.effort not in _accepted_efforts(joint):
-            faults["limits"] += _differences(name, ("effort", read.effort, joint.effort or 0.0))
-        if joint.velocity is not None or read.velocity not in _WITHOUT_VELOCITY:
-            velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-            faults["limits"] += _differences(name, ("velocity", read.velocity, velocity))
-        faults["damping"] += _differences(
-            name,
-            ("damping", read.damping, joint.damping),
-            ("friction", read.friction, joint.friction),
-        )
-        if name in gains:
-            gain = gains[name]
-            faults["gains"] += _differences(
-                name,
-                ("stiffness", _or_nan(read.stiffness), gain.stiffness),
-                ("derivative gain", _or_nan(read.derivative_gain), gain.damping),
-                ("armature", _or_nan(read.armature), gain.armature),
-            )
-    mimic_faults = list(_mimic_differences(robot, reading.mimics, shared))
-    reads_damping = any(reading.joints[name].damping is not None for name in shared)
-    return JointAgreement(
-        limits=not faults["limits"],
-        mimic=None if reading.mimics is None else not mimic_faults,
-        damping=not faults["damping"] if reads_damping else None,
-        gains=not faults["gains"] if reading.has_actuators else None,
-        faults=(*faults["limits"], *mimic_faults, *faults["damping"], *faults["gains"]),
-    )
-
-
-def _accepted_efforts(joint: Joint) -> tuple[float | None, ...]:
-    """Return the efforts that a loader may read besides the joint's own.
-
-    Where the source names none, the URDF of a bundle has the default and its MJCF no limit.
-    """
-    if joint.effort in (None, 0.0, DEFAULT_EFFORT):
-        return (None, 0.0, DEFAULT_EFFORT, math.inf)
-    return (None,)
-
-
-def _or_nan(value: float | None) -> float:
-    """Return a value that is required; a missing one differs from every number."""
-    return math.nan if value is None else value
-
-
-def _differences(name: str, *values: tuple[str, float | None, float]) -> Iterator[str]:
-    """Describe values that differ, each given as its name, the loader's and the robot's."""
-    for quantity, read, expected in values:
-        if read is not None and not _is_close(read, expected):
-            yield f"joint {name}: {quantity} {read:.6g}, not {expected:.6g}"
-
-
-def _is_close(a: float, b: float) -> bool:
-    return math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE)
-
-
-def _mimic_differences(
-    robot: Robot, mimics: Mapping[str, Mimic] | None, shared: list[str]
-) -> Iterator[str]:
-    if mimics is None:
-        return
-    known = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
-    independent = {robot.joints[k].name for k in robot.independent_joints}
-    for name in shared:
-        read = _follow(name, mimics, independent)
-        expected = _follow(name, known, independent)
-        is_same = (
-            read.joint == expected.joint
-            and _is_close(read.multiplier, expected.multiplier)
-            and _is_close(read.offset, expected.offset)
-        )
-        if not is_same:
-            yield f"joint {name}: {_formula(read)}, not {_formula(expected)}"
-
-
-def _follow(name: str, mimics: Mapping[str, Mimic], independent: set[str]) -> Mimic:
-    """Return a joint's coupling to the independent joint at the end of its chain of leaders.
-
-    A fixed joint at the end stays at zero: its name is empty and only the offset counts.
-    """
-    joint, multiplier, offset = name, 1.0, 0.0
-    for _ in range(len(mimics)):
-        if joint not in mimics:
-            break
-        mimic = mimics[joint]
-        offset += multiplier * mimic.offset
-        joint, multiplier = mimic.joint, multiplier * mimic.multiplier
-    return Mimic(joint, multiplier, offset) if joint in independent else Mimic("", 0.0, offset)
-
-
-def _formula(mimic: Mimic) -> str:
-    return f"{mimic.multiplier:.6g} {mimic.joint} {mimic.offset:+.6g}"
-
-
 _MASS_SCALE = 2.0**-20
 """Factor of the masses with which PyBullet computes forces."""
 _SLIDE, _HINGE = 2, 3
@@ -219,20 +92,6 @@ _SLIDE, _HINGE = 2, 3
 Read = Callable[[Path, str, Mapping[str, Array], int], Reading]
 """Function of a folder, the name of a frame, or of none for the root, the positions of every
 movable joint, shape (n,) [rad or m], and the number n of configurations."""
-
-
-Change = Callable[[etree._Element, Path], None]
-"""Function of the root of a URDF, which it changes to what a loader reads, and of the file."""
-
-
-@dataclass(frozen=True)
-class Quirk:
-    """How a loader reads a URDF otherwise than morphgen."""
-
-    words: str
-    """Description of the deviation."""
-    change: Change
-    """Changes a URDF so that morphgen reads it as the loader does."""
 
 
 @dataclass(frozen=True)
@@ -583,150 +442,6 @@ def _mujoco_mimics(model: mujoco.MjModel) -> Iterator[tuple[str, Mimic]]:
 def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
     """Read the USD that urdf-usd-converter makes of the URDF with OpenUSD."""
     return read_stage(folder / URDF, frame, q, n)
-
-
-def _add_inertia(root: etree._Element, urdf: Path) -> None:
-    for link in root.iterfind("link"):
-        if link.find("inertial") is None and link.get("name") != "world":
-            _set_inertial(link, 1.0, np.eye(3))
-
-
-def _add_solids(root: etree._Element, urdf: Path) -> None:
-    """Give links without inertia the one that MuJoCo makes of their shapes."""
-    import mujoco
-
-    spec = mujoco.MjSpec.from_file(str(urdf))
-    spec.compiler.fusestatic = False
-    spec.compiler.boundmass, spec.compiler.boundinertia = BOUND_MASS, BOUND_INERTIA
-    model = spec.compile()
-    for link in root.iterfind("link"):
-        if link.find("inertial") is None and link.find("collision") is not None:
-            body = model.body(link.get("name", ""))
-            w, x, y, z = body.iquat.tolist()
-            R = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
-            inertia = R @ np.diag(body.inertia) @ R.T
-            _set_inertial(link, float(body.mass[0]), inertia, body.ipos.tolist())
-
-
-def _set_inertial(
-    link: etree._Element, mass: float, inertia: Array, com: Sequence[float] = (0, 0, 0)
-) -> None:
-    for old in link.findall("inertial"):
-        link.remove(old)
-    element = etree.SubElement(link, "inertial")
-    etree.SubElement(element, "origin", xyz=" ".join(map(repr, com)))
-    etree.SubElement(element, "mass", value=repr(mass))
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = inertia[np.triu_indices(3)].tolist()
-    etree.SubElement(element, "inertia", dict(zip(names, map(repr, values), strict=True)))
-
-
-def _drop_quaternions(root: etree._Element, urdf: Path) -> None:
-    for origin in root.iter("origin"):
-        origin.attrib.pop("quat_xyzw", "")
-
-
-def _empty_base(root: etree._Element, urdf: Path) -> None:
-    """Remove the inertia of the root and of the links that are fixed to it."""
-    parents = {}
-    for joint in root.iterfind("joint"):
-        parent, child = (joint.find(end) for end in ("parent", "child"))
-        if joint.get("type") == "fixed" and parent is not None and child is not None:
-            parents[child.get("link")] = parent.get("link")
-        elif child is not None:
-            parents[child.get("link")] = None
-    for link in root.iterfind("link"):
-        name = link.get("name")
-        while name is not None and name in parents:
-            name = parents[name]
-        if name is not None:
-            for inertial in link.findall("inertial"):
-                link.remove(inertial)
-
-
-def _count_massless(root: etree._Element, urdf: Path) -> None:
-    for mass in root.iterfind("link/inertial/mass"):
-        if float(mass.get("value") or 0) == 0:
-            mass.set("value", repr(BOUND_MASS))
-
-
-def _zero_impossible(root: etree._Element, urdf: Path) -> None:
-    for inertia in root.iterfind("link/inertial/inertia"):
-        xx, xy, xz, yy, yz, zz = (
-            float(inertia.get(name) or 0) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        )
-        a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
-        if a < 0 or c > a + b:
-            for name in inertia.attrib:
-                inertia.set(name, "0")
-
-
-def _limit_continuous(root: etree._Element, urdf: Path) -> None:
-    for joint in root.iterfind("joint[@type='continuous']"):
-        limit = joint.find("limit")
-        if limit is not None and {"lower", "upper"} & set(limit.attrib):
-            joint.set("type", "revolute")
-
-
-def _zero_ranges(root: etree._Element, urdf: Path) -> None:
-    for limit in root.iterfind("joint/limit"):
-        if not {"lower", "upper"} & set(limit.attrib):
-            limit.set("lower", "0")
-            limit.set("upper", "0")
-
-
-def _open_zero_ranges(root: etree._Element, urdf: Path) -> None:
-    for limit in root.iterfind("joint/limit"):
-        if float(limit.get("lower") or 0) == float(limit.get("upper") or 0) == 0:
-            for name in ("lower", "upper"):
-                limit.attrib.pop(name, "")
-
-
-def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
-    """Let joints that mimic a missing one follow a fixed one, and so stay."""
-    joints = {joint.get("name"): joint.get("type") for joint in root.iterfind("joint")}
-    fixed = next((name for name, kind in joints.items() if kind == "fixed"), None)
-    for mimic in root.iterfind("joint/mimic"):
-        if mimic.get("joint") not in joints and fixed is not None:
-            mimic.set("joint", fixed)
-
-
-NO_QUATERNIONS = Quirk("reads no quat_xyzw", _drop_quaternions)
-COUNT_MASSLESS = Quirk("counts the inertia of links without mass", _count_massless)
-ZERO_RANGES = Quirk("reads a range that is missing as 0 to 0", _zero_ranges)
-YOURDFPY_QUIRKS = (
-    NO_QUATERNIONS,
-    Quirk("holds joints that mimic a missing one", _hold_lost_followers),
-)
-PYBULLET_QUIRKS = (
-    NO_QUATERNIONS,
-    COUNT_MASSLESS,
-    Quirk("gives links without inertia 1 kg and 1 kg m^2", _add_inertia),
-    Quirk("sets inertia that no body has to zero", _zero_impossible),
-    Quirk("limits continuous joints that name a range", _limit_continuous),
-)
-MUJOCO_QUIRKS = (
-    NO_QUATERNIONS,
-    Quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", _add_solids),
-    Quirk("joins the base to the world, without its mass", _empty_base),
-    Quirk("reads a range of 0 to 0 as none", _open_zero_ranges),
-)
-PINOCCHIO_QUIRKS = (COUNT_MASSLESS, ZERO_RANGES)
-USD_QUIRKS = (NO_QUATERNIONS, ZERO_RANGES)
-
-REFUSALS = {
-    "mass and inertia of moving bodies": "refuses moving links without mass or inertia",
-    r"A \+ B >= C": "refuses inertia that no body has",
-    "must have positive eigenvalues": "refuses inertia that is not positive",
-    "getLinkState failed": "returns no state of robots with more than 127 links",
-    "Mimic joint '.*' not found": "refuses a joint that mimics a missing one",
-}
-"""Causes of refusals by a pattern of the loader's message."""
-
-
-def refusal_causes(message: str) -> tuple[str, ...]:
-    """Return why a loader refused a file, in words; nothing if it is not known."""
-    return tuple(words for pattern, words in REFUSALS.items() if re.search(pattern, message))[:1]
 
 
 LOADERS = (

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import trimesh
 
 from helpers.robots import arm, rod
 from morphgen.checks import conformance as module
@@ -419,6 +420,67 @@ def test_what_a_loader_does_with_a_file_is_named(changes, causes, tmp_path):
         assert (row.passed, row.causes) == (loader not in causes, causes.get(loader, ())), row
         assert bool(row.message) is (loader in causes)
         assert not row.is_unexplained
+
+
+AXIS, FOUR = '<axis xyz="0 1 0"/>', '<mesh filename="cube.stl" scale="1 1 1 1"/>'
+NO_INERTIA = "refuses <inertial> without <inertia>"
+REPEATED = "refuses a repeated element"
+SCALE = "refuses a mesh scale of more than three numbers"
+NO_SIZE = "refuses shapes without a size"
+
+
+def many_links(count):
+    links = "".join(f'<link name="l{i}"/>' for i in range(count))
+    joint = '<joint name="j{0}" type="fixed"><parent link="bar"/><child link="l{0}"/></joint>'
+    return "</robot>", links + "".join(joint.format(i) for i in range(count)) + "</robot>"
+
+
+@pytest.mark.parametrize(
+    ("changes", "edit", "words", "loaders"),
+    [
+        ({"base": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
+        ({"bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
+        ({"base": " ", "bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
+        ({}, (AXIS, 2 * AXIS), REPEATED, {"mujoco (urdf)"}),
+        ({}, (AXIS, AXIS + '<axis xyz="1 0 0"/>' + AXIS), REPEATED, {"mujoco (urdf)"}),
+        ({}, (LIMIT, 2 * LIMIT), REPEATED, {"mujoco (urdf)"}),
+        ({}, (BOX, f"<geometry>{FOUR}</geometry>"), SCALE, {"mujoco (urdf)", "usd"}),
+        ({"tip": f"{TIP}<visual><geometry>{FOUR}</geometry></visual>"}, None, SCALE, {"usd"}),
+        (
+            {"tip": f"{TIP}<collision><geometry>{FOUR}</geometry></collision>"},
+            ("1 1 1 1", "2 2 2 2 2"),
+            SCALE,
+            {"mujoco (urdf)", "usd"},
+        ),
+        ({}, ("0.1 0.1 0.1", "0 0.1 0.1"), NO_SIZE, {"mujoco (urdf)"}),
+        ({}, ('box size="0.1 0.1 0.1"', 'sphere radius="0"'), NO_SIZE, {"mujoco (urdf)"}),
+        (
+            {},
+            ('box size="0.1 0.1 0.1"', 'cylinder radius="0" length="1"'),
+            NO_SIZE,
+            {"mujoco (urdf)"},
+        ),
+        *(
+            ({}, many_links(n), "fails on robots with more than 127 links", {"pybullet"})
+            for n in (126, 127, 150)
+        ),
+    ],
+)
+def test_what_a_loader_refuses_is_named(changes, edit, words, loaders, tmp_path):
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
+    path = pendulum(tmp_path, **{"tip": TIP, **changes})
+    path.write_text(path.read_text().replace(*edit or ("", "")))
+    rows = file_rows(path)
+    assert not [row for row in rows.values() if row.is_unexplained]
+    refused = {name for name, row in rows.items() if words in row.causes}
+    assert refused == loaders & rows.keys()
+
+
+def test_a_refusal_without_its_cause_is_unexplained(tmp_path, monkeypatch):
+    """The words of a message are not enough: the loader must read the file without the cause."""
+    idle = tuple(replace(refusal, change=lambda root, urdf: None) for refusal in module.REFUSALS)
+    monkeypatch.setattr(module, "REFUSALS", idle)
+    assert file_rows(pendulum(tmp_path, tip=TIP, bar=IMPOSSIBLE))["mujoco (urdf)"].is_unexplained
 
 
 @pytest.mark.parametrize(
