@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from morphgen.checks.quirks import PYBULLET_LINKS
 from morphgen.errors import MeshError
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Geometry, Mesh, Shape, dimensions
@@ -278,6 +277,10 @@ def safe_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, 
     for name in names:
         new_names[name] = name if name in kept else take_name(_UNSAFE.sub("_", name) or "_", taken)
     return new_names
+
+
+PYBULLET_LINKS = 127
+"""Largest number of links below the root in PyBullet 3.2.7, which fails silently on more."""
 
 
 def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:

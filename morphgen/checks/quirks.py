@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
+from morphgen.checks.loaders import PYBULLET_LINKS
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.geometry import Pose
 from morphgen.typing import Array
 
-PYBULLET_LINKS = 127
-"""Largest number of links below the root in PyBullet 3.2.7, which fails silently on more."""
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 Change = Callable[[etree._Element, Path], None]
 """Function of the root of a URDF, which it changes to what a loader reads, and of the file."""
