@@ -16,7 +16,6 @@ from morphgen.formats.srdf import (
     EndEffector,
     Group,
     GroupState,
-    LinkPair,
     LinkSpheres,
     Srdf,
     require_tool,
@@ -172,13 +171,12 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
             parent = robot.parents[robot.link_index[limb.end_effector.links[0]]]
             name, carrier = limb.end_effector.name, robot.links[parent].name
             end_effectors.append(EndEffector(name, carrier, name, limb.arm.name))
-    disabled = (LinkPair(a, b, reason) for (a, b), reason in matrix.reasons.items())
     return Srdf(
         robot.name,
         groups=tuple(groups),
         group_states=tuple(_home_states(robot, groups)),
         end_effectors=tuple(end_effectors),
-        disabled_pairs=tuple(disabled),
+        disabled_pairs=matrix.reasons,
     )
 
 
@@ -259,6 +257,6 @@ def _home_states(robot: Robot, groups: Iterable[Group]) -> Iterator[GroupState]:
         for chain in group.chains:
             indices = robot.joint_chain(robot.frame(chain.tip_link).link)
             names += (robot.joints[k].name for k in indices)
-        positions = tuple((name, (home[name],)) for name in names if name in home)
+        positions = tuple((name, home[name]) for name in names if name in home)
         if positions:
             yield GroupState(HOME, group.name, positions)

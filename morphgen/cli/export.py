@@ -122,8 +122,7 @@ def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.robot_srdf import collision_matrix, matrix_evidence
     from morphgen.fitting.collision_geometry import SPHERES, link_spheres
     from morphgen.formats.bundle import URDF
-    from morphgen.formats.curobo import CONFIG, curobo_text
-    from morphgen.formats.srdf import require_tool
+    from morphgen.formats.srdf import CUROBO_CONFIG, curobo_text, require_tool
 
     require_tool(robot)
     if settings.spheres is None:
@@ -133,7 +132,7 @@ def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     spheres = link_spheres(robot)
     text = curobo_text(robot, spheres, matrix.reasons, URDF, matrix_evidence(robot, matrix))
     _with_meshes(_urdf)(robot, folder, replace(settings, spheres=None))
-    (folder / CONFIG).write_text(text, encoding="utf-8")
+    (folder / CUROBO_CONFIG).write_text(text, encoding="utf-8")
 
 
 def _with_meshes(

@@ -1,14 +1,15 @@
-"""SRDF, the description that MoveIt reads beside a URDF: its content, its writer and reader."""
+"""Descriptions for motion planners: SRDF, which MoveIt reads beside a URDF, and cuRobo's file."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import MISSING, dataclass, fields, replace
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import NamedTuple
 
+import yaml
 from lxml import etree
 
 from morphgen.errors import FormatError, nearest, shortened
@@ -18,92 +19,42 @@ from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 
 
-@dataclass(frozen=True)
-class Chain:
+class Chain(NamedTuple):
     """The joints and links between two links."""
 
     base_link: str
     tip_link: str
 
 
-@dataclass(frozen=True)
-class Group:
-    """A planning group: links, joints, chains and other groups."""
+class Group(NamedTuple):
+    """A planning group: links and chains."""
 
     name: str
     links: tuple[str, ...] = ()
-    joints: tuple[str, ...] = ()
     chains: tuple[Chain, ...] = ()
-    subgroups: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class GroupState:
+class GroupState(NamedTuple):
     """A named configuration of a group."""
 
     name: str
     group: str
-    positions: tuple[tuple[str, tuple[float, ...]], ...]
-    """Joints with their positions [rad or m]; joints of several degrees of freedom have several."""
+    positions: tuple[tuple[str, float], ...]
+    """Joints with their positions [rad or m]."""
 
 
-@dataclass(frozen=True)
-class EndEffector:
+class EndEffector(NamedTuple):
     """A group that is an end-effector of another one."""
 
     name: str
     parent_link: str
     """Link that carries the end-effector."""
     group: str
-    parent_group: str = ""
-    """Group that moves the end-effector; empty if the file names none."""
+    parent_group: str
+    """Group that moves the end-effector."""
 
 
-@dataclass(frozen=True)
-class VirtualJoint:
-    """A joint between a frame of the world and the robot."""
-
-    name: str
-    type: str
-    parent_frame: str
-    child_link: str
-
-
-@dataclass(frozen=True)
-class PassiveJoint:
-    """A joint without an actuator."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class JointProperty:
-    """A named property of a joint."""
-
-    joint_name: str
-    property_name: str
-    value: str
-
-
-@dataclass(frozen=True)
-class UncheckedLink:
-    """A link whose collisions with all links are off, except for the enabled pairs."""
-
-    link: str
-
-
-@dataclass(frozen=True)
-class LinkPair:
-    """Two links whose collisions are enabled or disabled."""
-
-    link1: str
-    link2: str
-    reason: str = ""
-    """Why, such as ``Adjacent`` or ``Never``; empty if the file gives no reason."""
-
-
-@dataclass(frozen=True)
-class BoundingSphere:
+class BoundingSphere(NamedTuple):
     """A sphere that bounds a part of a link."""
 
     center: Vec3
@@ -112,8 +63,7 @@ class BoundingSphere:
     """Radius [m]; MoveIt gives a link no collision shape if its only sphere has radius zero."""
 
 
-@dataclass(frozen=True)
-class LinkSpheres:
+class LinkSpheres(NamedTuple):
     """Spheres that approximate a link."""
 
     link: str
@@ -122,38 +72,16 @@ class LinkSpheres:
 
 @dataclass(frozen=True)
 class Srdf:
-    """The content of an SRDF; each kind of element is in the order of the file."""
+    """The content of an SRDF that morphgen writes; each kind of element is in its order."""
 
     robot: str
     """Name of the robot."""
-    virtual_joints: tuple[VirtualJoint, ...] = ()
     groups: tuple[Group, ...] = ()
     group_states: tuple[GroupState, ...] = ()
     end_effectors: tuple[EndEffector, ...] = ()
-    passive_joints: tuple[PassiveJoint, ...] = ()
-    joint_properties: tuple[JointProperty, ...] = ()
     link_spheres: tuple[LinkSpheres, ...] = ()
-    unchecked_links: tuple[UncheckedLink, ...] = ()
-    enabled_pairs: tuple[LinkPair, ...] = ()
-    disabled_pairs: tuple[LinkPair, ...] = ()
-
-
-FlatElement: TypeAlias = (
-    VirtualJoint | EndEffector | PassiveJoint | JointProperty | UncheckedLink | LinkPair
-)
-FLAT_ELEMENTS: dict[str, tuple[str, type[FlatElement]]] = {
-    "virtual_joint": ("virtual_joints", VirtualJoint),
-    "end_effector": ("end_effectors", EndEffector),
-    "passive_joint": ("passive_joints", PassiveJoint),
-    "joint_property": ("joint_properties", JointProperty),
-    "disable_default_collisions": ("unchecked_links", UncheckedLink),
-    "enable_collisions": ("enabled_pairs", LinkPair),
-    "disable_collisions": ("disabled_pairs", LinkPair),
-}
-"""Elements without children: their field of ``Srdf`` and their class, whose fields are the
-element's attributes; those with a default may be missing."""
-GROUP, STATE, SPHERES = "group", "group_state", "link_sphere_approximation"
-"""Elements with children."""
+    disabled_pairs: Mapping[Pair, str] = field(default_factory=dict)
+    """Reason why a pair of links needs no test, such as ``Adjacent`` or ``Never``."""
 
 
 def require_tool(robot: Robot) -> None:
@@ -166,53 +94,171 @@ def require_tool(robot: Robot) -> None:
 
 
 def srdf_text(srdf: Srdf, evidence: str = "") -> str:
-    """Write SRDF; ``morphgen.formats.srdf`` reads the same value back."""
+    """Write SRDF, with the evidence of its disabled pairs as a comment."""
     root = etree.Element("robot", name=srdf.robot)
-    _write_flat(root, "virtual_joint", srdf.virtual_joints)
     for group in srdf.groups:
-        element = etree.SubElement(root, GROUP, name=group.name)
-        for tag, names in (("link", group.links), ("joint", group.joints)):
-            for name in names:
-                etree.SubElement(element, tag, name=name)
-        _write_flat(element, "chain", group.chains)
-        for name in group.subgroups:
-            etree.SubElement(element, GROUP, name=name)
+        _write_group(root, group)
     for state in srdf.group_states:
-        element = etree.SubElement(root, STATE, name=state.name, group=state.group)
-        for joint, values in state.positions:
-            etree.SubElement(element, "joint", name=joint, value=_join(values))
-    _write_flat(root, "end_effector", srdf.end_effectors)
-    _write_flat(root, "passive_joint", srdf.passive_joints)
-    _write_flat(root, "joint_property", srdf.joint_properties)
-    for approximation in srdf.link_spheres:
-        element = etree.SubElement(root, SPHERES, link=approximation.link)
-        for sphere in approximation.spheres:
-            center, radius = _join(sphere.center), _join([sphere.radius])
-            etree.SubElement(element, "sphere", center=center, radius=radius)
-    _write_flat(root, "disable_default_collisions", srdf.unchecked_links)
-    _write_flat(root, "enable_collisions", srdf.enabled_pairs)
+        element = etree.SubElement(root, "group_state", name=state.name, group=state.group)
+        for joint, position in state.positions:
+            etree.SubElement(element, "joint", name=joint, value=_join([position]))
+    for end_effector in srdf.end_effectors:
+        etree.SubElement(root, "end_effector", end_effector._asdict())
+    for link, spheres in srdf.link_spheres:
+        element = etree.SubElement(root, "link_sphere_approximation", link=link)
+        for center, radius in spheres:
+            etree.SubElement(element, "sphere", center=_join(center), radius=_join([radius]))
     if evidence:
         root.append(etree.Comment(f" {evidence} "))
-    _write_flat(root, "disable_collisions", srdf.disabled_pairs)
+    for (a, b), reason in srdf.disabled_pairs.items():
+        etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
     etree.indent(root)
     return etree.tostring(root, encoding="unicode") + "\n"
 
 
-def disabled_link_pairs(srdf: Srdf, links: Iterable[str]) -> tuple[Pair, ...]:
+def _write_group(root: etree._Element, group: Group) -> None:
+    element = etree.SubElement(root, "group", name=group.name)
+    for name in group.links:
+        etree.SubElement(element, "link", name=name)
+    for chain in group.chains:
+        etree.SubElement(element, "chain", chain._asdict())
+
+
+def _join(values: Iterable[float]) -> str:
+    """Return numbers with all their digits, so that reading them back is exact."""
+    return " ".join(repr(float(value)) for value in values)
+
+
+MAX_SRDF_BYTES = 16 * 2**20
+"""Size of the largest SRDF that is read [bytes]."""
+
+
+class _Rule(NamedTuple):
+    """What an element may have: names of attributes and tags, separated by spaces."""
+
+    required: str
+    optional: str = ""
+    children: str = ""
+    numbers: Mapping[str, int | None] = {}
+    """Counts of the numbers in an attribute; None for any count but zero."""
+
+
+_RULES = {
+    "": _Rule(
+        "name",
+        children="virtual_joint end_effector passive_joint joint_property "
+        "disable_default_collisions enable_collisions disable_collisions group group_state "
+        "link_sphere_approximation",
+    ),
+    "virtual_joint": _Rule("name type parent_frame child_link"),
+    "end_effector": _Rule("name parent_link group", "parent_group"),
+    "passive_joint": _Rule("name"),
+    "joint_property": _Rule("joint_name property_name value"),
+    "disable_default_collisions": _Rule("link"),
+    "enable_collisions": _Rule("link1 link2", "reason"),
+    "disable_collisions": _Rule("link1 link2", "reason"),
+    "group": _Rule("name", children="link joint chain group"),
+    "group/link": _Rule("name"),
+    "group/joint": _Rule("name"),
+    "group/chain": _Rule("base_link tip_link"),
+    "group/group": _Rule("name"),
+    "group_state": _Rule("name group", children="joint"),
+    "group_state/joint": _Rule("name value", numbers={"value": None}),
+    "link_sphere_approximation": _Rule("link", children="sphere"),
+    "link_sphere_approximation/sphere": _Rule("center radius", numbers={"center": 3, "radius": 1}),
+}
+"""Elements of SRDF by their path below ``<robot>``. morphgen reads the disabled pairs only, but an
+unknown name anywhere may be a slip in one of those."""
+
+
+def read_srdf(path: Path) -> etree._Element:
+    """Return the root of an SRDF file, whose elements are known and complete."""
+    return parse_srdf(read_bytes(path, MAX_SRDF_BYTES), str(path))
+
+
+def parse_srdf(data: bytes, origin: str) -> etree._Element:
+    """Return the root of SRDF text; see ``read_srdf``."""
+    root = parse_xml(data, origin)
+    if root.tag != "robot":
+        raise FormatError(f"{origin}: root element <{shortened(str(root.tag))}>; expected <robot>")
+    _require_valid(root, "", origin)
+    groups = Counter(group.get("name", "") for group in root.iterfind("group"))
+    for name, count in groups.items():
+        if count > 1:
+            raise FormatError(f"{origin}: two groups are named {shortened(name)!r}")
+    named = [(owner, sub.get("name", "")) for owner in root for sub in owner.iterfind("group")]
+    named += [(owner, owner.get(key, "")) for owner in root for key in ("group", "parent_group")]
+    for owner, group in named:
+        if group and group not in groups:
+            name = shortened(f"{owner.tag} {owner.get('name', '')!r}")
+            hint = nearest(group, groups)
+            raise FormatError(
+                f"{origin}: {name} names the unknown group {shortened(group)!r}{hint}"
+            )
+    return root
+
+
+def _require_valid(element: etree._Element, path: str, origin: str) -> None:
+    """Require that an element and those in it are as the rules say."""
+    rule, where = _RULES[path], _place(element, origin)
+    for child in element:
+        if child.tag not in rule.children.split():
+            hint = nearest(str(child.tag), rule.children.split())
+            parent = shortened(str(element.tag))
+            raise FormatError(f"{_place(child, origin)} is unknown in <{parent}>{hint}")
+        _require_valid(child, f"{path}/{child.tag}".removeprefix("/"), origin)
+    for name in rule.required.split():
+        if not element.get(name):
+            raise FormatError(f"{where}: missing attribute {name!r}")
+    valid = f"{rule.required} {rule.optional}".split()
+    for name in map(str, element.attrib):
+        if name not in valid:
+            hint = nearest(name, valid)
+            raise FormatError(f"{where}: unknown attribute {shortened(name)!r}{hint}")
+    _require_numbers(element, rule, where)
+
+
+def _require_numbers(element: etree._Element, rule: _Rule, where: str) -> None:
+    for name, count in rule.numbers.items():
+        text = element.get(name, "")
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = [math.nan]
+        if (
+            not values
+            or len(values) != (count or len(values))
+            or not all(map(math.isfinite, values))
+        ):
+            wanted = {None: "finite numbers", 1: "a finite number"}.get(count, "3 finite numbers")
+            raise FormatError(f"{where}: {name} {shortened(text)!r}; expected {wanted}")
+        if name == "radius" and values[0] < 0:
+            raise FormatError(f"{where}: radius {values[0]:g}; expected 0 or more")
+
+
+def _place(element: etree._Element, origin: str) -> str:
+    return f"{origin}:{element.sourceline}: <{shortened(str(element.tag))}>"
+
+
+def disabled_link_pairs(root: etree._Element, links: Iterable[str]) -> tuple[Pair, ...]:
     """Return the pairs of links whose collisions an SRDF disables, sorted."""
-    pairs = {sorted_pair(unchecked.link, b) for unchecked in srdf.unchecked_links for b in links}
-    pairs -= {sorted_pair(pair.link1, pair.link2) for pair in srdf.enabled_pairs}
-    pairs |= {sorted_pair(pair.link1, pair.link2) for pair in srdf.disabled_pairs}
+
+    def pairs_of(tag: str) -> set[Pair]:
+        return {sorted_pair(e.get("link1", ""), e.get("link2", "")) for e in root.iterfind(tag)}
+
+    unchecked = [element.get("link", "") for element in root.iterfind("disable_default_collisions")]
+    pairs = {sorted_pair(a, b) for a in unchecked for b in links}
+    pairs = (pairs - pairs_of("enable_collisions")) | pairs_of("disable_collisions")
     return tuple(sorted((a, b) for a, b in pairs if a != b))
 
 
-def with_disabled_pairs(robot: Robot, srdf: Srdf, origin: str = "SRDF") -> Robot:
+def with_disabled_pairs(robot: Robot, root: etree._Element, origin: str = "SRDF") -> Robot:
     """Return a robot that also ignores the contacts of the pairs that an SRDF disables.
 
     Links that are frames of the robot have no shapes, so their pairs are left out.
     """
     frames = {frame.name for frame in robot.frames}
-    pairs = disabled_link_pairs(srdf, robot.link_index)
+    pairs = disabled_link_pairs(root, robot.link_index)
     for name in dict.fromkeys(link for pair in pairs for link in pair):
         if name not in robot.link_index and name not in frames:
             raise FormatError(
@@ -223,160 +269,56 @@ def with_disabled_pairs(robot: Robot, srdf: Srdf, origin: str = "SRDF") -> Robot
     return replace(robot, ignore_pairs=tuple(sorted({*robot.ignore_pairs, *known})))
 
 
-def _write_flat(parent: etree._Element, tag: str, values: Iterable[FlatElement | Chain]) -> None:
-    for value in values:
-        texts = {field.name: str(getattr(value, field.name)) for field in fields(value)}
-        etree.SubElement(parent, tag, {name: text for name, text in texts.items() if text})
+CUROBO_CONFIG = "robot.yml"
+"""Name of the configuration in an exported folder."""
+_CUROBO_VERSION = 2.0
 
 
-def _join(values: Iterable[float]) -> str:
-    """Return numbers with all their digits, so that reading them back is exact."""
-    return " ".join(repr(float(value)) for value in values)
+def curobo_text(
+    robot: Robot, spheres: Sequence[LinkSpheres], ignored: Iterable[Pair], urdf: str, comment: str
+) -> str:
+    """Return a robot's configuration for cuRobo as YAML: spheres, pairs to ignore and joints.
 
-
-_Flat = TypeVar("_Flat", bound=FlatElement | Chain)
-
-MAX_SRDF_BYTES = 16 * 2**20
-"""Size of the largest SRDF that is read [bytes]."""
-
-
-def read_srdf(path: Path) -> Srdf:
-    """Read an SRDF file."""
-    return parse_srdf(read_bytes(path, MAX_SRDF_BYTES), str(path))
-
-
-def parse_srdf(data: bytes, origin: str) -> Srdf:
-    """Read SRDF text; writing the result again loses nothing but comments."""
-    root = parse_xml(data, origin)
-    if root.tag != "robot":
-        raise FormatError(f"{origin}: root element <{shortened(str(root.tag))}>; expected <robot>")
-    name = _attributes(root, ("name",), origin)["name"]
-    content: dict[str, list[Any]] = {field.name: [] for field in fields(Srdf)}
-    for element in _children(root, (*FLAT_ELEMENTS, GROUP, STATE, SPHERES), origin):
-        if element.tag == GROUP:
-            content["groups"].append(_read_group(element, origin))
-        elif element.tag == STATE:
-            content["group_states"].append(_read_state(element, origin))
-        elif element.tag == SPHERES:
-            content["link_spheres"].append(_read_spheres(element, origin))
-        else:
-            field, kind = FLAT_ELEMENTS[element.tag]
-            content[field].append(_read_flat(element, kind, origin))
-    del content["robot"]
-    srdf = Srdf(name, **{field: tuple(values) for field, values in content.items()})
-    _require_groups(srdf, origin)
-    return srdf
-
-
-def _read_flat(element: etree._Element, kind: type[_Flat], origin: str) -> _Flat:
-    _children(element, (), origin)
-    required = [field.name for field in fields(kind) if field.default is MISSING]
-    optional = [field.name for field in fields(kind) if field.default is not MISSING]
-    return kind(**_attributes(element, required, origin, optional))
-
-
-def _read_group(element: etree._Element, origin: str) -> Group:
-    content: dict[str, list[Any]] = {"link": [], "joint": [], "chain": [], GROUP: []}
-    for child in _children(element, content, origin):
-        if child.tag == "chain":
-            content["chain"].append(_read_flat(child, Chain, origin))
-            continue
-        _children(child, (), origin)
-        content[child.tag].append(_attributes(child, ("name",), origin)["name"])
-    name = _attributes(element, ("name",), origin)["name"]
-    return Group(name, *(tuple(values) for values in content.values()))
-
-
-def _read_state(element: etree._Element, origin: str) -> GroupState:
-    positions = []
-    for child in _children(element, ("joint",), origin):
-        joint = _attributes(child, ("name", "value"), origin)
-        positions.append((joint["name"], _numbers(child, "value", origin)))
-    return GroupState(**_attributes(element, ("name", "group"), origin), positions=tuple(positions))
-
-
-def _read_spheres(element: etree._Element, origin: str) -> LinkSpheres:
-    spheres = []
-    for child in _children(element, ("sphere",), origin):
-        _attributes(child, ("center", "radius"), origin)
-        x, y, z = _numbers(child, "center", origin, count=3)
-        (radius,) = _numbers(child, "radius", origin, count=1)
-        if radius < 0:
-            raise FormatError(f"{_place(child, origin)}: radius {radius:g}; expected 0 or more")
-        spheres.append(BoundingSphere((x, y, z), radius))
-    return LinkSpheres(_attributes(element, ("link",), origin)["link"], tuple(spheres))
-
-
-def _place(element: etree._Element, origin: str) -> str:
-    return f"{origin}:{element.sourceline}: <{shortened(str(element.tag))}>"
-
-
-def _children(
-    element: etree._Element, tags: Iterable[str], origin: str
-) -> Iterator[etree._Element]:
-    """Return the children of an element, which must all have one of the tags."""
-    for child in element:
-        if child.tag not in tags:
-            parent = shortened(str(element.tag))
-            raise FormatError(
-                f"{_place(child, origin)} is unknown in <{parent}>" + nearest(str(child.tag), tags)
-            )
-    return iter(element)
-
-
-def _attributes(
-    element: etree._Element, required: Iterable[str], origin: str, optional: Iterable[str] = ()
-) -> dict[str, str]:
-    """Return the attributes of an element; the required ones must not be missing or empty."""
-    attributes = {str(name): str(value) for name, value in element.attrib.items()}
-    for name in required:
-        if not attributes.get(name):
-            raise FormatError(f"{_place(element, origin)}: missing attribute {name!r}")
-    valid = (*required, *optional)
-    for name in attributes:
-        if name not in valid:
-            raise FormatError(
-                f"{_place(element, origin)}: unknown attribute {shortened(name)!r}"
-                + nearest(name, valid)
-            )
-    return attributes
-
-
-def _numbers(
-    element: etree._Element, attribute: str, origin: str, count: int | None = None
-) -> tuple[float, ...]:
-    """Return the finite numbers of an attribute; ``count`` of them, or any number but zero."""
-    text = element.get(attribute, "")
-    try:
-        values = tuple(map(float, text.split()))
-    except ValueError:
-        values = (math.nan,)
-    is_right = len(values) == count if count is not None else len(values) > 0
-    if not (is_right and all(map(math.isfinite, values))):
-        wanted = {None: "finite numbers", 1: "a finite number"}.get(
-            count, f"{count} finite numbers"
-        )
-        raise FormatError(
-            f"{_place(element, origin)}: {attribute} {shortened(text)!r}; expected {wanted}"
-        )
-    return values
-
-
-def _require_groups(srdf: Srdf, origin: str) -> None:
-    """Require that groups have different names and that all named groups exist."""
-    names = [group.name for group in srdf.groups]
-    for name, count in Counter(names).items():
-        if count > 1:
-            raise FormatError(f"{origin}: two groups are named {shortened(name)!r}")
-    known = set(names)
-    named = [(f"group {g.name!r}", sub) for g in srdf.groups for sub in g.subgroups]
-    named += [(f"group_state {state.name!r}", state.group) for state in srdf.group_states]
-    for effector in srdf.end_effectors:
-        parents = (effector.parent_group,) if effector.parent_group else ()
-        named += [(f"end_effector {effector.name!r}", g) for g in (effector.group, *parents)]
-    for owner, group in named:
-        if group not in known:
-            raise FormatError(
-                f"{origin}: {shortened(owner)} names the unknown group {shortened(group)!r}"
-                + nearest(group, names)
-            )
+    The keys are those that cuRobo's ``KinematicsLoaderCfg`` and ``CSpaceParams`` read (format
+    version 2.0, https://github.com/NVlabs/curobo). Keys with values that a robot does not
+    determine, such as limits of acceleration and jerk, are left out: cuRobo takes its defaults.
+    """
+    require_tool(robot)
+    # "tool" of a robot with several limbs is the tool of the last one.
+    names = (frame.name for frame in robot.frames)
+    tools = [name for name in names if name.endswith(f"_{TOOL}")] or [TOOL]
+    if not spheres:
+        raise FormatError(f"robot {robot.name!r} has no link with spheres")
+    links = [link.link for link in spheres]
+    joints = [robot.joints[k].name for k in robot.independent_joints]
+    ignore = defaultdict(list)
+    for a, b in sorted(ignored):
+        if a in links and b in links:
+            ignore[a].append(b)
+    kinematics = {
+        "format_version": _CUROBO_VERSION,
+        "urdf_path": urdf,
+        "asset_root_path": "",
+        "base_link": robot.root.name,
+        "tool_frames": tools,
+        "collision_link_names": links,
+        "collision_spheres": {
+            link.link: [
+                {"center": list(sphere.center), "radius": sphere.radius} for sphere in link.spheres
+            ]
+            for link in spheres
+        },
+        "collision_sphere_buffer": 0.0,
+        "self_collision_ignore": dict(ignore),
+        "self_collision_buffer": dict.fromkeys(links, 0.0),
+        "mesh_link_names": [link.name for link in robot.links if link.visuals],
+        "cspace": {
+            "joint_names": joints,
+            "default_joint_position": list(robot.home),
+            "null_space_weight": [1.0] * len(joints),
+            "cspace_distance_weight": [1.0] * len(joints),
+        },
+    }
+    data = {"robot_cfg": {"kinematics": kinematics}}
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+    return f"# {comment}\n{text}"

@@ -67,8 +67,10 @@ def test_exports_have_the_same_spheres(run, bundle, tmp_path):
     assert {link: len(of_link) for link, of_link in expected.items()} == counts(2)
     srdf = read_srdf(tmp_path / "arm.srdf")
     assert expected == {
-        approximation.link: [(*s.center, s.radius) for s in approximation.spheres]
-        for approximation in srdf.link_spheres
+        link.get("link"): [
+            tuple(map(float, f"{s.get('center')} {s.get('radius')}".split())) for s in link
+        ]
+        for link in srdf.iterfind("link_sphere_approximation")
     }
     config = yaml.safe_load((tmp_path / "arm-curobo" / "robot.yml").read_text())
     kinematics = config["robot_cfg"]["kinematics"]

@@ -1,72 +1,85 @@
-"""SRDF: exact round trips, refusals, and the pairs that it disables."""
+"""SRDF and cuRobo: what is written, refusals, and the pairs that an SRDF disables."""
 
 import re
 from dataclasses import replace
 
 import pytest
+import yaml
 
 from helpers.robots import arm
 from morphgen.errors import FormatError
+from morphgen.fitting.collision_geometry import link_spheres
 from morphgen.formats.srdf import (
     BoundingSphere,
     Chain,
     EndEffector,
     Group,
     GroupState,
-    JointProperty,
-    LinkPair,
     LinkSpheres,
-    PassiveJoint,
     Srdf,
-    UncheckedLink,
-    VirtualJoint,
+    curobo_text,
     disabled_link_pairs,
     parse_srdf,
     read_srdf,
     srdf_text,
     with_disabled_pairs,
 )
+from morphgen.model.geometry import Pose, Shape, Sphere
+from morphgen.model.robot import Frame
 
+TEXT = """\
+<robot name="arm &amp; &quot;hand&quot;">
+  <group name="arm">
+    <chain base_link="base" tip_link="tool"/>
+  </group>
+  <group name="hand">
+    <link name="left"/>
+    <link name="right"/>
+  </group>
+  <group_state name="home" group="arm">
+    <joint name="shoulder" value="0.30000000000000004"/>
+    <joint name="elbow" value="-1e-17"/>
+  </group_state>
+  <end_effector name="hand" parent_link="slider" group="hand" parent_group="arm"/>
+  <link_sphere_approximation link="upper">
+    <sphere center="0.1 -0.2 0.14285714285714285" radius="0.05"/>
+  </link_sphere_approximation>
+  <!-- found by counting -->
+  <disable_collisions link1="base" link2="upper" reason="Adjacent"/>
+</robot>
+"""
 FULL = Srdf(
     'arm & "hand"',
-    (VirtualJoint("fixed_base", "fixed", "world", "base"),),
-    (
-        Group("arm", chains=(Chain("base", "tool"),)),
-        Group("hand", ("left", "right"), ("left",)),
-        Group("all", subgroups=("arm", "hand")),
-    ),
-    (
-        GroupState("home", "arm", (("shoulder", (0.1 + 0.2,)), ("elbow", (-1e-17,)))),
-        GroupState("away", "all", (("floating", (1.0, 2.0, 1 / 3, 0.0, 0.0, 0.0, 1.0)),)),
-    ),
-    (EndEffector("hand", "slider", "hand", "arm"), EndEffector("other", "slider", "hand")),
-    (PassiveJoint("right"),),
-    (JointProperty("floating", "motion_model", "diff_drive"),),
-    (
-        LinkSpheres(
-            "upper",
-            (BoundingSphere((0.1, -0.2, 1 / 7), 0.05), BoundingSphere((0.0, 0.0, 0.0), 0.0)),
-        ),
-        LinkSpheres("lower", ()),
-    ),
-    (UncheckedLink("right"),),
-    (LinkPair("base", "right"),),
-    (LinkPair("base", "upper", "Adjacent"), LinkPair("lower", "upper")),
+    (Group("arm", chains=(Chain("base", "tool"),)), Group("hand", ("left", "right"))),
+    (GroupState("home", "arm", (("shoulder", 0.1 + 0.2), ("elbow", -1e-17))),),
+    (EndEffector("hand", "slider", "hand", "arm"),),
+    (LinkSpheres("upper", (BoundingSphere((0.1, -0.2, 1 / 7), 0.05),)),),
+    {("base", "upper"): "Adjacent"},
 )
+FOREIGN = """
+<virtual_joint name="fixed_base" type="fixed" parent_frame="world" child_link="base"/>
+<group name="arm"><link name="upper"/><joint name="shoulder"/></group>
+<group name="all"><group name="arm"/></group>
+<group_state name="away" group="all"><joint name="floating" value="1 2 0.5 0 0 0 1"/></group_state>
+<end_effector name="other" parent_link="slider" group="arm"/>
+<passive_joint name="right"/>
+<joint_property joint_name="floating" property_name="motion_model" value="diff_drive"/>
+<disable_default_collisions link="c"/>
+<enable_collisions link1="a" link2="c"/>
+<disable_collisions link1="b" link2="a"/>
+"""
+"""Elements that morphgen does not write."""
 
 
 def document(content):
     return f'<robot name="arm">\n{content}\n</robot>'.encode()
 
 
-def test_written_content_is_read_back_exactly(tmp_path):
-    text = srdf_text(FULL, "found by counting")
+def test_content_is_written_with_all_digits_and_is_valid(tmp_path):
+    assert srdf_text(FULL, "found by counting") == TEXT
     path = tmp_path / "arm.srdf"
-    path.write_text(text)
-    assert "<!-- found by counting -->\n  <disable_collisions" in text
-    assert read_srdf(path) == FULL
-    assert srdf_text(read_srdf(path), "found by counting") == text
-    assert parse_srdf(srdf_text(Srdf("r")).encode(), "r") == Srdf("r")
+    path.write_text(TEXT)
+    assert read_srdf(path).get("name") == FULL.robot
 
 
 @pytest.mark.parametrize(
@@ -74,10 +87,13 @@ def test_written_content_is_read_back_exactly(tmp_path):
     [
         ("<grup/>", "x:2: <grup> is unknown in <robot>; did you mean 'group'? valid:"),
         ('<group name="g"><chain base_link="a"/></group>', "<chain>: missing attribute 'tip_link'"),
-        ('<group name="g"><link/></group>', "x:2: <link>: missing attribute 'name'"),
         ('<group name="g"><link name="a"><b/></link></group>', "<b> is unknown in <link>"),
         ('<group name="g"/><group name="g"/>', "x: two groups are named 'g'"),
         ('<group name="g" nmae="h"/>', "<group>: unknown attribute 'nmae'; did you mean 'name'?"),
+        (
+            '<group name="g"><group name="h"/></group>',
+            "x: group 'g' names the unknown group 'h'; valid: g",
+        ),
         (
             '<group_state name="home" group="arm"/>',
             "x: group_state 'home' names the unknown group 'arm'; valid: (none)",
@@ -91,20 +107,17 @@ def test_written_content_is_read_back_exactly(tmp_path):
             '<group name="g"/><end_effector name="e" parent_link="l" group="g" parent_group="h"/>',
             "x: end_effector 'e' names the unknown group 'h'; valid: g",
         ),
-        (
-            '<link_sphere_approximation link="l"><sphere center="0 0" radius="1"/>'
-            "</link_sphere_approximation>",
-            "x:2: <sphere>: center '0 0'; expected 3 finite numbers",
-        ),
-        (
-            '<link_sphere_approximation link="l"><sphere center="0 0 0" radius="-1"/>'
-            "</link_sphere_approximation>",
-            "x:2: <sphere>: radius -1; expected 0 or more",
-        ),
-        (
-            '<link_sphere_approximation link="l"><sphere center="0 0 0" radius="nan"/>'
-            "</link_sphere_approximation>",
-            "x:2: <sphere>: radius 'nan'; expected a finite number",
+        *(
+            (
+                f'<link_sphere_approximation link="l"><sphere center="{center}" radius="{radius}"/>'
+                "</link_sphere_approximation>",
+                f"x:2: <sphere>: {message}",
+            )
+            for center, radius, message in (
+                ("0 0", "1", "center '0 0'; expected 3 finite numbers"),
+                ("0 0 0", "-1", "radius -1; expected 0 or more"),
+                ("0 0 0", "nan", "radius 'nan'; expected a finite number"),
+            )
         ),
         ('<disable_collisions link1="a"/>', "x:2: <disable_collisions>: missing attribute 'link2'"),
     ],
@@ -117,7 +130,6 @@ def test_invalid_content_is_refused(content, message):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"<robot name='a'>", "x:1:"),
         (b"<sdf/>", "x: root element <sdf>; expected <robot>"),
         (b"<robot/>", "x:1: <robot>: missing attribute 'name'"),
         (b'<!DOCTYPE r [<!ENTITY e "a">]><robot name="r"/>', "x: has a DOCTYPE"),
@@ -130,20 +142,102 @@ def test_other_documents_are_refused(data, message):
 
 def test_disabled_pairs_become_ignored_ones():
     robot = replace(arm(), ignore_pairs=(("left", "right"),))
-    disabled = (LinkPair("upper", "base", "Adjacent"), LinkPair("tool", "base", "Never"))
-    result = with_disabled_pairs(robot, Srdf("arm", disabled_pairs=disabled))
+    pairs = '<disable_collisions link1="{}" link2="base" reason="Adjacent"/>'.format
+    disabled = parse_srdf(document(pairs("upper") + pairs("tool")), "x")
+    result = with_disabled_pairs(robot, disabled)
     assert result.ignore_pairs == (("base", "upper"), ("left", "right"))
-    unknown = Srdf("arm", disabled_pairs=(LinkPair("uper", "base"),))
     message = "a.srdf: robot 'arm' has no link 'uper'; did you mean 'upper'? valid: base, left,"
     with pytest.raises(FormatError, match=re.escape(message)):
-        with_disabled_pairs(robot, unknown, "a.srdf")
+        with_disabled_pairs(robot, parse_srdf(document(pairs("uper")), "x"), "a.srdf")
 
 
 def test_unchecked_links_collide_only_in_enabled_pairs():
-    srdf = Srdf(
-        "r",
-        unchecked_links=(UncheckedLink("c"),),
-        enabled_pairs=(LinkPair("a", "c"),),
-        disabled_pairs=(LinkPair("b", "a"),),
+    root = parse_srdf(document(FOREIGN), "x")
+    assert disabled_link_pairs(root, ("a", "b", "c", "d")) == (("a", "b"), ("b", "c"), ("c", "d"))
+
+
+KINEMATICS = {
+    "format_version": float,
+    "urdf_path": str,
+    "asset_root_path": str,
+    "base_link": str,
+    "tool_frames": list,
+    "collision_link_names": list,
+    "collision_spheres": dict,
+    "collision_sphere_buffer": float,
+    "self_collision_ignore": dict,
+    "self_collision_buffer": dict,
+    "mesh_link_names": list,
+    "cspace": dict,
+}
+"""Fields of cuRobo's ``KinematicsLoaderCfg`` that are written, with their types."""
+CSPACE = {
+    "joint_names",
+    "default_joint_position",
+    "null_space_weight",
+    "cspace_distance_weight",
+}
+"""Fields of its ``CSpaceParams`` that are written."""
+
+
+def with_balls(robot):
+    """Return the robot with two spheres on every link but the last, which has no shapes."""
+    balls = (
+        Shape(Sphere(0.05), Pose((1e-5, -0.02, 0.123456789))),
+        Shape(Sphere(0.025), Pose((0.0, 0.0, 0.2))),
     )
-    assert disabled_link_pairs(srdf, ("a", "b", "c", "d")) == (("a", "b"), ("b", "c"), ("c", "d"))
+    links = [replace(link, collisions=balls) for link in robot.links[:-1]]
+    return robot.with_links([*links, replace(robot.links[-1], collisions=())])
+
+
+def read(robot, ignored=()):
+    text = curobo_text(robot, link_spheres(robot), ignored, "robot.urdf", "where it comes from")
+    data = yaml.safe_load(text)
+    assert text.startswith("# where it comes from\n")
+    assert list(data) == ["robot_cfg"]
+    assert list(data["robot_cfg"]) == ["kinematics"]
+    return data["robot_cfg"]["kinematics"]
+
+
+def test_all_keys_are_those_of_curobo_with_their_types():
+    kinematics = read(with_balls(arm()))
+    assert {name: type(value) for name, value in kinematics.items()} == KINEMATICS
+    assert kinematics["format_version"] == 2.0
+    assert set(kinematics["cspace"]) == CSPACE
+
+
+def test_spheres_joints_and_pairs_are_those_of_the_robot():
+    robot = with_balls(arm())
+    ignored = [("base", "upper"), ("base", "lower"), ("left", "right")]
+    kinematics = read(robot, ignored)
+    names = ["base", "upper", "lower", "slider", "left"]
+    assert kinematics["collision_link_names"] == names
+    assert list(kinematics["self_collision_buffer"]) == names
+    assert kinematics["collision_spheres"] == {
+        name: [
+            {"center": [1e-5, -0.02, 0.123456789], "radius": 0.05},
+            {"center": [0.0, 0.0, 0.2], "radius": 0.025},
+        ]
+        for name in names
+    }
+    # A link without spheres needs no pair.
+    assert kinematics["self_collision_ignore"] == {"base": ["lower", "upper"]}
+    assert kinematics["base_link"] == "base"
+    assert kinematics["tool_frames"] == ["tool"]
+    cspace = kinematics["cspace"]
+    assert cspace["joint_names"] == ["shoulder", "elbow", "extend", "left"]
+    assert cspace["default_joint_position"] == [0.4, 0.5, 0.01, 0.02]
+    assert {len(values) for values in cspace.values()} == {4}
+
+
+def test_every_tool_of_several_limbs_is_a_tool_frame():
+    frames = (Frame("left_tool", "left"), Frame("right_tool", "right"), Frame("tool", "right"))
+    robot = with_balls(replace(arm(), frames=frames))
+    assert read(robot)["tool_frames"] == ["left_tool", "right_tool"]
+
+
+def test_robots_without_tool_or_spheres_are_refused():
+    with pytest.raises(FormatError, match="no frame 'tool', where its arm ends"):
+        read(with_balls(replace(arm(), frames=())))
+    with pytest.raises(FormatError, match="no link with spheres"):
+        read(arm())
