@@ -27,7 +27,7 @@ import torch
 from tabulate import tabulate
 
 import morphgen
-from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.model import kinematics, kinematics_torch
 from morphgen.model.kinematics import frame_positions, movable_positions, random_configurations

@@ -7,12 +7,8 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 
-from morphgen.errors import MeshError
-from morphgen.formats.files import file_sha256
-from morphgen.formats.resolve import file_stamp
+from morphgen.formats.files import content_sha256
 from morphgen.model.geometry import Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
@@ -83,7 +79,7 @@ def _inertial(inertial: Inertial | None) -> list[int] | None:
 
 def _geometry(geometry: Geometry) -> list[object]:
     if isinstance(geometry, Mesh):
-        content = _content(geometry.path, file_stamp(geometry.path))
+        content = content_sha256(geometry.path)
         return [content, _grid(geometry.scale), geometry.part]
     return [type(geometry).__name__, _grid(dimensions(geometry))]
 
@@ -109,13 +105,3 @@ def _joint(joint: Joint, robot: Robot) -> list[object]:
         _grid([joint.mimic.multiplier, joint.mimic.offset]),
     ]
     return [kind, *attachment, _grid(motion), limits, mimic]
-
-
-@lru_cache(maxsize=4096)
-def _content(path: Path, stamp: tuple[int, int]) -> str:
-    """Return the SHA-256 of a file; the stamp makes the cache notice a changed file."""
-    del stamp
-    try:
-        return file_sha256(path)
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read: {error.strerror}") from error

@@ -31,8 +31,16 @@ from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, tokens
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.bundle import CARD, PICTURE, URDF, file_findings, split_colours, write_bundle
-from morphgen.formats.card import card_text, robot_card
+from morphgen.formats.bundle import (
+    CARD,
+    PICTURE,
+    URDF,
+    card_text,
+    file_findings,
+    robot_card,
+    split_colours,
+    write_bundle,
+)
 from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.urdf.write import urdf_text

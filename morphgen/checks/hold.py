@@ -353,7 +353,7 @@ def overloads(robot: Robot, q: ArrayLike) -> tuple[str, ...]:
 def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
     import mujoco
 
-    from morphgen.formats.mujoco_warnings import MujocoWarnings
+    from morphgen.formats.quiet import MujocoWarnings
 
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / MJCF))

@@ -97,7 +97,7 @@ class SelfCollisionChecker:
         """
         import mujoco
 
-        from morphgen.formats.mujoco_warnings import MujocoWarnings
+        from morphgen.formats.quiet import MujocoWarnings
 
         model, data, qpos = self._model, self._data, self._data.qpos
         full = data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL]
@@ -145,7 +145,7 @@ class SelfCollisionChecker:
         """Find the contacts at movable joint positions, perturbed slightly where EPA fails."""
         import mujoco
 
-        from morphgen.formats.mujoco_warnings import MujocoWarnings
+        from morphgen.formats.quiet import MujocoWarnings
 
         for offset in _PERTURBATIONS:
             self._data.qpos[self._qpos] = positions + offset * self._perturbation

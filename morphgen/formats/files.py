@@ -9,12 +9,14 @@ import shutil
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
+from morphgen.formats.resolve import file_stamp
 
 SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file managers write into the folders that they show."""
@@ -26,6 +28,20 @@ def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file; cached until it changes."""
+    return _content_sha256(path.absolute(), file_stamp(path))
+
+
+@lru_cache(maxsize=4096)
+def _content_sha256(path: Path, stamp: tuple[int, int]) -> str:
+    del stamp
+    try:
+        return file_sha256(path)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def folder_hashes(folder: Path) -> dict[str, str]:

@@ -19,9 +19,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import file_sha256, write_cache_file
+from morphgen.formats.files import content_sha256, write_cache_file
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.rounding import format_number
@@ -36,6 +35,7 @@ from morphgen.model.geometry import (
     Sphere,
     StoredFit,
     StoredFits,
+    dimensions,
     scale_shape,
 )
 from morphgen.model.robot import Link, Robot
@@ -52,6 +52,10 @@ FITTER_VERSION = 2
 
 _Iou = Annotated[float, Meta(ge=0, le=1)]
 """Intersection over union of the fitted and the original volume."""
+
+
+_KINDS = {Box: "box", Cylinder: "cylinder", Sphere: "sphere", Capsule: "capsule"}
+"""Keys of primitives in files, with their ``dimensions`` as values."""
 
 
 class ShapeRecord(Record, frozen=True):
@@ -71,8 +75,7 @@ class ShapeRecord(Record, frozen=True):
     """Radius, and length without the caps [m]."""
 
     def __post_init__(self) -> None:
-        sizes = (self.box, self.cylinder, self.sphere, self.capsule)
-        if sum(size is not None for size in sizes) != 1:
+        if sum(getattr(self, kind) is not None for kind in _KINDS.values()) != 1:
             raise ValueError("expected one of box, cylinder, sphere and capsule")
         if not math.isclose(math.hypot(*self.quaternion), 1, rel_tol=1e-6):
             raise ValueError(f"quaternion {list(self.quaternion)} is not of unit length")
@@ -81,15 +84,8 @@ class ShapeRecord(Record, frozen=True):
     def shape(self) -> Shape:
         """The shape that the record describes."""
         geometry: Geometry
-        if self.box:
-            geometry = Box(self.box)
-        elif self.cylinder:
-            geometry = Cylinder(*self.cylinder)
-        elif self.sphere:
-            geometry = Sphere(*self.sphere)
-        else:
-            assert self.capsule
-            geometry = Capsule(*self.capsule)
+        kind, size = next((k, size) for k, key in _KINDS.items() if (size := getattr(self, key)))
+        geometry = Box(size) if kind is Box else kind(*size)
         return Shape(geometry, Pose(self.xyz, self.quaternion))
 
 
@@ -189,10 +185,7 @@ def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
 
 def read_fits(path: Path) -> dict[str, StoredFit]:
     """Return the fits of one file; none if another version of the fitter wrote it."""
-    try:
-        return dict(_read(path.absolute(), file_stamp(path)))
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}") from error
+    return dict(_read(path.absolute(), file_stamp(path)))
 
 
 def fits_text(fits: Mapping[str, StoredFit]) -> str:
@@ -214,20 +207,14 @@ def fits_text(fits: Mapping[str, StoredFit]) -> str:
 
 def shape_to_data(shape: Shape) -> dict[str, object]:
     """Return the data of a ``ShapeRecord`` for a primitive."""
-    size: dict[str, object]
-    match shape.geometry:
-        case Box(edges):
-            size = {"box": list(edges)}
-        case Cylinder(radius, length):
-            size = {"cylinder": [radius, length]}
-        case Sphere(radius):
-            size = {"sphere": [radius]}
-        case Capsule(radius, length):
-            size = {"capsule": [radius, length]}
-        case Mesh(path):
-            raise ValueError(f"mesh {path} is not a primitive")
-    pose = shape.T_link_shape
-    return size | {"xyz": list(pose.position), "quaternion": list(pose.quaternion)}
+    geometry, pose = shape.geometry, shape.T_link_shape
+    if isinstance(geometry, Mesh):
+        raise ValueError(f"mesh {geometry.path} is not a primitive")
+    return {
+        _KINDS[type(geometry)]: list(dimensions(geometry)),
+        "xyz": list(pose.position),
+        "quaternion": list(pose.quaternion),
+    }
 
 
 @lru_cache(maxsize=256)
@@ -241,30 +228,10 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
 
 
 def _geometry_text(geometry: Geometry) -> str:
-    match geometry:
-        case Mesh(path, scale, part):
-            return " ".join(["mesh", _digest(path), *(format_number(s) for s in scale), str(part)])
-        case Box(edges):
-            return " ".join(["box", *(format_number(edge) for edge in edges)])
-        case Sphere(radius):
-            return f"sphere {format_number(radius)}"
-        case Cylinder(radius, length):
-            return f"cylinder {format_number(radius)} {format_number(length)}"
-        case Capsule(radius, length):
-            return f"capsule {format_number(radius)} {format_number(length)}"
-
-
-def _digest(path: Path) -> str:
-    try:
-        return _digest_of(path.absolute(), file_stamp(path))
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}") from error
-
-
-@lru_cache(maxsize=1024)
-def _digest_of(path: Path, stamp: tuple[int, int]) -> str:
-    del stamp
-    return file_sha256(path)
+    if isinstance(geometry, Mesh):
+        scale = map(format_number, geometry.scale)
+        return " ".join(["mesh", content_sha256(geometry.path), *scale, str(geometry.part)])
+    return " ".join([_KINDS[type(geometry)], *map(format_number, dimensions(geometry))])
 
 
 def keep_fit(path: Path, text: str) -> None:

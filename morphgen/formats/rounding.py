@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, map_dimensions
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -103,17 +103,7 @@ def _inertial(inertial: Inertial | None) -> Inertial | None:
 
 
 def _geometry(geometry: Geometry) -> Geometry:
-    match geometry:
-        case Box(size):
-            return Box(_vector(size))
-        case Sphere(radius):
-            return Sphere(round_number(radius))
-        case Cylinder(radius, length):
-            return Cylinder(round_number(radius), round_number(length))
-        case Capsule(radius, length):
-            return Capsule(round_number(radius), round_number(length))
-        case Mesh():
-            return geometry
+    return geometry if isinstance(geometry, Mesh) else map_dimensions(round_number, geometry)
 
 
 def _joint(joint: Joint) -> Joint:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -168,20 +168,22 @@ def dimensions(primitive: Primitive) -> tuple[float, ...]:
             return (radius, length)
 
 
+def map_dimensions(function: Callable[[float], float], primitive: Primitive) -> Primitive:
+    """Return the primitive whose ``dimensions`` are those of another one after a function."""
+    sizes = tuple(map(function, dimensions(primitive)))
+    if isinstance(primitive, Box):
+        x, y, z = sizes
+        return Box((x, y, z))
+    return type(primitive)(*sizes)
+
+
 def scale_shape(shape: Shape, factor: float) -> Shape:
     """Return the shape scaled uniformly about the origin of its link's frame."""
     geometry: Geometry
-    match shape.geometry:
-        case Box(size):
-            geometry = Box(scale_vector(size, factor))
-        case Sphere(radius):
-            geometry = Sphere(factor * radius)
-        case Cylinder(radius, length):
-            geometry = Cylinder(factor * radius, factor * length)
-        case Capsule(radius, length):
-            geometry = Capsule(factor * radius, factor * length)
-        case Mesh() as mesh:
-            geometry = replace(mesh, scale=scale_vector(mesh.scale, factor))
+    if isinstance(shape.geometry, Mesh):
+        geometry = replace(shape.geometry, scale=scale_vector(shape.geometry.scale, factor))
+    else:
+        geometry = map_dimensions(lambda size: factor * size, shape.geometry)
     return replace(shape, geometry=geometry, T_link_shape=scale_pose(shape.T_link_shape, factor))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import tool_reach
 from morphgen.errors import TaskError
-from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.inverse_kinematics import solve_position_ik
 from morphgen.model.kinematics import (

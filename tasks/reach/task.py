@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import shoulder
 from morphgen.errors import TaskError
-from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from morphgen.errors import SimulationError
-from morphgen.formats.mujoco_warnings import MujocoWarnings
+from morphgen.formats.quiet import MujocoWarnings
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import (

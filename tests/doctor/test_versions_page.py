@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from morphgen.benchmark import release_file, split, split_folder
-from morphgen.formats import card
+from morphgen.formats import bundle
 from morphgen.grammar.robot_set import SetConfig
 from morphgen.rl.runs import checkpoint as runs
 from morphgen.rl.runs import drawn_robots
@@ -18,7 +18,7 @@ FORMATS = {
     "NAME.yaml": split.FORMAT,
     "build.json": split_folder.FORMAT,
     "goals/index.json": split_goals.FORMAT,
-    "card.json": card.CARD_FORMAT,
+    "card.json": bundle.CARD_FORMAT,
     "set.json": SetConfig(Path(), "", "", 0, (), False, False, ()).settings()["format"],
     runs.CONFIG: READABLE,
     runs.CHECKPOINT: READABLE,

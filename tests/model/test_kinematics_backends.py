@@ -10,7 +10,7 @@ import torch
 import morphgen
 from helpers.kinematic_backends import BACKENDS, TorchBackend, backend
 from helpers.robots import arm
-from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.model import kinematics_torch
 from morphgen.model.geometry import Pose
@@ -79,12 +79,13 @@ def drawn(index, n=8):
 
 def test_link_poses_agree_with_mujoco(kinematics, index):
     robot, q = ROBOTS[index], drawn(index)
-    expected = MujocoKinematics(robot)
+    frames = tuple(Frame(f"at_{link.name}", link.name) for link in robot.links)
+    expected = MujocoKinematics(replace(robot, frames=frames))
     T_root_link = kinematics.link_poses(index, q)
     assert T_root_link.shape == (len(q), len(robot.links), 4, 4)
-    for i, link in enumerate(robot.links):
+    for i, frame in enumerate(frames):
         np.testing.assert_allclose(
-            T_root_link[:, i], expected.link_pose(q, link.name), atol=kinematics.tolerance
+            T_root_link[:, i], expected.frame_pose(q, frame.name), atol=kinematics.tolerance
         )
 
 

@@ -21,7 +21,7 @@ from trimesh.exchange.stl import export_stl
 from morphgen.errors import FormatError
 from morphgen.formats.files import write_cache_file
 from morphgen.formats.mjcf.document import GEOM_TYPES, MjcfDocument, listed
-from morphgen.formats.mujoco_warnings import MujocoWarnings
+from morphgen.formats.quiet import MujocoWarnings
 from morphgen.formats.urdf.schema import MAX_LINKS, MAX_NUMBER, MAX_SHAPES, MAX_TEXT
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import mujoco
@@ -17,7 +18,7 @@ from morphgen.model.dynamics import Actuation, actuation, armature
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.mesh import convex_hull, load_mesh
-from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.model.tree import take_name
 from morphgen.typing import Array
 
@@ -346,3 +347,32 @@ def _limits(joint: Joint) -> str | None:
             "needs lower < upper, or make the joint fixed"
         )
     return join(joint.limits)
+
+
+class MujocoKinematics:
+    """The kinematic tree of a robot in MuJoCo, to verify ``morphgen.model.kinematics``.
+
+    Attributes:
+        model: The compiled model; bodies have the names of links, sites those of frames.
+        data: The state of the model at the last configuration.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Compile a robot."""
+        bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
+        self._robot = robot
+        self.model = to_spec(robot.with_links(bare)).compile()
+        self.data = mujoco.MjData(self.model)
+        names = (robot.joints[k].name for k in robot.movable_joints)
+        self._address = [self.model.joint(name).qposadr[0] for name in names]
+
+    def frame_pose(self, q: Array, frame: str = TOOL) -> Array:
+        """Return ``T_root_frame`` at configurations (n, dof), shape (n, 4, 4)."""
+        site = self.data.site(frame)
+        T = np.tile(np.eye(4), (len(q), 1, 1))
+        for T_root_frame, positions in zip(T, movable_positions(self._robot, q), strict=True):
+            self.data.qpos[self._address] = positions
+            mujoco.mj_kinematics(self.model, self.data)
+            T_root_frame[:3, :3] = site.xmat.reshape(3, 3)
+            T_root_frame[:3, 3] = site.xpos
+        return T
