@@ -35,3 +35,9 @@ class Finding:
         data = asdict(self)
         del data["repair"]
         return {**data, "fixable": self.fixable}
+
+
+def left_out(code: str, where: str, what: str) -> Finding:
+    """Return a finding about content that a robot cannot hold, and that nobody has to change."""
+    why, repair = f"a robot has no place for {what}", f"left out: {what}"
+    return Finding(code, "info", where, why, "none is needed", repair)

@@ -14,10 +14,10 @@ from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolve_uri
 from morphgen.formats.urdf.read import UnsoundError
-from morphgen.formats.urdf.schema import MAX_LINKS
+from morphgen.formats.urdf.schema import MAX_LINKS, counted_elements
 from morphgen.formats.xacro.evaluator import RefusedError
 from morphgen.formats.xml import parse_description
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, left_out
 
 MAX_MJCF_BYTES = 8 * 2**20
 """Largest MJCF that is read, with all its includes [bytes]."""
@@ -265,28 +265,13 @@ def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
                 elements.setdefault((tag, str(child.tag)), []).append(child)
         todo += reversed([child for child in element if child.tag not in skipped])
     for (tag, name), children in elements.items():
-        inside = sum(sum(1 for _ in child.iterdescendants()) for child in children)
-        what = f"{len(children)} <{name}> of <{tag}>" + (
-            f" with {inside} elements inside" if inside else ""
-        )
-        yield _left_out("element-unread", f"{path}:{children[0].sourceline}", what)
+        what = counted_elements(children, name, tag)
+        yield left_out("element-unread", f"{path}:{children[0].sourceline}", what)
     for tag, places in attributes.items():
         counts = Counter(name for _, name in places)
         what = ", ".join(f"{n} {name}=..." for name, n in sorted(counts.items()))
-        yield _left_out(
-            "attribute-unread", f"{path}:{places[0][0].sourceline}", f"{what} of <{tag}>"
-        )
-
-
-def _left_out(code: str, where: str, what: str) -> Finding:
-    return Finding(
-        code,
-        "info",
-        where,
-        f"a robot has no place for {what}",
-        "none is needed",
-        f"left out: {what}",
-    )
+        where = f"{path}:{places[0][0].sourceline}"
+        yield left_out("attribute-unread", where, f"{what} of <{tag}>")
 
 
 def _require_plain(root: etree._Element, path: Path) -> None:

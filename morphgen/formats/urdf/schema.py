@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lxml import etree
 
 from morphgen.errors import nearest, shortened
 from morphgen.formats.urdf.write import MUJOCO_BOUNDS
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, left_out
 from morphgen.model.robot import JOINT_KINDS
 
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -25,28 +25,18 @@ MAX_TEXT = 1000
 """Longest name or file name in a URDF [characters]."""
 
 
-@dataclass(frozen=True)
-class UrdfLocation:
-    """The file, and the link, joint or robot in it, that findings about an element name."""
+def _finding(
+    element: etree._Element, code: str, why: str, fix: str, repair: str = "", owner: str = ""
+) -> Finding:
+    """Return a finding at an element's line: a warning if reading repairs it, else an error.
 
-    origin: str
-    """Name of the file."""
-    owner: str
-    """Tag and name of the top-level element that contains the element, such as ``link 'base'``."""
-
-    @classmethod
-    def of(cls, element: etree._Element, origin: str) -> UrdfLocation:
-        """Return the location named after a link, joint or other top-level element."""
-        name = element.get("name")
-        owner = f"{element.tag} {shortened(name)!r}" if name else f"{element.tag} without a name"
-        return cls(origin, owner)
-
-    def finding(
-        self, element: etree._Element, code: str, why: str, fix: str, repair: str = ""
-    ) -> Finding:
-        """Return a finding at an element's line: a warning if reading repairs it, else an error."""
-        where = f"{self.origin}:{element.sourceline} {self.owner}"
-        return Finding(code, "warning" if repair else "error", where, why, fix, repair)
+    It names the link, joint or other top-level element that contains the element.
+    """
+    top = [element, *element.iterancestors()][-2:][0]
+    name = top.get("name")
+    owner = owner or (f"{top.tag} {shortened(name)!r}" if name else f"{top.tag} without a name")
+    where = f":{element.sourceline} {owner}"
+    return Finding(code, "warning" if repair else "error", where, why, fix, repair)
 
 
 @dataclass(frozen=True)
@@ -177,82 +167,72 @@ _EXTENSIONS = (
 """Names that robot software knows and that a robot has no place for; others may be slips."""
 
 
-def unread_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
+def unread_findings(root: etree._Element) -> Iterator[Finding]:
     """Yield a finding for each kind of attribute, element and text that is not read.
 
     Each has its count and first place. Names that no robot software is known to have are warnings
     with the nearest name that is read; known extensions are for information.
     """
-    unread: dict[tuple[str, str, str], list[tuple[etree._Element, UrdfLocation]]] = {}
-    here = UrdfLocation.of(root, origin)
-    todo = [(root, here)]
+    unread: dict[tuple[str, str, str], list[etree._Element]] = {}
+    todo = [root]
     while todo:
-        element, location = todo.pop()
+        element = todo.pop()
         tag = str(element.tag)
         for name in map(str, element.attrib):
             if name not in _ATTRIBUTES.get(tag, ()):
-                unread.setdefault((tag, "attribute", name), []).append((element, location))
-        texts = [element.text, *(child.tail for child in element)]
-        if any(text and text.strip() for text in texts):
-            unread.setdefault((tag, "text", ""), []).append((element, location))
-        deeper = []
-        for child in element:
-            name = str(child.tag)
-            inside = UrdfLocation.of(child, origin) if element is root else location
-            if name in _READ_CHILDREN.get(tag, ()):
-                deeper.append((child, inside))
-            elif tag != "geometry":  # a finding of its own
-                unread.setdefault((tag, "element", name), []).append((child, inside))
+                unread.setdefault((tag, "attribute", name), []).append(element)
+        if any(text and text.strip() for text in (element.text, *(c.tail for c in element))):
+            unread.setdefault((tag, "text", ""), []).append(element)
+        deeper = [child for child in element if child.tag in _READ_CHILDREN.get(tag, ())]
+        for child in element if tag != "geometry" else ():  # which has a finding of its own
+            if child not in deeper:
+                unread.setdefault((tag, "element", str(child.tag)), []).append(child)
         todo += reversed(deeper)
     for (tag, kind, name), found in unread.items():
         yield _unread_finding(tag, kind, name, found)
 
 
-def _unread_finding(
-    tag: str, kind: str, name: str, found: list[tuple[etree._Element, UrdfLocation]]
-) -> Finding:
-    first, location = found[0]
-    local = etree.QName(name).localname if name else ""
+def _unread_finding(tag: str, kind: str, name: str, found: list[etree._Element]) -> Finding:
+    first, local = found[0], etree.QName(name).localname if name else ""
+    valid: tuple[str, ...] = ()
+    what = f"{len(found)} text of <{tag}>"
     if kind == "element":
         prefix = f"{first.prefix}:" if first.prefix else ""
-        inside = sum(sum(1 for _ in element.iterdescendants()) for element, _ in found)
-        what = f"{len(found)} <{prefix}{local}> of <{tag}>" + (
-            f" with {inside} elements inside" if inside else ""
-        )
-        valid = _READ_CHILDREN.get(tag, ())
+        what, valid = counted_elements(found, f"{prefix}{local}", tag), _READ_CHILDREN.get(tag, ())
     elif kind == "attribute":
         prefixes = {namespace: prefix for prefix, namespace in first.nsmap.items()}
         prefix = f"{prefixes.get(etree.QName(name).namespace)}:" if local != name else ""
         what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _ATTRIBUTES.get(tag, ())
-    else:
-        what, valid = f"{len(found)} text of <{tag}>", ()
-    is_known = name in _EXTENSIONS.split() or local != name
+    code, where = f"{kind}-unread", _finding(first, "", "", "").where
+    if name in _EXTENSIONS.split() or local != name:
+        return left_out(code, where, what)
     hint = nearest(shortened(name), valid) if valid else ""
     guess = f"{hint.partition('?')[0]}?" if "?" in hint else ""
-    return Finding(
-        f"{kind}-unread",
-        "info" if is_known else "warning",
-        f"{location.origin}:{first.sourceline} {location.owner}",
-        f"a robot has no place for {what}" if is_known else f"{what}: not of URDF{hint}",
-        "none is needed" if is_known else "correct the name, or remove it",
-        f"left out: {what}" + (f", not of URDF{guess}" if not is_known else ""),
-    )
+    fix, repair = "correct the name, or remove it", f"left out: {what}, not of URDF{guess}"
+    return Finding(code, "warning", where, f"{what}: not of URDF{hint}", fix, repair)
 
 
-def content_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+def counted_elements(elements: Sequence[etree._Element], name: str, parent: str) -> str:
+    """Return the number of elements of a name in others, and of what is inside of them."""
+    inside = sum(1 for element in elements for _ in element.iterdescendants())
+    more = f" with {inside} elements inside" if inside else ""
+    return f"{len(elements)} <{name}> of <{parent}>{more}"
+
+
+def content_findings(element: etree._Element) -> Iterator[Finding]:
     """Check an element and everything that is read inside it."""
     tag = element.tag
-    yield from _text_findings(element, location)
+    yield from _text_findings(element)
     for numbers in _NUMBERS.get(tag, ()):
-        yield from _number_findings(element, numbers, location)
-    yield from _missing_findings(element, location)
-    yield from _alternative_findings(element, location)
+        yield from _number_findings(element, numbers)
+    yield from _missing_findings(element)
+    yield from _alternative_findings(element)
     if tag == "geometry":
-        yield from _geometry_findings(element, location)
+        yield from _geometry_findings(element)
     for name in CHILDREN.get(tag, ()):
         children = element.findall(name)
         if len(children) > 1 and name not in _REPEATABLE:
-            yield location.finding(
+            yield _finding(
                 children[1],
                 "element-repeated",
                 f"<{tag}> has {len(children)} <{name}>; the first one counts",
@@ -260,15 +240,15 @@ def content_findings(element: etree._Element, location: UrdfLocation) -> Iterato
                 f"of {len(children)} <{name}> the first one was taken",
             )
         for child in children:
-            yield from content_findings(child, location)
+            yield from content_findings(child)
 
 
-def _text_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+def _text_findings(element: etree._Element) -> Iterator[Finding]:
     tag = element.tag
     for name in _REQUIRED_TEXT.get(tag, ()):
         value = element.get(name, "")
         if len(value) > MAX_TEXT or not value.isprintable():
-            yield location.finding(
+            yield _finding(
                 element,
                 "text-invalid",
                 f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
@@ -276,7 +256,7 @@ def _text_findings(element: etree._Element, location: UrdfLocation) -> Iterator[
                 "write a shorter text of printable characters",
             )
         if not value.strip():
-            yield location.finding(
+            yield _finding(
                 element,
                 "attribute-missing",
                 f"<{tag}> has no {name}",
@@ -284,11 +264,11 @@ def _text_findings(element: etree._Element, location: UrdfLocation) -> Iterator[
             )
 
 
-def _missing_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+def _missing_findings(element: etree._Element) -> Iterator[Finding]:
     tag = element.tag
     for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
         if element.find(name) is None:
-            yield location.finding(
+            yield _finding(
                 element,
                 "element-missing",
                 f"<{tag}> has no <{name}>",
@@ -297,11 +277,11 @@ def _missing_findings(element: etree._Element, location: UrdfLocation) -> Iterat
             )
 
 
-def _geometry_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
     kinds = CHILDREN["geometry"]
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
-        yield location.finding(
+        yield _finding(
             element,
             "geometry-missing",
             "<geometry> is empty",
@@ -312,7 +292,7 @@ def _geometry_findings(element: etree._Element, location: UrdfLocation) -> Itera
     known = [shape for shape in shapes if shape.tag in kinds]
     for shape in shapes:
         if shape not in known:
-            yield location.finding(
+            yield _finding(
                 shape,
                 "geometry-unknown",
                 f"<{shortened(shape.tag)}> is not a geometry of URDF",
@@ -320,7 +300,7 @@ def _geometry_findings(element: etree._Element, location: UrdfLocation) -> Itera
                 f"the geometry <{shortened(shape.tag)}> was left out",
             )
     if len(known) > 1:
-        yield location.finding(
+        yield _finding(
             known[1],
             "element-repeated",
             f"<geometry> holds {len(known)} shapes; the first one counts",
@@ -329,14 +309,12 @@ def _geometry_findings(element: etree._Element, location: UrdfLocation) -> Itera
         )
 
 
-def _number_findings(
-    element: etree._Element, numbers: Numbers, location: UrdfLocation
-) -> Iterator[Finding]:
+def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Finding]:
     name = numbers.attribute
     text = element.get(name)
     if text is None:
         if numbers.required:
-            yield location.finding(
+            yield _finding(
                 element,
                 "attribute-missing",
                 f"<{element.tag}> has no {name}{_others(element)}",
@@ -349,7 +327,7 @@ def _number_findings(
     words = text.replace(",", " ").split() if vector else text.split()
     wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
-        yield location.finding(
+        yield _finding(
             element,
             "number-malformed",
             f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number",
@@ -358,7 +336,7 @@ def _number_findings(
         return
     if len(words) not in numbers.counts:
         surplus = numbers.accepts_surplus and len(words) > max(numbers.counts)
-        yield location.finding(
+        yield _finding(
             element,
             "number-count",
             f"{shown} holds {len(words)} numbers",
@@ -369,7 +347,7 @@ def _number_findings(
             return
         words = words[: max(numbers.counts)]
     if "," in text:
-        yield location.finding(
+        yield _finding(
             element,
             "number-commas",
             f"{shown} separates numbers by commas, which MuJoCo refuses",
@@ -378,14 +356,14 @@ def _number_findings(
         )
     values = [float(word) for word in words]
     if max(map(abs, values)) > MAX_NUMBER or (numbers.positive and 0 < min(values) < MIN_LENGTH):
-        yield location.finding(
+        yield _finding(
             element,
             "number-absurd",
             f"{shown} is out of range",
             f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units",
         )
     if numbers.positive and min(values) <= 0:
-        yield location.finding(
+        yield _finding(
             element,
             "size-not-positive",
             f"{shown} is not positive",
@@ -393,7 +371,7 @@ def _number_findings(
             f"the shape {shown} was left out" if min(values) == 0 else "",
         )
     if numbers.nonzero and 0.0 in values:
-        yield location.finding(
+        yield _finding(
             element,
             "mesh-scale-invalid",
             f"{shown} flattens the mesh",
@@ -401,14 +379,14 @@ def _number_findings(
         )
 
 
-def _alternative_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
+def _alternative_findings(element: etree._Element) -> Iterator[Finding]:
     """Check attributes of which an element has either one or the other."""
     quaternion = element.get("quat_xyzw", "1").split()
     if element.tag == "origin" and (
         (element.get("rpy") and element.get("quat_xyzw"))
         or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
     ):
-        yield location.finding(
+        yield _finding(
             element,
             "rotation-invalid",
             "its quat_xyzw is zero, or beside rpy",
@@ -420,7 +398,7 @@ def _alternative_findings(element: etree._Element, location: UrdfLocation) -> It
         and not element.get("length")
         and (not ends or ends[:3] == ends[3:])
     ):
-        yield location.finding(
+        yield _finding(
             element,
             "attribute-missing",
             f"<capsule> has no length{_others(element)}, and no two end points as fromto",
@@ -456,29 +434,34 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     Returns:
         Findings in the order of detection. A document without errors can be converted.
     """
+    return tuple(replace(f, where=f"{origin}{f.where}") for f in _document_findings(root))
+
+
+def _document_findings(root: etree._Element) -> list[Finding]:
     if root.tag != "robot":
-        return (_wrong_root(root, origin),)
-    large = tuple(_size_findings(root, origin))
-    if large:
+        return [_wrong_root(root)]
+    if large := [*_size_findings(root)]:
         return large
-    findings = [*_first(_robot_findings(root, origin)), *unread_findings(root, origin)]
+    findings = [*_first(_robot_findings(root)), *unread_findings(root)]
     unexpanded = _first_xacro(root)
     if unexpanded is None:
-        return tuple(findings)
+        return findings
     # Loaders ignore an unexpanded xacro call, so alone it is a warning. Next to other errors it is
     # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
-    xacro_finding = UrdfLocation.of(root, origin).finding(
+    name = f"<xacro:{etree.QName(unexpanded).localname}>"
+    xacro_finding = _finding(
         unexpanded,
         "xacro-unexpanded",
-        f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
+        f"{name} is left in the document",
         "give the file the suffix .xacro, or expand it first",
-        "" if broken else f"<xacro:{etree.QName(unexpanded).localname}> was left out",
+        "" if broken else f"{name} was left out",
+        owner=f"robot {shortened(root.get('name', ''))!r}" if root.get("name") else "",
     )
-    return (xacro_finding,) if broken else (xacro_finding, *findings)
+    return [xacro_finding] if broken else [xacro_finding, *findings]
 
 
-def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
+def _size_findings(root: etree._Element) -> Iterator[Finding]:
     """Check the number of elements first: later checks would take too long on a huge document."""
     for tag, elements, max_count in (
         ("link", root.iterfind("link"), MAX_LINKS),
@@ -487,7 +470,7 @@ def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     ):
         count = sum(1 for _ in elements)
         if count > max_count:
-            yield UrdfLocation.of(root, origin).finding(
+            yield _finding(
                 root,
                 "robot-too-large",
                 f"it has {count} <{tag}> elements; at most {max_count} are read",
@@ -507,23 +490,21 @@ def _first(findings: Iterator[Finding]) -> list[Finding]:
     return kept
 
 
-def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
+def _robot_findings(root: etree._Element) -> Iterator[Finding]:
     links, joints = root.findall("link"), root.findall("joint")
-    yield from content_findings(root, UrdfLocation.of(root, origin))
+    yield from content_findings(root)
     if not links:
-        yield UrdfLocation.of(root, origin).finding(
-            root, "link-missing", "<robot> has no <link>", "add at least one link"
-        )
-    yield from _duplicates(links, origin)
-    yield from _duplicates(joints, origin)
-    yield from _tree(links, joints, origin)
-    yield from _kinds(root, origin)
-    yield from _mimics(joints, origin)
+        yield _finding(root, "link-missing", "<robot> has no <link>", "add at least one link")
+    yield from _duplicates(links)
+    yield from _duplicates(joints)
+    yield from _tree(links, joints)
+    yield from _kinds(root)
+    yield from _mimics(joints)
     for element in [*links, *joints, *root.findall("material")]:
-        yield from content_findings(element, UrdfLocation.of(element, origin))
+        yield from content_findings(element)
 
 
-def _wrong_root(root: etree._Element, origin: str) -> Finding:
+def _wrong_root(root: etree._Element) -> Finding:
     name = etree.QName(root)
     fix = "give a URDF or xacro, whose root element is <robot>, or an MJCF, whose is <mujoco>"
     tag = f"{root.prefix}:{name.localname}" if root.prefix else name.localname
@@ -533,7 +514,7 @@ def _wrong_root(root: etree._Element, origin: str) -> Finding:
     elif name.localname == "robot":
         why = f"the root element <robot> is in the namespace {shortened(str(name.namespace))!r}"
         fix = "remove xmlns=... from it"
-    return UrdfLocation(origin, f"<{tag}>").finding(root, "root-not-robot", why, fix)
+    return _finding(root, "root-not-robot", why, fix, owner=f"<{tag}>")
 
 
 def _first_xacro(root: etree._Element) -> etree._Element | None:
@@ -544,12 +525,12 @@ def _first_xacro(root: etree._Element) -> etree._Element | None:
     return None
 
 
-def _duplicates(elements: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+def _duplicates(elements: Sequence[etree._Element]) -> Iterator[Finding]:
     first: dict[str, etree._Element] = {}
     for element in elements:
         name = element.get("name")
         if name in first:
-            yield UrdfLocation.of(element, origin).finding(
+            yield _finding(
                 element,
                 f"{element.tag}-duplicate",
                 f"the name is taken by the {element.tag} on line {first[name].sourceline}",
@@ -567,19 +548,16 @@ def _ends(joint: etree._Element) -> tuple[str | None, str | None]:
     )
 
 
-def _tree(
-    links: Sequence[etree._Element], joints: Sequence[etree._Element], origin: str
-) -> Iterator[Finding]:
+def _tree(links: Sequence[etree._Element], joints: Sequence[etree._Element]) -> Iterator[Finding]:
     by_name = {name: link for link in links if (name := link.get("name"))}
     parent_of: dict[str, str] = {}
     joint_above: dict[str, etree._Element] = {}
     """Joint whose child a link is, by the link's name."""
     for joint in joints:
-        location = UrdfLocation.of(joint, origin)
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
-                yield location.finding(
+                yield _finding(
                     joint,
                     "joint-link-unknown",
                     f"its {role} {name!r} is not a link",
@@ -588,7 +566,7 @@ def _tree(
         if not child or child not in by_name:
             continue
         if child in joint_above:
-            yield location.finding(
+            yield _finding(
                 joint,
                 "link-two-parents",
                 f"link {child!r} is already the child of joint {joint_above[child].get('name')!r} "
@@ -600,7 +578,7 @@ def _tree(
         if parent in by_name:
             parent_of[child] = parent
     for cycle in _cycles(parent_of):
-        yield UrdfLocation.of(joint_above[cycle[0]], origin).finding(
+        yield _finding(
             joint_above[cycle[0]],
             "cycle",
             "links form a loop: " + " -> ".join([*cycle, cycle[0]]),
@@ -608,7 +586,7 @@ def _tree(
         )
     roots = [name for name in by_name if name not in joint_above]
     for name in roots[1:]:
-        yield UrdfLocation.of(by_name[name], origin).finding(
+        yield _finding(
             by_name[name],
             "disconnected",
             f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root",
@@ -664,7 +642,7 @@ def above_free_base(root: etree._Element) -> list[etree._Element]:
     return [*outside, *links]
 
 
-def _kinds(root: etree._Element, origin: str) -> Iterator[Finding]:
+def _kinds(root: etree._Element) -> Iterator[Finding]:
     left_out = above_free_base(root)
     for joint in root.iterfind("joint"):
         kind = joint.get("type")
@@ -672,7 +650,7 @@ def _kinds(root: etree._Element, origin: str) -> Iterator[Finding]:
             links = [element for element in left_out if element.tag == "link"]
             names = ", ".join(repr(link.get("name")) for link in links[:5])
             shapes = sum(1 for link in links for _ in link.iterchildren("visual", "collision"))
-            yield UrdfLocation.of(joint, origin).finding(
+            yield _finding(
                 joint,
                 "base-free",
                 f"it is {kind} and lets the whole robot move; the base of a robot is fixed",
@@ -681,14 +659,14 @@ def _kinds(root: etree._Element, origin: str) -> Iterator[Finding]:
                 f"{shapes} shapes, {names}, were left out",
             )
         elif kind in _REPLACEMENT:
-            yield UrdfLocation.of(joint, origin).finding(
+            yield _finding(
                 joint,
                 "joint-type-unsupported",
                 f"joints of type {kind!r} are not supported",
                 _REPLACEMENT[kind],
             )
         elif kind and kind not in JOINT_KINDS:
-            yield UrdfLocation.of(joint, origin).finding(
+            yield _finding(
                 joint,
                 "joint-type-unknown",
                 f"{kind!r} is not a joint type",
@@ -696,7 +674,7 @@ def _kinds(root: etree._Element, origin: str) -> Iterator[Finding]:
             )
 
 
-def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+def _mimics(joints: Sequence[etree._Element]) -> Iterator[Finding]:
     by_name = {name: joint for joint in joints if (name := joint.get("name"))}
     leader_of: dict[str, str] = {}
     for name, joint in by_name.items():
@@ -707,7 +685,7 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
         if leader in by_name:
             leader_of[name] = leader
         else:
-            yield UrdfLocation.of(joint, origin).finding(
+            yield _finding(
                 mimic,
                 "mimic-unknown",
                 f"it mimics {leader!r}, which is not a joint",
@@ -716,7 +694,7 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
                 "it moves independently",
             )
     for cycle in _cycles(leader_of):
-        yield UrdfLocation.of(by_name[cycle[0]], origin).finding(
+        yield _finding(
             by_name[cycle[0]],
             "mimic-cycle",
             "joints mimic each other: " + " -> ".join([*cycle, cycle[0]]),
