@@ -17,17 +17,19 @@ import torch
 
 from morphgen.benchmark.tokens import GEOMETRY, SHAPE_POSE
 from morphgen.errors import TaskError
-from morphgen.model.inverse_kinematics_torch import dls_step, pose_task, solve_from_starts
 from morphgen.model.kinematics_torch import (
     FrameChain,
     compile_tree,
+    dls_step,
     forward_kinematics,
     frame_jacobian,
     frame_pose,
     joint_axes,
     matrix_from_quaternion,
+    pose_task,
     rotation_from_z,
     rotvec_from_matrix,
+    solve_from_starts,
 )
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.typing import Array

@@ -172,7 +172,6 @@ def test_pybullet_processes_load_few_packages():
         "benchmark.split_build",
         "fitting.token_shapes",
         "model.kinematics",
-        "model.inverse_kinematics",
         "tasks.scenes.env_specs",
     ],
 )

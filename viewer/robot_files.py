@@ -23,8 +23,8 @@ from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import framed_height, render
 from morphgen.formats.zip_files import write_entries
 from morphgen.grammar.robot_source import is_robot_folder
-from morphgen.model.mesh_pieces import read_picture
 from morphgen.model.robot import Robot
+from morphgen.model.scene_files import read_picture
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.robot_tables import has_tool

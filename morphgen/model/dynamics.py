@@ -62,12 +62,9 @@ class Actuation:
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Return the joint-space inertia of the independent joints at one configuration.
+    """Return the joint-space inertia at one configuration (dof,), symmetric, shape (dof, dof).
 
-    q: Independent joint positions, shape (dof,) [rad or m].
-
-    Returns:
-        Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
+    Mimic joints are folded into their leaders.
     """
     matrix, _ = robot.mimic_map
     return np.asarray(matrix.T @ movable_mass_matrix(robot, q) @ matrix)
@@ -76,12 +73,8 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 def movable_mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Return the joint-space inertia as if mimic joints were free, the sum of J^T I J over links.
 
-    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1.
-
-    q: Independent joint positions, shape (dof,) [rad or m].
-
-    Returns:
-        Symmetric matrix, shape (n_movable, n_movable).
+    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1. The matrix is
+    symmetric, shape (n_movable, n_movable).
     """
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
     J_root_link = link_jacobians(robot, T_root_link)
@@ -101,12 +94,8 @@ def movable_mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 def gravity_load(robot: Robot, q: ArrayLike) -> Array:
     """Return the forces that hold the weight of an upright robot, the sum of J^T m g over links.
 
-    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.3.
-
-    q: Independent joint positions, shape (dof,) [rad or m].
-
-    Returns:
-        Force of every movable joint, shape (n_movable,) [N m or N]; mimic joints have their own.
+    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.3. Every movable
+    joint has a force, mimic joints their own, shape (n_movable,) [N m or N].
     """
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
     J_root_link = link_jacobians(robot, T_root_link)
@@ -120,10 +109,9 @@ def gravity_load(robot: Robot, q: ArrayLike) -> Array:
 
 
 def armature(robot: Robot) -> Array:
-    """Return the inertia that motors and linkages add to joints; see ``actuation``.
+    """Return the inertia that motors and linkages add to joints, (n_movable,) [kg m^2 or kg].
 
-    Returns:
-        Array of shape (n_movable,) [kg m^2 or kg].
+    See ``actuation``.
     """
     return _inertias(robot)[1]
 
@@ -139,7 +127,6 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
     """
     inertias, armatures = _inertias(robot)
     joints = [robot.joints[k] for k in robot.independent_joints]
-    rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
     return tuple(
         Actuation(
             joint.name,
@@ -150,7 +137,7 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
             velocity=joint.velocity,
         )
         for joint, value, added in zip(
-            joints, inertias.tolist(), armatures[rows].tolist(), strict=True
+            joints, inertias.tolist(), armatures[robot.independent_rows].tolist(), strict=True
         )
     )
 
@@ -160,7 +147,7 @@ def _inertias(robot: Robot) -> tuple[Array, Array]:
     matrix, _ = robot.mimic_map
     of_movable = movable_mass_matrix(robot, robot.home)
     carried = np.diag(of_movable)
-    rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
+    rows = robot.independent_rows
     follows = matrix**2
     follows[rows] = 0
     armatures = COUPLED_INERTIA * carried

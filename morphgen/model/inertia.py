@@ -69,13 +69,8 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     """Return the mass properties of solid shapes with uniform density, overlaps counted once.
 
     Primitives use closed forms. A closed mesh counts as its volume, an open one as its convex hull.
-    The overlap of shapes is measured on their tessellations by exact booleans.
-
-    shapes: The solids, at their poses on the link.
-    density: Density [kg/m^3].
-
-    Returns:
-        Mass, centre of mass and inertia; zero mass if there are no shapes.
+    The overlap of shapes is measured on their tessellations by exact booleans. The density is in
+    kg/m^3; without shapes the mass is zero.
     """
     integrals = union_integrals(shapes)
     if integrals.volume <= 0:
@@ -167,11 +162,7 @@ def bounding_box(shapes: Sequence[Shape]) -> Array:
 
 
 def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
-    """Return the corners of an axis-aligned box, shape (8, 3) [m].
-
-    low: Lowest corner, shape (3,) [m].
-    high: Highest corner, shape (3,) [m].
-    """
+    """Return the corners (8, 3) of an axis-aligned box from its lowest and highest ones (3,) [m]."""
     sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
     return np.array(np.meshgrid(*sides)).reshape(3, -1).T
 

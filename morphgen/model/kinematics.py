@@ -1,7 +1,8 @@
-"""Kinematics of one robot in NumPy: poses, joint axes, Jacobians and reach, in batches.
+"""Kinematics of one robot in NumPy: poses, Jacobians, reach, and inverse kinematics, in batches.
 
 ``morphgen.model.kinematics_torch`` has the same for many robots in one batch of tensors. Joint
-positions ``q`` have shape (..., dof) [rad or m]; poses are homogeneous matrices.
+positions ``q`` are those of the independent joints, shape (..., dof) [rad or m]; poses are
+homogeneous matrices.
 """
 
 from __future__ import annotations
@@ -75,10 +76,7 @@ def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:
     """Return the positions of all movable joints, mimic joints following their leaders.
 
-    q: Independent joint positions, shape (..., dof).
-
-    Returns:
-        Positions in the order of ``robot.movable_joints``, shape (..., n_movable) [rad or m].
+    They are in the order of ``robot.movable_joints``, shape (..., n_movable) [rad or m].
     """
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (robot.dof,):
@@ -88,13 +86,7 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
 
 
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
-    """Return the pose of every link in the root frame.
-
-    q: Independent joint positions, shape (..., dof).
-
-    Returns:
-        ``T_root_link``, shape (..., n_links, 4, 4).
-    """
+    """Return ``T_root_link``, the pose of every link in the root frame, (..., n_links, 4, 4)."""
     positions = movable_positions(robot, q)
     batch = positions.shape[:-1]
     T_root_link = np.empty((*batch, len(robot.links), 4, 4))
@@ -116,13 +108,9 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = TOOL) -> Array:
 
 
 def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
-    """Return a point and the direction of each link's joint axis, in the root frame.
+    """Return a point [m] and the direction of each link's joint axis in the root frame.
 
-    T_root_link: Poses of all links, shape (..., n_links, 4, 4).
-
-    Returns:
-        Points on the axes [m] and unit axes, both (..., n_links, 3); zeros for the root and for
-        links on fixed joints.
+    Both have shape (..., n_links, 3), with zeros for the root and for links on fixed joints.
     """
     anchors, axes = np.zeros((2, *T_root_link.shape[:-2], 3))
     for k in robot.movable_joints:
@@ -136,8 +124,6 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
     joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
-
-    q: Independent joint positions, shape (..., dof).
 
     Returns:
         ``T_root_frame``, shape (..., 4, 4), and ``J_root_frame``, shape (..., 6, dof): linear
@@ -187,8 +173,6 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
 
     Spatial: the linear velocity is that of the link's point that coincides with the root's origin
     (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 2.2).
-
-    T_root_link: Poses of all links, shape (..., n_links, 4, 4).
 
     Returns:
         ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity per unit
@@ -301,14 +285,9 @@ def _joint_motion(kind: str, axis: Vec3, position: Array) -> Array:
 
 
 def _joint_motions(slides: NDArray[np.bool_], axes: Array, positions: Array) -> Array:
-    """Return transforms of joints.
+    """Return transforms (..., k, 4, 4) of k joints, which are prismatic or not, (k,).
 
-    slides: Whether each of k joints is prismatic, shape (k,).
-    axes: Their unit axes, shape (k, 3).
-    positions: Their positions, shape (..., k) [rad or m].
-
-    Returns:
-        Shape (..., k, 4, 4).
+    Their unit axes have shape (k, 3), their positions (..., k) [rad or m].
     """
     T = np.zeros((*positions.shape, 4, 4))
     x, y, z = axes.T
@@ -369,13 +348,7 @@ def _displacement(joint: Joint, position: float) -> Pose:
 
 
 def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
-    """Return positions of a named frame in the root frame.
-
-    q: Independent joint positions, a row per joint, shape (dof, n).
-
-    Returns:
-        Positions, shape (3, n) [m].
-    """
+    """Return positions of a named frame in the root frame, (3, n) [m], at ``q`` (dof, n)."""
     points = np.zeros((3, q.shape[1]))
     joints, T_root_next = _aligned_joints(robot, frame)
     for joint in joints:
@@ -436,3 +409,106 @@ def _rows(T: Pose) -> tuple[float, ...]:
 def _transform(T: Pose, points: Array) -> Array:
     # einsum, because starting the threads of a matrix product costs more than it saves
     return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
+
+
+DAMPING = 0.02
+"""Damping of position tasks [m/rad or 1]; in ``solve_pose_ik`` it is relative to the largest
+singular value of the Jacobian."""
+MAX_STEP = 0.3
+"""Largest change of a joint position in one iteration [rad or m]."""
+POSE_ITERATIONS = 24
+"""Maximum number of iterations of ``solve_pose_ik``, which runs while the user drags a gizmo."""
+POSE_TOLERANCE = 1e-5
+"""Weighted pose error at which ``solve_pose_ik`` stops [m]."""
+
+
+def dls_step(J: Array, error: Array, damping: float) -> Array:
+    """Return the damped least-squares step, J^T (J J^T + damping^2 I)^-1 error.
+
+    Wampler, Manipulator inverse kinematic solutions based on vector formulations and damped
+    least-squares methods, 1986. Jacobians J (..., m, dof), errors (..., m); steps (..., dof).
+    """
+    J_T = J.swapaxes(-1, -2)
+    regularized = J @ J_T + damping**2 * np.eye(J.shape[-2])
+    return np.asarray((J_T @ np.linalg.solve(regularized, error[..., None]))[..., 0])
+
+
+def solve_position_ik(
+    robot: Robot,
+    q: Array,
+    positions: Array,
+    *,
+    iterations: int = 25,
+    damping: float = DAMPING,
+    max_step: float = MAX_STEP,
+    tolerance: float = 0.0,
+) -> tuple[Array, Array]:
+    """Move tools to positions by damped least squares, within the joint limits.
+
+    q: Initial configurations, shape (n, dof) [rad or m].
+    positions: Goal positions of the tools in the root frame, shape (n, 3) [m].
+    max_step: Largest change of a joint position in one iteration [rad or m].
+    tolerance: Distance at which a tool has arrived and its row iterates no more [m].
+
+    Returns:
+        Configurations, shape (n, dof), and the remaining position errors, shape (n, 3) [m].
+    """
+    low, high = joint_limits(robot).T
+    q = np.clip(q, low, high)
+    rows = np.arange(len(q))
+    for _ in range(iterations):
+        T_root_tool, J_root_tool = frame_jacobian(robot, q[rows])
+        error = positions[rows] - T_root_tool[:, :3, 3]
+        if tolerance:
+            away = np.linalg.norm(error, axis=1) > tolerance
+            rows, error, J_root_tool = rows[away], error[away], J_root_tool[away]
+        step = dls_step(J_root_tool[:, :3], error, damping)
+        q[rows] = np.clip(q[rows] + np.clip(step, -max_step, max_step), low, high)
+    return q, positions - frame_pose(robot, q)[:, :3, 3]
+
+
+def solve_pose_ik(
+    robot: Robot,
+    T_root_goal: Array,
+    q: ArrayLike,
+    *,
+    rotation_weight: float = 0.2,
+    frame: str = TOOL,
+) -> Array:
+    """Move a frame to a pose, or as near as possible, by damped least squares.
+
+    Joints at a limit that a step would move beyond it are excluded from the step.
+
+    T_root_goal: Goal pose of the frame in the root frame, shape (4, 4).
+    q: Initial configuration, shape (dof,) [rad or m].
+    rotation_weight: Weight of the rotation error [m/rad]; 0 leaves the orientation free.
+
+    Returns:
+        The best configuration found, shape (dof,), within the joint limits.
+    """
+    from scipy.spatial.transform import Rotation  # here, because it takes time to load
+
+    low, high = joint_limits(robot).T
+    current = best = np.clip(np.asarray(q, dtype=np.float64), low, high)
+    least = np.inf
+    weights = np.repeat([1.0, rotation_weight], 3)
+    for _ in range(POSE_ITERATIONS):
+        T_root_frame, J = frame_jacobian(robot, current, frame)
+        R_error = T_root_goal[:3, :3] @ T_root_frame[:3, :3].T
+        position_error = T_root_goal[:3, 3] - T_root_frame[:3, 3]
+        rotation_error = Rotation.from_matrix(R_error).as_rotvec()
+        error = np.concatenate([position_error, rotation_error]) * weights
+        norm = float(np.linalg.norm(error))
+        if norm < least:
+            best, least = current, norm
+        if norm < POSE_TOLERANCE:
+            break
+        direction = J.T @ error
+        blocked = ((current <= low) & (direction < 0)) | ((current >= high) & (direction > 0))
+        weighted = np.where(blocked, 0.0, J * weights[:, None])
+        damping = DAMPING * max(float(np.linalg.norm(weighted, 2)), 1e-9)
+        step = dls_step(weighted, error, damping)
+        # Scale all joints equally, so that the frame keeps its direction of motion.
+        scale = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-9))
+        current = np.clip(current + step * scale, low, high)
+    return best

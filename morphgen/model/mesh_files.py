@@ -21,17 +21,19 @@ from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
 from morphgen.model.geometry import MESH_SUFFIXES
-from morphgen.model.mesh_pieces import (
+from morphgen.model.scene_files import (
     MAX_SETS,
     UNREADABLE,
     FolderResolver,
     Piece,
     note_missing,
     parse_numbers,
+    read_dae,
+    read_glb,
+    read_gltf,
     require_faces,
     scene_pieces,
 )
-from morphgen.model.scene_files import read_dae, read_glb, read_gltf
 from morphgen.typing import Array
 
 MAX_HULL_VERTICES = 500_000

@@ -275,6 +275,11 @@ class Robot:
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_independent)
 
     @cached_property
+    def independent_rows(self) -> list[int]:
+        """Places of the independent joints among the movable ones, shape (dof,)."""
+        return [self.movable_joints.index(k) for k in self.independent_joints]
+
+    @cached_property
     def mimic_map(self) -> tuple[Array, Array]:
         """Matrix M (n_movable, dof) and offset b (n_movable,): movable positions are M q + b."""
         column = {self.joints[k].name: i for i, k in enumerate(self.independent_joints)}

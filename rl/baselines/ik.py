@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from morphgen.model.inverse_kinematics_torch import solve_from_starts
+from morphgen.model.kinematics_torch import solve_from_starts
 from morphgen.rl.baselines.path_planner import (
     Path,
     PathFollower,

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from morphgen.model.inverse_kinematics_torch import pose_task
-from morphgen.model.kinematics_torch import frame_jacobian
+from morphgen.model.kinematics_torch import frame_jacobian, pose_task
 from morphgen.rl.baselines.ik import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch

@@ -14,10 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.dynamics import actuation
-from morphgen.model.inverse_kinematics import MAX_STEP, solve_position_ik
-from morphgen.model.inverse_kinematics_torch import pose_ik_step
-from morphgen.model.kinematics import frame_jacobian, unwrap_joints
-from morphgen.model.kinematics_torch import frame_pose
+from morphgen.model.kinematics import MAX_STEP, frame_jacobian, solve_position_ik, unwrap_joints
+from morphgen.model.kinematics_torch import frame_pose, pose_ik_step
 from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner, Tree
 from morphgen.rl.baselines.push_contacts import PreContact, find_contacts, overhang, touches
 from morphgen.tasks.free_space import FreeSpace

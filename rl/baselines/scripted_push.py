@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from morphgen.model.inverse_kinematics_torch import pose_ik_step
-from morphgen.model.kinematics_torch import frame_positions
+from morphgen.model.kinematics_torch import frame_positions, pose_ik_step
 from morphgen.rl.baselines.path_planner import PathFollower, fractions_towards
 from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
 from morphgen.tasks.actions import encode_actions

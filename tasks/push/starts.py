@@ -15,12 +15,12 @@ from morphgen.benchmark.workspace import tool_reach
 from morphgen.errors import TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose
-from morphgen.model.inverse_kinematics import solve_position_ik
 from morphgen.model.kinematics import (
     forward_kinematics,
     frame_positions,
     joint_axes,
     random_configurations,
+    solve_position_ik,
 )
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace, outside_limits

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
-from morphgen.model.inverse_kinematics import solve_pose_ik, solve_position_ik
-from morphgen.model.kinematics import frame_pose
+from morphgen.model.kinematics import frame_pose, solve_pose_ik, solve_position_ik
 from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
 from morphgen.model.robot import TOOL
 from morphgen.tasks.free_space import FreeSpace

@@ -418,13 +418,11 @@ class BulletBatch:
                 leader = np.abs(matrix).argmax(axis=1)
                 source.extend((env * width + leader).tolist())
                 gain.extend(matrix[np.arange(len(matrix)), leader].tolist())
-                rows = [robot.movable_joints.index(k) for k in robot.independent_joints]
+                rows = robot.independent_rows
                 leaders.extend(start + row for row in np.array(rows)[leader].tolist())
             offset.extend(shift.tolist())
             fastest.extend(limited_speeds(robot))
-            independent.extend(
-                start + robot.movable_joints.index(k) for k in robot.independent_joints
-            )
+            independent.extend(start + row for row in robot.independent_rows)
             sink.extend(range(env * width, env * width + robot.dof))
         self._source = consecutive(np.array(source, np.intp))
         self._sink = consecutive(np.array(sink, np.intp))

@@ -154,9 +154,7 @@ class MotorForces:
             inertia, swing = inertias[id(robot)]
             self._pull[: robot.dof, start:end] = GAIN * inertia
             self._swing[: robot.dof, start:end] = GAIN * swing
-            self._row[: robot.dof, start:end] = [
-                [start + robot.movable_joints.index(k)] for k in robot.independent_joints
-            ]
+            self._row[: robot.dof, start:end] = [[start + row] for row in robot.independent_rows]
             farthest.extend(farthest_targets(robot, robot.movable_joints))
         self._farthest = np.array(farthest)
         self._has_mimic_joints = bool(self._swing.any())

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from morphgen.model import inverse_kinematics, inverse_kinematics_torch, kinematics
+from morphgen.model import kinematics, kinematics_torch
 from morphgen.model import kinematics_torch as batched
 from morphgen.model.kinematics import frame_positions, joint_limits
 
@@ -35,11 +35,11 @@ class NumpyBackend:
         return frame_positions(self.robots[index], q.T).T
 
     def dls_step(self, J, error, damping):
-        return inverse_kinematics.dls_step(J, error, damping)
+        return kinematics.dls_step(J, error, damping)
 
     def solve_position_ik(self, index, q, positions, **options):
         robot = self.robots[index]
-        return inverse_kinematics.solve_position_ik(robot, q, positions, **options)
+        return kinematics.solve_position_ik(robot, q, positions, **options)
 
 
 @dataclass
@@ -88,13 +88,13 @@ class TorchBackend:
 
     def dls_step(self, J, error, damping):
         tensors = (torch.from_numpy(each).to(self.dtype) for each in (J, error))
-        return inverse_kinematics_torch.dls_step(*tensors, damping).numpy()
+        return kinematics_torch.dls_step(*tensors, damping).numpy()
 
     def solve_position_ik(self, index, q, positions, **options):
         robot_index, padded = self.rows(index, q)
         goals = torch.from_numpy(positions).to(self.dtype)
         limits = self.limits(robot_index)
-        found, error = inverse_kinematics_torch.solve_position_ik(
+        found, error = kinematics_torch.solve_position_ik(
             self.chain, robot_index, padded, goals, limits, **options
         )
         return found[:, : q.shape[1]].double().numpy(), error.numpy()

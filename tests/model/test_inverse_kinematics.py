@@ -10,24 +10,26 @@ from scipy.spatial.transform import Rotation
 from helpers.kinematic_backends import BACKENDS, backend
 from helpers.robots import arm
 from helpers.scenes import robot
-from morphgen.model import inverse_kinematics
-from morphgen.model.inverse_kinematics import solve_pose_ik
-from morphgen.model.inverse_kinematics_torch import pose_ik_step, pose_task, solve_position_ik
-from morphgen.model.inverse_kinematics_torch import solve_pose_ik as solve_poses
 from morphgen.model.kinematics import (
     driving_joints,
     frame_pose,
     joint_limits,
     random_configurations,
+    solve_pose_ik,
 )
+from morphgen.model.kinematics import solve_position_ik as solve_one
 from morphgen.model.kinematics_torch import (
     angle_between,
     matrix_from_quaternion,
+    pose_ik_step,
+    pose_task,
     quaternion_from_matrix,
     rotvec_from_matrix,
+    solve_position_ik,
 )
 from morphgen.model.kinematics_torch import frame_jacobian as frame_jacobians
 from morphgen.model.kinematics_torch import frame_pose as frame_poses
+from morphgen.model.kinematics_torch import solve_pose_ik as solve_poses
 
 UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
     robot(words)
@@ -86,7 +88,7 @@ def test_position_ik_reports_the_error_of_unreachable_goals(kinematics):
 def test_position_ik_leaves_rows_that_have_arrived():
     q = random_configurations(PANDA, 20, np.random.default_rng(0))
     goals = frame_pose(PANDA, q)[:, :3, 3] + np.linspace(0, 0.1, 20)[:, None]
-    solve = inverse_kinematics.solve_position_ik
+    solve = solve_one
     loose, error = solve(PANDA, q, goals, tolerance=0.01)
     tight, _ = solve(PANDA, q, goals)
     near = np.linalg.norm(goals - frame_pose(PANDA, q)[:, :3, 3], axis=1) <= 0.01

@@ -20,7 +20,7 @@ from morphgen.checks import check
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh
 from morphgen.model.mesh_files import MeshContent, read_mesh_file
-from morphgen.model.mesh_pieces import MAX_PIXELS, read_picture
+from morphgen.model.scene_files import MAX_PIXELS, read_picture
 
 CORNERS = [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]

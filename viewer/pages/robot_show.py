@@ -17,7 +17,6 @@ from morphgen.fitting.replace_collision import as_primitives, stored_primitives
 from morphgen.formats.fits import read_stored_fits
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Pose, Shape
-from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.kinematics import (
     driving_joints,
     forward_kinematics,
@@ -25,6 +24,7 @@ from morphgen.model.kinematics import (
     joint_limits,
     link_jacobians,
     random_configurations,
+    solve_pose_ik,
 )
 from morphgen.model.robot import Robot
 from morphgen.typing import Array

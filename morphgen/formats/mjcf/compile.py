@@ -26,8 +26,8 @@ from morphgen.formats.urdf.schema import MAX_LINKS, MAX_NUMBER, MAX_SHAPES, MAX_
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh
 from morphgen.model.mesh import load_mesh
-from morphgen.model.mesh_pieces import MAX_COORDINATE, MAX_FACES
 from morphgen.model.rotation import Vec3
+from morphgen.model.scene_files import MAX_COORDINATE, MAX_FACES
 
 _REFUSALS = (ValueError, mujoco.FatalError)
 """Exceptions by which MuJoCo refuses a document."""
