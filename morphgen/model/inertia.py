@@ -162,7 +162,7 @@ def bounding_box(shapes: Sequence[Shape]) -> Array:
 
 
 def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
-    """Return the corners (8, 3) of an axis-aligned box from its lowest and highest ones (3,) [m]."""
+    """Return the corners (8, 3) of an axis-aligned box, from the lowest and the highest [m]."""
     sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
     return np.array(np.meshgrid(*sides)).reshape(3, -1).T
 
