@@ -1,8 +1,9 @@
 """Kinematics of many robots in one batch of torch tensors, differentiable, on any device.
 
 The functions have the names, formulas and results of ``morphgen.model.kinematics``. Robots are
-compiled once: ``compile_tree`` for the poses of all links, ``compile_chain`` for the pose and the Jacobian of one
-frame, which is several times as fast because only joints between the root and the frame count.
+compiled once: ``compile_tree`` for the poses of all links, ``compile_chain`` for the pose and the
+Jacobian of one frame, which is several times as fast because only joints between the root and the
+frame count.
 Loops run over levels of the tree, never over environments.
 
 Arguments that the functions share:
