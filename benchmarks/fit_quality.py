@@ -1,7 +1,7 @@
 """Quality of primitive fits, compared with trimesh's tightest bound and scikit-robot.
 
     python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read]
-        [--fits one,four,residual,enclose] [--jobs 2] [--json rows.json]
+        [--fits one,four,enclose] [--jobs 2] [--json rows.json]
 
 Measures every link of every real arm. All methods use the same solid and the measure of
 `morphgen.fitting.quality`. Prints one table per definition of the solid:
@@ -15,15 +15,14 @@ Measures every link of every real arm. All methods use the same solid and the me
 A row is an arm; values are means over its links (links with the same meshes are fitted once):
 
 - IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (AnyBody's method),
-  scikit-robot's, ours; ours with up to four primitives, with ``--search residual``, and the
-  number of the former.
+  scikit-robot's, ours; ours with up to four primitives, and their number.
 - Enclosing fits: volume divided by the solid's volume, and the smallest coverage, of scikit-robot's
   and ours.
 - CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
-  and with up to four by both searches.
+  and with up to four.
 
-``--fits`` names the fits of morphgen to measure; the residual search takes most of the time. With
-``--json``, an interrupted run goes on where it stopped.
+``--fits`` names the fits of morphgen to measure. With ``--json``, an interrupted run goes on where
+it stopped.
 scikit-robot comes with `pip install morphgen[bench]`; without it its columns are missing.
 """
 
@@ -35,7 +34,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -64,11 +63,9 @@ Row = dict[str, float]
 """Measured values of a link by column."""
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
 """The arms for which issues of this project set targets."""
-UP_TO_FOUR = FitOptions(max_primitives=4, iou=1.0)
 FITS = {
     "one": FitOptions(),
-    "four": UP_TO_FOUR,
-    "residual": replace(UP_TO_FOUR, search="residual"),
+    "four": FitOptions(max_primitives=4, iou=1.0),
     "enclose": FitOptions(enclose=True),
 }
 """Fits that are measured, by their name in the columns."""
@@ -77,7 +74,6 @@ COLUMNS: dict[str, Callable[[Sequence[Row], str], float]] = {
     "iou skrobot": lambda rows, key: _mean(rows, key),
     "iou one": lambda rows, key: _mean(rows, key),
     "iou four": lambda rows, key: _mean(rows, key),
-    "iou residual": lambda rows, key: _mean(rows, key),
     "n four": lambda rows, key: _mean(rows, key),
     "volume skrobot": lambda rows, key: _mean(rows, key),
     "volume enclose": lambda rows, key: _mean(rows, key),
@@ -86,7 +82,6 @@ COLUMNS: dict[str, Callable[[Sequence[Row], str], float]] = {
     "s skrobot": lambda rows, key: _mean(rows, key),
     "s one": lambda rows, key: _mean(rows, key),
     "s four": lambda rows, key: _mean(rows, key),
-    "s residual": lambda rows, key: _mean(rows, key),
 }
 """Columns of the table, and how the values of the links are combined."""
 

@@ -26,7 +26,6 @@ from morphgen.model.robot import Link, Robot
 
 if TYPE_CHECKING:
     from morphgen.fitting.fitted_robot import FittedRobot
-    from morphgen.fitting.link_fit import Search
 
 
 @checked_signature
@@ -195,7 +194,6 @@ def fit(
     enclose: bool = False,
     spheres: int | None = None,
     cover: float | None = None,
-    search: Search = "clusters",
     visual: bool = False,
     seed: int = 0,
     jobs: int = 1,
@@ -219,8 +217,6 @@ def fit(
         spheres: Number of spheres per link, 1 to 32, for a fit with spheres alone.
         cover: Share of a link's volume that its spheres must cover, such as 0.995; by default they
             have the largest intersection over union.
-        search: How several primitives are searched for: ``residual`` takes two to three
-            times as long, gets closer, and uses capsules, too.
         visual: Replace the visual shapes, too.
         seed: Seed of the sample points.
         jobs: Number of processes; the result does not depend on it.
@@ -239,7 +235,7 @@ def fit(
     from morphgen.fitting.fitted_robot import fit_robot
     from morphgen.fitting.link_fit import FitOptions
 
-    options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover, search)
+    options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover)
     parts = default_library(library)
     target = _mesh_robot(robot) or resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)

@@ -1,4 +1,4 @@
-"""``morphgen fit``: meshes to boxes, cylinders, spheres and capsules, or to spheres alone."""
+"""``morphgen fit``: meshes to boxes, cylinders and spheres, or to spheres alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, whole_number
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from morphgen.model.robot import Robot
 
 DEFAULT_IOU, DEFAULT_CONFIGURATIONS = 0.9, 1000
-DEFAULT_SEARCH: Final = "clusters"
 COLUMNS = {
     "link": "",
     "primitives": "",
@@ -71,12 +70,6 @@ class Target:
         type=float,
         help="with --max-primitives: use the fewest primitives that reach this intersection over "
         f"union (default: {DEFAULT_IOU})",
-    ),
-    option(
-        "--search",
-        metavar="SEARCH",
-        help="with --max-primitives: clusters, or residual, which takes two to three times as "
-        f"long, gets closer and uses capsules, too (default: {DEFAULT_SEARCH})",
     ),
     option(
         "--spheres",
@@ -129,7 +122,6 @@ def fit(args: argparse.Namespace) -> None:
         args.seed,
         args.spheres,
         args.cover,
-        DEFAULT_SEARCH if args.search is None else args.search,
     )
     if args.all:
         _fit_all_parts(args)
@@ -172,16 +164,14 @@ def _require_own_names(targets: Sequence[Target]) -> None:
 
 def _reject_idle_options(args: argparse.Namespace) -> None:
     """Refuse options that have no effect on the kind of fit."""
-    several = {"--iou": args.iou is not None, "--search": args.search is not None}
+    iou = {"--iou": args.iou is not None}
     if args.spheres is None:
         opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
     else:
-        primitives = {"--max-primitives": args.max_primitives is not None, **several}
+        primitives = {"--max-primitives": args.max_primitives is not None, **iou}
         opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
     if args.max_primitives is None and not args.all:
-        opt.reject_idle(several, "only with --max-primitives")
-    if args.enclose:
-        opt.reject_idle({"--search": args.search is not None}, "only without --enclose")
+        opt.reject_idle(iou, "only with --max-primitives")
 
 
 def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:
@@ -280,7 +270,6 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
         "--no-picture": args.no_picture,
         "--max-primitives": args.max_primitives is not None,
         "--iou": args.iou is not None,
-        "--search": args.search is not None,
         "--spheres": args.spheres is not None,
         "--configurations": args.configurations is not None,
         "--seed": args.seed,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, get_args
 
 from morphgen.errors import FitError
 from morphgen.fitting.enclose_pieces import enclose_solid
@@ -13,11 +12,8 @@ from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, best_spheres, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
-from morphgen.model.geometry import Primitive, Shape, Sphere
+from morphgen.model.geometry import Shape, Sphere
 
-Search = Literal["clusters", "residual"]
-"""How several primitives are searched for; ``residual`` is slower, better, and uses capsules."""
-SEARCHES: tuple[Search, ...] = get_args(Search)
 MAX_COVER = 0.9999
 """Largest share that spheres can be required to cover: more cannot be counted on sample points."""
 
@@ -38,8 +34,6 @@ class FitOptions:
     """Number of spheres per link, of a fit with spheres alone; None for a fit with primitives."""
     cover: float | None = None
     """Share of a link's volume that its spheres must cover; None for the largest IoU."""
-    search: Search = "clusters"
-    """How several primitives of largest intersection over union are searched for."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -50,13 +44,6 @@ class FitOptions:
             raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
         if self.seed < 0:
             raise FitError(f"seed {self.seed}: expected 0 or more")
-        if self.search not in SEARCHES:
-            raise FitError(f"search {self.search!r}: expected {' or '.join(SEARCHES)}")
-        if self.search == "residual" and (self.max_primitives == 1 or self.enclose):
-            raise FitError(
-                "search 'residual': expected max_primitives of 2 or more, neither enclose nor "
-                "spheres; 'clusters' is the search for one primitive"
-            )
 
     def _check_spheres(self) -> None:
         if self.spheres is not None:
@@ -76,7 +63,7 @@ class LinkFit:
     """Primitives that replace the shapes of a link, with their measured quality."""
 
     primitives: tuple[Shape, ...]
-    """Boxes, cylinders, spheres and capsules in the link frame."""
+    """Boxes, cylinders and spheres in the link frame."""
     single: Shape | None
     """The single primitive of largest overlap; None if it was not searched for."""
     solid: str
@@ -104,8 +91,7 @@ def fit_shapes(
     """Fit the shapes of one link.
 
     shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
-        there are no more than ``max_primitives``; by the residual search also capsules; by a
-        fit of spheres, if all are spheres.
+        there are no more than ``max_primitives``; by a fit of spheres, if all are spheres.
     solid: The solid of the shapes, if it is known already.
     """
     start = time.perf_counter()
@@ -113,11 +99,7 @@ def fit_shapes(
     if options.spheres is not None:
         is_kept = all(isinstance(shape.geometry, Sphere) for shape in shapes)
     else:
-        has_right_kinds = are_primitives(shapes) or (
-            options.search == "residual"
-            and all(isinstance(shape.geometry, Primitive) for shape in shapes)
-        )
-        is_kept = has_right_kinds and len(shapes) <= options.max_primitives
+        is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
     if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None
@@ -140,7 +122,7 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     for _ in range(1, options.max_primitives):
         if best.iou >= options.iou:
             break
-        more = best_several(target, latest, options.seed, residual=options.search == "residual")
+        more = best_several(target, latest, options.seed)
         if more is None:
             break
         latest = more

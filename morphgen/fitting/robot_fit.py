@@ -72,7 +72,6 @@ class FitReport:
                 "max_primitives": options.max_primitives,
                 "iou": options.iou,
                 "enclose": options.enclose,
-                "search": options.search,
             }
         return {
             "robot": self.robot,

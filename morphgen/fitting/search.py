@@ -18,9 +18,9 @@ from scipy.stats import qmc
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS, canonical
-from morphgen.fitting.soft_iou import SEARCH_KINDS, Candidates, ascend, covered, distances, overlaps
+from morphgen.fitting.soft_iou import Candidates, ascend, covered, distances, overlaps
 from morphgen.fitting.solid import Solid
-from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, normalize
 from morphgen.processes import one_torch_thread
 from morphgen.typing import Array
@@ -33,11 +33,7 @@ _NUM_CLUSTERS = (1, 2, 3)
 """Numbers of clusters of the uncovered points, each of which may get a further primitive."""
 _MIN_HALF_EXTENT = 1e-3
 """Smallest half extent of a guess, relative to the solid's size."""
-_CAP_LENGTH = 2 / 3
-"""Length of a cylinder of the volume of a capsule's cap, relative to the radius."""
-_BOX, _CYLINDER, _SPHERE, _CAPSULE = (
-    SEARCH_KINDS.index(kind) for kind in ("box", "cylinder", "sphere", "capsule")
-)
+_BOX, _CYLINDER, _SPHERE = map(KINDS.index, ("box", "cylinder", "sphere"))
 _AXES_TO_Z = (
     np.eye(3),
     np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -46,9 +42,7 @@ _AXES_TO_Z = (
 """Rotations whose z axis is the z, x and y axis."""
 
 
-def around(
-    points: Array, axes: list[Array], *, sphere: bool = False, capsules: bool = False
-) -> Candidates:
+def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
     """Return guesses of one primitive each around a point cloud.
 
     points: Points, shape (n, 3).
@@ -58,12 +52,6 @@ def around(
     _, principal_axes = np.linalg.eigh(np.cov(points.T))
     principal_axes *= (1.0, 1.0, np.linalg.det(principal_axes))  # right-handed
     guesses = [guess for R in (*axes, principal_axes) for guess in _along(points, R)]
-    if capsules:
-        guesses += [
-            (_CAPSULE, centre, R, np.array([r, r, max(h - _CAP_LENGTH * r, _MIN_HALF_EXTENT)]))
-            for kind, centre, R, (r, _, h) in guesses
-            if kind == _CYLINDER
-        ]
     if sphere:
         centre = points.mean(axis=0)
         # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
@@ -85,8 +73,6 @@ def by_pieces(
     weights: Array,
     k: int,
     seeds: list[int],
-    *,
-    capsules: bool = False,
 ) -> Candidates | None:
     """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
 
@@ -104,9 +90,7 @@ def by_pieces(
         if np.bincount(label, minlength=k).min() < MIN_POINTS:
             continue
         pieces = [
-            _best_of_each_kind(
-                cloud[label == j], weights[inside][label == j], *outside, capsules=capsules
-            )
+            _best_of_each_kind(cloud[label == j], weights[inside][label == j], *outside)
             for j in range(k)
         ]
         rows.append(Candidates.join(pieces))
@@ -119,8 +103,6 @@ def by_growth(
     inside: NDArray[np.bool_],
     weights: Array,
     seed: int,
-    *,
-    capsules: bool = False,
 ) -> Candidates | None:
     """Return guesses with one more primitive, around a part of the solid that is not covered.
 
@@ -141,47 +123,29 @@ def by_growth(
         for j in range(n):
             if np.count_nonzero(label == j) >= MIN_POINTS:
                 piece = cloud[label == j], weights[missed][label == j]
-                more = _best_of_each_kind(*piece, *outside, capsules=capsules)
+                more = _best_of_each_kind(*piece, *outside)
                 rows.append(Candidates.join([fewer.take(np.zeros(len(more.kinds), int)), more]))
     return Candidates.stack(rows) if rows else None
 
 
-def by_replacement(
-    candidates: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
-) -> Candidates | None:
-    """Return guesses in which one primitive is replaced by one where the rest leaves a gap.
-
-    Each primitive of each candidate is replaced in turn, also by capsules. Arguments and result
-    are those of ``by_growth``.
-    """
-    n, k = candidates.kinds.shape
-    rows = [
-        by_growth(rest.without(i), points, inside, weights, seed, capsules=True)
-        for rest in (candidates.take(np.array([row])) for row in range(n))
-        for i in range(k)
-    ]
-    guesses = [guess for guess in rows if guess is not None]
-    return Candidates.stack(guesses) if guesses else None
-
-
 def _best_of_each_kind(
-    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array, *, capsules: bool
+    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array
 ) -> Candidates:
-    """Return guesses around a cluster: the best, the best box, the best cylinder, a capsule.
+    """Return guesses around a cluster: the best, the best box, the best cylinder.
 
     piece: Points of the cluster, shape (n, 3).
     piece_weights: Weights of these points, shape (n,).
     outside: Points outside the solid, shape (m, 3).
     outside_weights: Weights of these points, shape (m,).
     """
-    guesses = around(piece, [np.eye(3)], capsules=capsules)
+    guesses = around(piece, [np.eye(3)])
     points = np.concatenate([piece, outside])
     weights = np.concatenate([piece_weights, outside_weights])
     ious = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
     kinds = guesses.kinds[:, 0]
     best = [
         int(np.argmax(np.where(allowed, ious, -1.0)))
-        for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER, kinds == _CAPSULE)
+        for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
         if allowed.any()
     ]
     return guesses.take(np.array(best))
@@ -212,12 +176,6 @@ NUM_CLUSTERINGS = 4
 """Number of clusterings from which the search for several primitives starts."""
 NUM_REFINED = 2
 """Number of candidates that are refined on all sample points."""
-REPLACEMENT_POINTS = 2**12
-"""Number of sample points on which replacements of primitives are screened and improved."""
-NUM_REPLACEMENTS = 16
-"""Number of replacements that are improved in a round; 24 take longer and bring nothing."""
-MAX_ROUNDS = 6
-"""Largest number of rounds of replacements."""
 DIGITS = 6
 """Decimals of dimensions and positions in metres; quaternions have three more."""
 
@@ -261,16 +219,14 @@ class SampledSolid:
             strict=True,
         ):
             x, y, z = np.maximum(halves, 10.0**-DIGITS).tolist()
-            geometry: Box | Cylinder | Sphere | Capsule
-            match SEARCH_KINDS[kind]:
+            geometry: Box | Cylinder | Sphere
+            match KINDS[kind]:
                 case "box":
                     geometry = Box((2 * x, 2 * y, 2 * z))
                 case "cylinder":
                     geometry = Cylinder(x, 2 * z)
                 case "sphere":
                     geometry = Sphere(x)
-                case "capsule":
-                    geometry = Capsule(x, 2 * z)
             a, b, c = np.round(centre, DIGITS).tolist()
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
             pose = Pose((a, b, c), normalize((w, i, j, k)))
@@ -321,9 +277,7 @@ def best_single(target: SampledSolid) -> SearchResult:
         return _refine(target, ascend_coarsely(target, start, target.weights, (0.03, 0.008)))
 
 
-def best_several(
-    target: SampledSolid, fewer: SearchResult, seed: int, *, residual: bool = False
-) -> SearchResult | None:
+def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
     """Return the primitives of largest IoU, one more than in an earlier result.
 
     Returns:
@@ -335,55 +289,21 @@ def best_several(
     k = len(fewer.shapes) + 1
     with one_torch_thread():
         starts = (
-            by_pieces(*cloud, k, seeds, capsules=residual),
-            by_growth(fewer.candidate, *cloud, seeds[0], capsules=residual),
+            by_pieces(*cloud, k, seeds),
+            by_growth(fewer.candidate, *cloud, seeds[0]),
         )
         guesses = [start for start in starts if start is not None]
         if not guesses:
             return None
         start = Candidates.stack(guesses)
-        coarse = ascend_coarsely(target, start, target.weights, (0.02, 0.006))
-        return _refine(target, _with_replacements(target, coarse, seed) if residual else coarse)
-
-
-def _with_replacements(target: SampledSolid, candidates: Candidates, seed: int) -> Candidates:
-    """Replace primitives of the best candidates, one at a time, as long as it helps."""
-    subset = slice(REPLACEMENT_POINTS)
-    cloud = target.points[subset], target.inside[subset], target.weights[subset]
-    best, iou = _best_candidates(target, candidates)
-    for round_seed in np.random.SeedSequence(seed).generate_state(MAX_ROUNDS):
-        guesses = by_replacement(best, *cloud, int(round_seed))
-        if guesses is None:
-            break
-        # Equal guesses have equal overlaps, of which ``unique`` keeps one.
-        _, order = np.unique(-overlaps(guesses, *cloud), return_index=True)
-        replaced = ascend(
-            guesses.take(order[:NUM_REPLACEMENTS]),
-            *cloud[:2],
-            weights=cloud[2],
-            num_steps=60,
-            tau=(0.015, 0.004),
-            rate=(0.01, 0.002),
-        )
-        previous = iou
-        best, iou = _best_candidates(target, Candidates.stack([best, replaced]))
-        if iou == previous:
-            break
-    return best
-
-
-def _best_candidates(target: SampledSolid, candidates: Candidates) -> tuple[Candidates, float]:
-    """Return the candidates of largest IoU, and that of the best one."""
-    ious = overlaps(candidates, target.points, target.inside, target.weights)
-    order = np.argsort(-ious, kind="stable")[:NUM_REFINED]
-    return candidates.take(order), float(ious[order[0]])
+        return _refine(target, ascend_coarsely(target, start, target.weights, (0.02, 0.006)))
 
 
 def _refine(target: SampledSolid, coarse: Candidates) -> SearchResult:
     """Improve the best candidates on all points, and return the best one."""
     points, inside, weights = target.points, target.inside, target.weights
-    best, _ = _best_candidates(target, coarse)
-    fine = ascend_finely(target, best, weights)
+    order = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")
+    fine = ascend_finely(target, coarse.take(order[:NUM_REFINED]), weights)
     ious = overlaps(fine, points, inside, weights)
     row = int(np.argmax(ious))
     return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))

@@ -9,18 +9,15 @@ each, are optimised at once.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.fitting.canonical import KINDS, Kind
+from morphgen.fitting.canonical import KINDS
 from morphgen.typing import Array
 
-SEARCH_KINDS: tuple[Kind | Literal["capsule"], ...] = (*KINDS, "capsule")
-"""Kinds of primitives that candidates can have; those of a token come first."""
-_SPHERE = SEARCH_KINDS.index("sphere")
+_SPHERE = KINDS.index("sphere")
 _MAX_DISTANCES = 96_000
 """Number of distances that are evaluated together; bounds memory."""
 
@@ -30,24 +27,20 @@ class Candidates:
     """``n`` candidates of ``k`` primitives each."""
 
     kinds: NDArray[np.int64]
-    """Indices into ``SEARCH_KINDS``, shape (n, k)."""
+    """Indices into ``KINDS``, shape (n, k)."""
     centres: Array
     """Centres, shape (n, k, 3)."""
     quaternions: Array
     """Rotations (w, x, y, z) of any norm, shape (n, k, 4)."""
     halves: Array
-    """Half extents, shape (n, k, 3). A cylinder has its radius first and half its length third,
-    a capsule likewise, without its caps; a sphere's radius is the first."""
+    """Half extents, shape (n, k, 3). A cylinder has its radius first and half its length third; a
+    sphere's radius is the first."""
 
     def take(self, rows: NDArray[np.intp]) -> Candidates:
         """Return the candidates of some rows."""
         return Candidates(
             self.kinds[rows], self.centres[rows], self.quaternions[rows], self.halves[rows]
         )
-
-    def without(self, primitive: int) -> Candidates:
-        """Return the candidates without one of their primitives."""
-        return Candidates(*(np.delete(array, primitive, axis=1) for array in vars(self).values()))
 
     @staticmethod
     def stack(blocks: list[Candidates]) -> Candidates:
@@ -188,26 +181,18 @@ def _distance(
     order = torch.argsort(flat, stable=True)
     local = _local(x, centres.reshape(-1, 3)[order], quaternions.reshape(-1, 4)[order])
     size = halves.reshape(-1, 3)[order][:, :, None]
-    boxes, cylinders, spheres = (
-        int((flat == SEARCH_KINDS.index(kind)).sum()) for kind in ("box", "cylinder", "sphere")
-    )
+    boxes, cylinders = (int((flat == KINDS.index(kind)).sum()) for kind in ("box", "cylinder"))
+    end = boxes + cylinders
     distances = []
     if boxes:
         distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
     if cylinders:
-        points, half = local[boxes : boxes + cylinders], size[boxes : boxes + cylinders]
+        points, half = local[boxes:end], size[boxes:end]
         radial = (points[:, :2].square().sum(dim=1) + 1e-12).sqrt() - half[:, 0]
         axial = points[:, 2].abs() - half[:, 2]
         distances.append(_rounded(torch.stack([radial, axial], dim=1)))
-    end = boxes + cylinders + spheres
-    if spheres:
-        points, half = local[boxes + cylinders : end], size[boxes + cylinders : end]
-        distances.append((points.square().sum(dim=1) + 1e-12).sqrt() - half[:, 0])
     if end < len(flat):
-        points, half = local[end:], size[end:]
-        beyond_segment = (points[:, 2].abs() - half[:, 2]).clamp(min=0)
-        squares = points[:, :2].square().sum(dim=1) + beyond_segment.square()
-        distances.append((squares + 1e-12).sqrt() - half[:, 0])
+        distances.append((local[end:].square().sum(dim=1) + 1e-12).sqrt() - size[end:, 0])
     return torch.cat(distances)[torch.argsort(order)].reshape(n, k, -1)
 
 

@@ -80,7 +80,7 @@ def test_mirrored_links_share_a_fit(tmp_path, wedge):
 def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path, wedge):
     ball = trimesh.creation.icosphere(3, 0.1)
     robot = arm([mesh_shape(tmp_path, wedge, "a.stl")], [mesh_shape(tmp_path, ball, "b.stl")])
-    for options in (FitOptions(), FitOptions(max_primitives=2, iou=1.0, search="residual")):
+    for options in (FitOptions(), FitOptions(max_primitives=2, iou=1.0)):
         one, two = (fit_links(robot, options, jobs=jobs).links for jobs in (1, 2))
         assert [row.fit.primitives for row in one] == [row.fit.primitives for row in two]
 
@@ -104,13 +104,6 @@ def test_existing_primitives_are_unchanged():
     assert kept.solid == "primitives"
     assert kept.quality.iou > 0.99
     assert len(fit_shapes(shapes, FitOptions(max_primitives=1)).primitives) == 1
-
-
-def test_the_residual_search_keeps_capsules():
-    shapes = (Shape(Capsule(0.05, 0.2)), Shape(Box((0.1, 0.2, 0.3)), Pose((0.3, 0.0, 0.0))))
-    kept = fit_shapes(shapes, FitOptions(max_primitives=2, search="residual"))
-    assert kept.primitives == shapes
-    assert kept.solid == "primitives"
 
 
 def test_enclosing_primitives_contain_every_vertex(tmp_path, wedge):
@@ -157,9 +150,6 @@ def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
         ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
         ({"iou": 1.5}, "IoU 1.5"),
         ({"seed": -1}, "seed -1"),
-        ({"search": "greedy"}, "search 'greedy': expected clusters or residual"),
-        ({"search": "residual"}, "search 'residual': expected max_primitives of 2 or more"),
-        ({"search": "residual", "max_primitives": 2, "enclose": True}, "neither enclose"),
     ],
 )
 def test_options_out_of_range_are_errors(options, message):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS
@@ -15,7 +14,6 @@ from morphgen.fitting.quality import quality
 from morphgen.fitting.search import (
     DIGITS,
     MIN_POINTS,
-    SearchResult,
     around,
     best_several,
     best_single,
@@ -23,9 +21,9 @@ from morphgen.fitting.search import (
     by_pieces,
     sample_solid,
 )
-from morphgen.fitting.soft_iou import SEARCH_KINDS, Candidates, covered, overlaps
+from morphgen.fitting.soft_iou import covered, overlaps
 from morphgen.fitting.solid import solid_of, solid_of_mesh
-from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere, dimensions
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.2, 0.3), (0.4, 0.7, -1.1))
 PRIMITIVES = (Box((0.1, 0.2, 0.4)), Cylinder(0.06, 0.3), Sphere(0.1))
@@ -269,30 +267,6 @@ def test_pieces_give_three_reproducible_guesses_per_clustering():
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     scores = overlaps(first, target.points, target.inside, target.weights)
     assert scores.max() > 0.6
-
-
-@pytest.mark.slow
-def test_residual_search_finds_a_capsule_between_boxes():
-    """The earlier result has half of the upright box; the third primitive must not fill it up."""
-    capsule = Capsule(0.06, 0.25)
-    pose = Pose.from_xyz_rpy((0.3, 0.0, 0.2), (0.3, 0.9, 0.0))
-    target = target_of(*ANGLE, Shape(capsule, pose))
-    size, R = target.solid.size, target.R_link_box
-    sizes, centres = [(0.1, 0.1, 0.2), (0.2, 0.1, 0.1)], [(0.0, 0.0, 0.3), (0.15, 0.0, 0.05)]
-    boxes = Candidates(
-        np.full((1, 2), SEARCH_KINDS.index("box")),
-        (np.array([centres]) - target.centre) @ R / size,
-        np.tile(Rotation.from_matrix(R.T).as_quat(scalar_first=True), (1, 2, 1)),
-        np.array([sizes]) / 2 / size,
-    )
-    found = best_several(
-        target, SearchResult(target.shapes(boxes, 0), 0.0, boxes), 0, residual=True
-    )
-    assert quality(target.solid, found.shapes).iou > 0.985
-    (shape,) = (shape for shape in found.shapes if isinstance(shape.geometry, Capsule))
-    assert dimensions(shape.geometry) == pytest.approx(dimensions(capsule), rel=0.05)
-    np.testing.assert_allclose(shape.T_link_shape.position, pose.position, atol=2e-3)
-    assert_well_formed(shape)
 
 
 def test_a_solid_with_few_points_is_not_split():
