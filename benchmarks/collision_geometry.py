@@ -9,7 +9,7 @@ convex hulls. Rows are kept in ``--out``, and only forms without a row are measu
 run goes on, and a new geometry needs no new rows of the others. ``--report`` only prints.
 
 Agreement: share of 1,000 random configurations in which the form collides with itself if and only
-if the triangles of the meshes do (`morphgen.fitting.agreement`). Pairs of links that the form or
+if the triangles of the meshes do (`morphgen.fitting.fitted_robot`). Pairs of links that the form or
 the arm with meshes ignores are not tested; the column "hull, same pairs" is the agreement of the
 hulls without these pairs.
 
@@ -50,8 +50,8 @@ from tqdm import tqdm
 import morphgen
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
-from morphgen.fitting.agreement import agreement
 from morphgen.fitting.convex_pieces import as_convex
+from morphgen.fitting.fitted_robot import agreement
 from morphgen.fitting.replace_collision import as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import write_file

@@ -23,9 +23,8 @@ from tqdm import tqdm
 
 import morphgen
 from morphgen.fitting.link_fit import FitOptions
-from morphgen.fitting.part_fits import COLLISION_OPTIONS
 from morphgen.fitting.replace_collision import stored_primitives, with_primitives
-from morphgen.fitting.robot_fit import fit_links
+from morphgen.fitting.robot_fit import COLLISION_OPTIONS, fit_links
 from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
 from morphgen.formats.fits import are_primitives, read_stored_fits, shapes_key
 from morphgen.formats.picture import render

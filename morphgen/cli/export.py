@@ -101,14 +101,14 @@ def _with_spheres(robot: Robot, settings: ExportSettings) -> Robot:
     """Return the robot with spheres as its collision shapes, if the settings have a number."""
     if settings.spheres is None:
         return robot
-    from morphgen.fitting.collision_geometry import as_spheres
+    from morphgen.fitting.replace_collision import as_spheres
 
     return as_spheres(robot, settings.folders, spheres=settings.spheres, cover=settings.cover)
 
 
 def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
     from morphgen.checks.robot_srdf import robot_srdf_text
-    from morphgen.fitting.collision_geometry import link_spheres
+    from morphgen.fitting.replace_collision import link_spheres
     from morphgen.formats.srdf import require_tool
 
     require_tool(robot)
@@ -120,7 +120,7 @@ def _srdf(robot: Robot, settings: ExportSettings) -> bytes:
 
 def _curobo(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.robot_srdf import collision_matrix, matrix_evidence
-    from morphgen.fitting.collision_geometry import SPHERES, link_spheres
+    from morphgen.fitting.replace_collision import SPHERES, link_spheres
     from morphgen.formats.bundle import URDF
     from morphgen.formats.srdf import CUROBO_CONFIG, curobo_text, require_tool
 
@@ -184,7 +184,7 @@ def _usd(robot: Robot, folder: Path, settings: ExportSettings) -> None:
 
 def _ros2(robot: Robot, folder: Path, settings: ExportSettings) -> None:
     from morphgen.checks.robot_srdf import robot_srdf_text
-    from morphgen.fitting.collision_geometry import link_spheres
+    from morphgen.fitting.replace_collision import link_spheres
     from morphgen.formats.ros_package import write_ros_package
     from morphgen.formats.srdf import require_tool
 

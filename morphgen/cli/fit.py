@@ -16,7 +16,7 @@ from morphgen.cli.progress import bar, print_line, status, track
 from morphgen.errors import FitError, FormatError, MorphgenError
 
 if TYPE_CHECKING:
-    from morphgen.fitting.agreement import Agreement
+    from morphgen.fitting.fitted_robot import Agreement
     from morphgen.fitting.link_fit import FitOptions, LinkFit
     from morphgen.fitting.quality import Quality
     from morphgen.fitting.robot_fit import FitReport
@@ -260,7 +260,7 @@ def _fit_robot(
 
 
 def _fit_all_parts(args: argparse.Namespace) -> None:
-    from morphgen.fitting.part_fits import parts_with_meshes, store_parts
+    from morphgen.fitting.robot_fit import parts_with_meshes, store_parts
 
     options_without_effect = {
         "--out": args.out,

@@ -1,27 +1,31 @@
-"""The box, cylinder or sphere of least volume that encloses points.
+"""Enclose points in the box, cylinder or sphere of least volume, and a solid in several of them.
 
 Only the vertices of the convex hull matter. The sphere, and the circle around a cylinder's cross
-section, are exact (``bounding_balls``). The volume of a box or cylinder is a function of its
-rotation with many kinks and local minima (O'Rourke, "Finding minimal enclosing boxes", 1985).
-Rotations all over the sphere and along the faces of the hull are evaluated first. The best are
-refined by a pattern search, which also rotates about one axis at a time to keep a side flush with a
-face of the hull.
+section, are exact (Gaertner, "Fast and robust smallest enclosing balls", 1999). The volume
+of a box or cylinder is a function of its rotation with many kinks and local minima (O'Rourke,
+"Finding minimal enclosing boxes", 1985). Rotations all over the sphere and along the faces of the
+hull are evaluated first. The best are refined by a pattern search, which also rotates about one
+axis at a time to keep a side flush with a face of the hull.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
-from morphgen.fitting.bounding_balls import smallest_balls
 from morphgen.fitting.canonical import KINDS, Kind, least_rotation, rounded
+from morphgen.fitting.quality import signed_distance
+from morphgen.fitting.search import SampledSolid
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
 from morphgen.model.mesh import is_flat
@@ -45,6 +49,14 @@ _LINK_AXES_EXCESS = 1e-5
 """Relative excess of volume up to which the link's own axes are preferred."""
 _MAX_PRODUCTS = 100_000
 """Number of points times rotations that are evaluated together; bounds memory."""
+_ON_BALL = 1e-12
+"""Relative excess of the squared distance below which a point counts as on the ball."""
+_MAX_PIVOTS = 100
+"""Largest number of points that are added to the support of a ball."""
+NUM_CLUSTERINGS = 3
+"""Number of partitions of a solid that are tried for each number of primitives."""
+_MAX_GROWTHS = 20
+"""Largest number of times that primitives are enlarged to contain the points left outside."""
 
 
 def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
@@ -54,14 +66,9 @@ def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
     rounded up to 1 um, so no point is more than 1e-9 m outside.
 
     points: Points in the link frame [m], shape (n, 3).
-
-    Returns:
-        The primitive in its canonical pose.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have the shape {points.shape}; expected (n, 3)")
-    if not kinds or not set(kinds) <= set(KINDS):
-        raise ValueError(f"kinds {tuple(kinds)}; valid: some of {', '.join(KINDS)}")
     points = np.asarray(points, dtype=np.float64)
     if not np.isfinite(points).all():
         raise FitError("the points are not finite")
@@ -182,7 +189,7 @@ def _cylinder_volumes(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Search:
-    """Parameters of the search for the rotation of least volume."""
+    """How the rotation of least volume is searched for."""
 
     volumes: Callable[[Array], Array]
     """Volumes around points given along the axes of ``n`` rotations, shape (n, 3, m)."""
@@ -292,3 +299,126 @@ def _descend(
         volumes = np.where(better, candidates[rows, best], volumes)
         step = np.where(better, step, step * _SHRINK)
     return rotations, volumes
+
+
+def smallest_balls(points: Array) -> tuple[Array, Array]:
+    """Return centres (n, d) and radii (n,) of the smallest balls around sets of points (n, d, m).
+
+    The farthest point outside is added to the support of a ball until no point is outside.
+    """
+    n, d, _ = points.shape
+    active = np.arange(n)
+    centres = points[active, :, _squared_lengths(points - points[:, :, :1]).argmax(axis=1)]
+    squared_radii = np.zeros(n)
+    support = np.repeat(centres[:, :, None], d + 1, axis=2)
+    for _ in range(_MAX_PIVOTS):
+        distances = _squared_lengths(points[active] - centres[active, :, None])
+        farthest = distances.argmax(axis=1)
+        outside = distances.max(axis=1) > squared_radii[active] * (1 + _ON_BALL)
+        active, farthest = active[outside], farthest[outside]
+        if not len(active):
+            break
+        pivots = points[active, :, farthest]
+        offsets, grown, kept = _balls_through_origin(support[active] - pivots[:, :, None])
+        # A ball that does not grow has reached the precision of its numbers.
+        larger = np.isfinite(grown) & (grown > squared_radii[active])
+        active, pivots, kept = active[larger], pivots[larger], kept[larger]
+        support[active, :, :d] = np.take_along_axis(support[active], kept[:, None], axis=2)
+        support[active, :, d] = pivots
+        centres[active] = pivots + offsets[larger]
+        squared_radii[active] = grown[larger]
+    return centres, np.sqrt(_squared_lengths(points - centres[:, :, None]).max(axis=1))
+
+
+def _balls_through_origin(others: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Return the smallest balls around points (n, d, d + 1) with the origin on their boundary.
+
+    These are centres (n, d), squared radii (n,), infinite where there is no such ball, and indices
+    of the points on the boundary (n, d), some repeated.
+    """
+    d = others.shape[1]
+    centres, unique, chosen = [], [], []
+    for k in range(1, d + 1):
+        subsets = np.array(list(itertools.combinations(range(d + 1), k)))
+        chosen.append(subsets[:, np.arange(d) % k])
+        # The centre c solves 2 p . c = p . p for each point p of a subset.
+        spokes = others[:, :, subsets].transpose(0, 2, 3, 1)
+        gram = spokes @ spokes.swapaxes(2, 3)
+        lengths = np.diagonal(gram, axis1=2, axis2=3)
+        unique.append(np.linalg.det(gram) > _ON_BALL * lengths.prod(axis=2))
+        gram = np.where(unique[-1][:, :, None, None], gram, np.eye(k))
+        centres.append((spokes * np.linalg.solve(gram, lengths[..., None] / 2)).sum(axis=2))
+    centre = np.concatenate(centres, axis=1).swapaxes(1, 2)
+    squares = _squared_lengths(centre)
+    farthest = _squared_lengths(others[:, :, None] - centre[..., None]).max(axis=2)
+    holds = np.concatenate(unique, axis=1) & (farthest <= squares * (1 + 100 * _ON_BALL))
+    squares = np.where(holds, squares, np.inf)
+    best, rows = squares.argmin(axis=1), np.arange(len(others))
+    return centre[rows, :, best], squares[rows, best], np.concatenate(chosen)[best]
+
+
+def _squared_lengths(vectors: Array) -> Array:
+    """Return the squared lengths along axis 1."""
+    return np.asarray(np.square(vectors).sum(axis=1))
+
+
+def enclose_solid(
+    target: SampledSolid, max_primitives: int, iou: float, seed: int
+) -> tuple[Shape, ...]:
+    """Return primitives that contain a solid with little excess volume.
+
+    One primitive is the one of least volume. For several, the solid is cut along the bisecting
+    planes between cluster centres, and each piece is enclosed; the best of ``NUM_CLUSTERINGS``
+    partitions is kept. The number of primitives is the smallest that reaches ``iou``, or the best.
+    """
+    best: tuple[Shape, ...] = (enclose(np.asarray(target.solid.mesh.vertices)),)
+    best_iou = _iou(best, target)
+    for k in range(2, max_primitives + 1):
+        if best_iou >= iou:
+            break
+        for child in np.random.SeedSequence([seed, k]).generate_state(NUM_CLUSTERINGS):
+            shapes = _enclose_clusters(target, k, int(child))
+            if shapes and (shapes_iou := _iou(shapes, target)) > best_iou:
+                best, best_iou = shapes, shapes_iou
+    return best
+
+
+def _enclose_clusters(target: SampledSolid, k: int, seed: int) -> tuple[Shape, ...]:
+    """Return a primitive around each of ``k`` pieces; empty if a piece is flat or empty."""
+    inside = target.link_points[target.inside]
+    centres, _ = kmeans2(inside, k, minit="++", seed=seed, iter=10)
+    pieces = [_cut(target.solid.mesh, centres, i) for i in range(k)]
+    try:
+        shapes = [enclose(piece) for piece in pieces]
+        for _ in range(_MAX_GROWTHS):
+            # The surface of each piece is enclosed, but its interior may reach beyond the cuts.
+            missed = inside[signed_distance(shapes, inside) > 0]
+            if not len(missed):
+                return tuple(shapes)
+            nearest = np.argmin(np.linalg.norm(missed[:, None] - centres, axis=2), axis=1)
+            for i in np.unique(nearest).tolist():
+                pieces[i] = np.concatenate([pieces[i], missed[nearest == i]])
+                shapes[i] = enclose(pieces[i])
+    except FitError:
+        return ()
+    return ()
+
+
+def _cut(mesh: trimesh.Trimesh, centres: Array, i: int) -> Array:
+    """Return the vertices of the part of a mesh that is nearest to centre ``i``."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    for j in range(len(centres)):
+        if j == i or not len(faces):
+            continue
+        vertices, faces, _ = trimesh.intersections.slice_faces_plane(
+            vertices,
+            faces,
+            plane_normal=centres[i] - centres[j],
+            plane_origin=(centres[i] + centres[j]) / 2,
+        )
+    return np.asarray(vertices[np.unique(faces)]) if len(faces) else np.zeros((0, 3))
+
+
+def _iou(shapes: tuple[Shape, ...], target: SampledSolid) -> float:
+    held, inside = signed_distance(shapes, target.link_points) <= 0, target.inside
+    return float(target.weights[held & inside].sum() / target.weights[held | inside].sum())

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 from morphgen.errors import FitError
-from morphgen.fitting.enclose_pieces import enclose_solid
+from morphgen.fitting.enclose import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, best_spheres, sample_solid
 from morphgen.fitting.solid import Solid, solid_of

@@ -1,10 +1,11 @@
-"""Fit primitives to every link of a robot."""
+"""Fit primitives to every link of a robot, and store the fits of parts beside their manifests."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -14,11 +15,31 @@ from morphgen.fitting.congruence import moved, representatives
 from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.formats.fits import shapes_to_fit
+from morphgen.fitting.token_shapes import token_of_primitives
+from morphgen.formats.files import write_file
+from morphgen.formats.fits import (
+    SUFFIX,
+    are_primitives,
+    find_fit,
+    fits_text,
+    has_meshes,
+    read_stored_fits,
+    shapes_key,
+    shapes_scale,
+    shapes_to_fit,
+)
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import Manifest
+from morphgen.grammar.part import load_part
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Shape
+from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
 from morphgen.processes import parallel_map
+
+TOKEN_OPTIONS = FitOptions(max_primitives=1)
+"""Options of the primitive in a link's token."""
+COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
+"""Options of the primitives that replace a link's collision meshes."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +68,12 @@ class FitReport:
         """Mean quality over the links, but the largest Hausdorff distance; None without links."""
         if not self.links:
             return None
-        qualities = [report.fit.quality for report in self.links]
-        means = {
-            name: float(np.mean([getattr(quality, name) for quality in qualities]))
+        values = {
+            name: [getattr(report.fit.quality, name) for report in self.links]
             for name in Quality.__dataclass_fields__
         }
-        return Quality(**means | {"hausdorff": max(quality.hausdorff for quality in qualities)})
+        means = {name: float(np.mean(column)) for name, column in values.items()}
+        return Quality(**means | {"hausdorff": max(values["hausdorff"])})
 
     def without_times(self) -> dict[str, object]:
         """Return plain data for a bundle's card: equal for the same robot, options and seed."""
@@ -64,18 +85,11 @@ class FitReport:
     def as_dict(self) -> dict[str, object]:
         """Return plain data for JSON."""
         options = self.options
-        settings: dict[str, object]
-        if options.spheres is not None:
-            settings = {"spheres": options.spheres, "cover": options.cover}
-        else:
-            settings = {
-                "max_primitives": options.max_primitives,
-                "iou": options.iou,
-                "enclose": options.enclose,
-            }
+        of_spheres, of_primitives = ("spheres", "cover"), ("max_primitives", "iou", "enclose")
+        names = of_primitives if options.spheres is None else of_spheres
         return {
             "robot": self.robot,
-            **settings,
+            **{name: getattr(options, name) for name in names},
             "seed": options.seed,
             "links": [
                 {"link": report.link, "same_as": report.same_as, **report.fit.as_dict()}
@@ -164,3 +178,66 @@ def _decimated(link: Link, solid: Solid) -> Finding:
         f"its {solid.decimated_from} triangles were decimated to {len(solid.mesh.faces)}",
         "give the link a lighter collision mesh",
     )
+
+
+def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
+    """Return the parts that have meshes, except those that are another part at another scale."""
+    stored = read_stored_fits(library.folders) if missing else {}
+    return [
+        manifest
+        for manifest in library.manifests()
+        if not manifest.scaling and _mesh_keys(manifest) - stored.keys()
+    ]
+
+
+def _mesh_keys(manifest: Manifest) -> set[str]:
+    """Return the keys of the shapes of links with meshes."""
+    links = (shapes_to_fit(link) for link in load_part(manifest).fragment.links)
+    return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}
+
+
+def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
+    """Fit and store several parts; yield the path of each file when it is written."""
+    yield from parallel_map(store_part, manifests, jobs, chunk=1)
+
+
+def store_part(manifest: Manifest) -> Path:
+    """Fit the links of a part, write the fits beside its manifest, and return the path."""
+    fragment = load_part(manifest).fragment
+    fits = {}
+    for report in fit_links(fragment, COLLISION_OPTIONS).links:
+        shapes = shapes_to_fit(fragment.link(report.link))
+        fit = _with_token(report.link, shapes, report.fit)
+        fits[shapes_key(shapes)] = fit.scaled(1 / shapes_scale(shapes))
+    path = manifest.path.with_name(manifest.path.stem + SUFFIX)
+    write_file(path, fits_text(fits))
+    return path
+
+
+def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, StoredFit]:
+    """Return the fits of a report by link name, each with the primitive of the link's token.
+
+    The token's primitive is the known one if the robot carries it or it is stored.
+    """
+    fits = {}
+    for row in report.links:
+        shapes = shapes_to_fit(robot.link(row.link))
+        if known := find_fit(shapes, robot, stored):
+            fits[row.link] = replace(
+                known, collision=row.fit.primitives, collision_iou=row.fit.quality.iou
+            )
+        else:
+            fits[row.link] = _with_token(row.link, shapes, row.fit)
+    return fits
+
+
+def _with_token(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
+    """Return a link's fit with the primitive of its token, which is fitted if it is missing."""
+    solid = solid_of(shapes)
+    single = fit.single
+    if single is None and are_primitives(shapes):
+        single = token_of_primitives(shapes)
+    if single is None:
+        (single,) = fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives
+    token_iou = quality(solid, [single]).iou
+    return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)

@@ -1,6 +1,11 @@
 """Search for the primitives of largest intersection over union (IoU) with a solid.
 
 Initial guesses are improved by gradient ascent on a soft IoU; counted sample points decide.
+
+The membership of a point in a primitive is ``sigmoid(-distance / tau)``, so that the ratio of
+volumes has a gradient; ``tau`` decreases during the ascent. The membership in a union is
+``1 - prod(1 - membership)``, so overlaps count once. Many candidates, of one or several primitives
+each, are optimised at once.
 """
 
 from __future__ import annotations
@@ -10,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
@@ -18,7 +24,6 @@ from scipy.stats import qmc
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS, canonical
-from morphgen.fitting.soft_iou import Candidates, ascend, covered, distances, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, normalize
@@ -40,12 +45,222 @@ _AXES_TO_Z = (
     np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 )
 """Rotations whose z axis is the z, x and y axis."""
+COARSE_POINTS = 2**11
+"""Number of sample points of the first ascent."""
+NEAR_POINTS, FAR_POINTS = 2**14, 2**12
+"""Numbers of sample points close to the solid and further away."""
+NEAR, FAR = 0.02, 0.35
+"""Margins of their boxes around the bounding box, relative to the solid's size."""
+NUM_CLUSTERINGS = 4
+"""Number of clusterings from which the search for several primitives starts."""
+NUM_REFINED = 2
+"""Number of candidates that are refined on all sample points."""
+DIGITS = 6
+"""Decimals of dimensions and positions in metres; quaternions have three more."""
+NUM_SPHERE_CLUSTERINGS = 2
+"""Number of clusterings from which the search starts; more bring next to nothing."""
+EMPHASES = (6.0, 20.0, 100.0)
+"""Weights of points inside, relative to points outside, of fits that must cover the solid; tuned on
+the Panda and the UR5. The best one is larger the thinner the solid and the fewer the spheres."""
+RESERVE = 0.2
+"""Share of the volume that may stay uncovered by which a fit covers more than it must, because the
+cover is counted on sample points."""
+_TAU = (0.02, 0.006)
+"""Softness of the membership in the first ascent of several [sizes of the solid]."""
+_MIN_RADIUS = 1e-3
+"""Smallest radius of a guess and after a change of all radii [sizes of the solid]."""
+_MAX_DISTANCES = 96_000
+"""Number of distances that are evaluated together; bounds memory."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Sample points over a solid and its surroundings."""
+
+    points: Array
+    """Points, shape (n, 3)."""
+    inside: NDArray[np.bool_]
+    """Which points are inside the solid, shape (n,)."""
+    weights: Array
+    """Volume that each point represents, shape (n,); for an ascent also one per candidate."""
+
+    def take(self, chosen: slice | NDArray[np.bool_]) -> Cloud:
+        """Return some of the points."""
+        return Cloud(self.points[chosen], self.inside[chosen], self.weights[..., chosen])
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """``n`` candidates of ``k`` primitives each."""
+
+    kinds: NDArray[np.int64]
+    """Indices into ``KINDS``, shape (n, k)."""
+    centres: Array
+    """Centres, shape (n, k, 3)."""
+    quaternions: Array
+    """Rotations (w, x, y, z) of any norm, shape (n, k, 4)."""
+    halves: Array
+    """Half extents, shape (n, k, 3). A cylinder has its radius first and half its length third; a
+    sphere's radius is the first."""
+
+    def take(self, rows: NDArray[np.intp]) -> Candidates:
+        """Return the candidates of some rows."""
+        return Candidates(*(array[rows] for array in vars(self).values()))
+
+    @staticmethod
+    def stack(blocks: list[Candidates], axis: int = 0) -> Candidates:
+        """Concatenate candidates with the same number of primitives."""
+        arrays = zip(*(vars(candidates).values() for candidates in blocks), strict=True)
+        return Candidates(*(np.concatenate(array, axis=axis) for array in arrays))
+
+    @staticmethod
+    def join(blocks: list[Candidates]) -> Candidates:
+        """Concatenate primitives: candidate i of the result has those of every candidate i."""
+        return Candidates.stack(blocks, axis=1)
+
+
+def ascend(
+    candidates: Candidates,
+    cloud: Cloud,
+    *,
+    num_steps: int,
+    tau: tuple[float, float],
+    rate: tuple[float, float],
+) -> Candidates:
+    """Return the candidates after gradient ascent (Adam) on the soft IoU.
+
+    tau: Softness of the membership in the first and last step.
+    rate: Learning rate in the first and last step.
+    """
+    kinds = torch.from_numpy(candidates.kinds)
+    x, target, weight = (
+        torch.from_numpy(array.astype(np.float32))
+        for array in (cloud.points, cloud.inside, cloud.weights)
+    )
+    parameters = [
+        torch.from_numpy(start.astype(np.float32)).requires_grad_()
+        for start in (candidates.centres, candidates.quaternions, np.log(candidates.halves))
+    ]
+    centres, quaternions, logs = parameters
+    # One step of a rotation or of a logarithm moves the surface about as far as one of a centre.
+    size = float(np.exp(np.log(candidates.halves).mean()))
+    groups = [
+        {"params": [centres], "unit": 1.0},
+        {"params": [quaternions], "unit": 0.5 / size},
+        {"params": [logs], "unit": 1.0 / size},
+    ]
+    optimizer = torch.optim.Adam(groups, lr=rate[0], betas=(0.8, 0.98))
+    for step in range(num_steps):
+        progress = step / max(num_steps - 1, 1)
+        softness = tau[0] * (tau[1] / tau[0]) ** progress
+        for group in optimizer.param_groups:
+            group["lr"] = group["unit"] * rate[0] * (rate[1] / rate[0]) ** progress
+        optimizer.zero_grad(set_to_none=True)
+        distance = _distance(x, kinds, centres, quaternions, logs.exp())
+        member = 1 - torch.exp(-torch.nn.functional.softplus(-distance / softness).sum(dim=1))
+        member, weighted_target = member * weight, (target * weight).expand_as(member)
+        intersection = (member * target).sum(dim=1)
+        union = member.sum(dim=1) + weighted_target.sum(dim=1) - intersection
+        loss = -(intersection / (union + 1e-9)).sum()
+        torch.autograd.backward(loss)
+        optimizer.step()
+    with torch.no_grad():
+        centres, quaternions, logs = (tensor.double() for tensor in parameters)
+        unit = quaternions / quaternions.norm(dim=-1, keepdim=True)
+    return Candidates(candidates.kinds, centres.numpy(), unit.numpy(), logs.exp().numpy())
+
+
+def overlaps(candidates: Candidates, cloud: Cloud) -> Array:
+    """Return the IoU of each candidate by counting points, shape (n,)."""
+    target, weight = torch.from_numpy(cloud.inside), torch.from_numpy(cloud.weights)
+    n, k = candidates.kinds.shape
+    rows = max(_MAX_DISTANCES // (k * len(cloud.points)), 1)
+    ious = []
+    for start in range(0, n, rows):
+        batch = candidates.take(np.arange(start, min(start + rows, n)))
+        member = (_distances(batch, cloud.points) <= 0).any(dim=1)
+        both, either = (count.double() @ weight for count in (member & target, member | target))
+        ious.append(both / either.clamp(min=1e-12))
+    return np.asarray(torch.cat(ious).numpy())
+
+
+def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
+    """Return which points (m, 3) are inside any primitive of each candidate, shape (n, m)."""
+    return np.asarray((_distances(candidates, points) <= 0).any(dim=1).numpy())
+
+
+def distances(candidates: Candidates, points: Array) -> Array:
+    """Return the signed distances of points (m, 3) to the union of each candidate, shape (n, m)."""
+    return np.asarray(_distances(candidates, points).amin(dim=1).double().numpy())
+
+
+@torch.no_grad()
+def _distances(candidates: Candidates, points: Array) -> torch.Tensor:
+    """Return signed distances, shape (n, k, m), without gradients."""
+    arrays = (candidates.centres, candidates.quaternions, candidates.halves)
+    return _distance(
+        torch.from_numpy(points.astype(np.float32)),
+        torch.from_numpy(candidates.kinds),
+        *(torch.from_numpy(array.astype(np.float32)) for array in arrays),
+    )
+
+
+def _distance(
+    x: torch.Tensor,
+    kinds: torch.Tensor,
+    centres: torch.Tensor,
+    quaternions: torch.Tensor,
+    halves: torch.Tensor,
+) -> torch.Tensor:
+    """Return signed distances (n, k, m) of points (m, 3) to primitives (n, k)."""
+    n, k = kinds.shape
+    if bool((kinds == _SPHERE).all()):
+        # Spheres need no rotation of the points, which is most of the work.
+        from_centres = torch.cdist(centres.reshape(1, n * k, 3), x[None])
+        return from_centres.reshape(n, k, -1) - halves[:, :, :1]
+    # Primitives are sorted by kind, so that each kind is one block of tensor operations.
+    flat = kinds.reshape(-1)
+    order = torch.argsort(flat, stable=True)
+    local = _local(x, centres.reshape(-1, 3)[order], quaternions.reshape(-1, 4)[order])
+    size = halves.reshape(-1, 3)[order][:, :, None]
+    boxes, cylinders = (int((flat == KINDS.index(kind)).sum()) for kind in ("box", "cylinder"))
+    end = boxes + cylinders
+    distances = []
+    if boxes:
+        distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
+    if cylinders:
+        points, half = local[boxes:end], size[boxes:end]
+        radial = (points[:, :2].square().sum(dim=1) + 1e-12).sqrt() - half[:, 0]
+        axial = points[:, 2].abs() - half[:, 2]
+        distances.append(_rounded(torch.stack([radial, axial], dim=1)))
+    if end < len(flat):
+        distances.append((local[end:].square().sum(dim=1) + 1e-12).sqrt() - size[end:, 0])
+    return torch.cat(distances)[torch.argsort(order)].reshape(n, k, -1)
+
+
+def _rounded(beyond: torch.Tensor) -> torch.Tensor:
+    """Return signed distances from the distances beyond each pair of faces, (p, faces, m)."""
+    outside = (beyond.clamp(min=0).square().sum(dim=1) + 1e-16).sqrt()
+    return outside + beyond.amax(dim=1).clamp(max=0)
+
+
+def _local(x: torch.Tensor, centres: torch.Tensor, quaternions: torch.Tensor) -> torch.Tensor:
+    """Return points (m, 3) in the frames of primitives, shape (p, 3, m)."""
+    w, a, b, c = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(dim=-1)
+    inverse = torch.stack(
+        [
+            torch.stack([1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)], -1),
+            torch.stack([2 * (a * b - w * c), 1 - 2 * (a * a + c * c), 2 * (b * c + w * a)], -1),
+            torch.stack([2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)], -1),
+        ],
+        dim=1,
+    )
+    return inverse @ x.T - (inverse @ centres[:, :, None])
 
 
 def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
-    """Return guesses of one primitive each around a point cloud.
+    """Return guesses of one primitive each around points, shape (n, 3).
 
-    points: Points, shape (n, 3).
     axes: Rotations, shape (3, 3) each, whose axes boxes and cylinders follow, besides the
         principal axes of the points.
     """
@@ -57,97 +272,56 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
         # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
         radius = np.sqrt(5 / 3 * np.square(points - centre).sum(axis=1).mean())
         guesses.append((_SPHERE, centre, np.eye(3), np.full(3, radius)))
-    kinds, centres, rotations, halves = zip(*guesses, strict=True)
-    quaternions = Rotation.from_matrix(np.array(rotations)).as_quat(scalar_first=True)
-    return Candidates(
-        np.array(kinds)[:, None],
-        np.array(centres)[:, None],
-        quaternions[:, None],
-        np.array(halves)[:, None],
-    )
+    kinds, centres, rotations, halves = (np.array(part) for part in zip(*guesses, strict=True))
+    quaternions = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    return Candidates(kinds[:, None], centres[:, None], quaternions[:, None], halves[:, None])
 
 
-def by_pieces(
-    points: Array,
-    inside: NDArray[np.bool_],
-    weights: Array,
-    k: int,
-    seeds: list[int],
-) -> Candidates | None:
+def by_pieces(cloud: Cloud, k: int, seeds: list[int]) -> Candidates | None:
     """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
 
-    points: Points over the solid and its surroundings, shape (n, 3).
-    inside: Points that are inside the solid, shape (n,).
-    weights: Weights of the points, shape (n,).
-
-    Returns:
-        The guesses; None if a cluster has too few points in every clustering.
+    None if a cluster has too few points in every clustering.
     """
-    cloud, outside = points[inside], (points[~inside], weights[~inside])
+    inside, outside = cloud.take(cloud.inside), cloud.take(~cloud.inside)
     rows: list[Candidates] = []
     for seed in seeds:
-        _, label = kmeans2(cloud, k, minit="++", seed=seed, iter=10)
-        if np.bincount(label, minlength=k).min() < MIN_POINTS:
-            continue
-        pieces = [
-            _best_of_each_kind(cloud[label == j], weights[inside][label == j], *outside)
-            for j in range(k)
-        ]
-        rows.append(Candidates.join(pieces))
+        _, label = kmeans2(inside.points, k, minit="++", seed=seed, iter=10)
+        if np.bincount(label, minlength=k).min() >= MIN_POINTS:
+            pieces = (inside.take(label == j) for j in range(k))
+            rows.append(Candidates.join([_best_of_each_kind(piece, outside) for piece in pieces]))
     return Candidates.stack(rows) if rows else None
 
 
-def by_growth(
-    fewer: Candidates,
-    points: Array,
-    inside: NDArray[np.bool_],
-    weights: Array,
-    seed: int,
-) -> Candidates | None:
+def by_growth(fewer: Candidates, cloud: Cloud, seed: int) -> Candidates | None:
     """Return guesses with one more primitive, around a part of the solid that is not covered.
 
-    points: Points over the solid and its surroundings, shape (n, 3).
-    inside: Points that are inside the solid, shape (n,).
-    weights: Weights of the points, shape (n,).
-
-    Returns:
-        The guesses; None if too few points are uncovered.
+    None if too few points are uncovered.
     """
-    missed = inside & ~covered(fewer, points)[0]
-    cloud, outside = points[missed], (points[~inside], weights[~inside])
+    outside = cloud.take(~cloud.inside)
+    missed = cloud.take(cloud.inside & ~covered(fewer, cloud.points)[0])
     rows: list[Candidates] = []
     for n in _NUM_CLUSTERS:
-        if len(cloud) < n * MIN_POINTS:
+        if len(missed.points) < n * MIN_POINTS:
             break
-        _, label = kmeans2(cloud, n, minit="++", seed=seed, iter=10)
+        _, label = kmeans2(missed.points, n, minit="++", seed=seed, iter=10)
         for j in range(n):
             if np.count_nonzero(label == j) >= MIN_POINTS:
-                piece = cloud[label == j], weights[missed][label == j]
-                more = _best_of_each_kind(*piece, *outside)
+                more = _best_of_each_kind(missed.take(label == j), outside)
                 rows.append(Candidates.join([fewer.take(np.zeros(len(more.kinds), int)), more]))
     return Candidates.stack(rows) if rows else None
 
 
-def _best_of_each_kind(
-    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array
-) -> Candidates:
-    """Return guesses around a cluster: the best, the best box, the best cylinder.
+def _best_of_each_kind(piece: Cloud, outside: Cloud) -> Candidates:
+    """Return guesses around a cluster inside the solid: the best, the best box, the best cylinder.
 
-    piece: Points of the cluster, shape (n, 3).
-    piece_weights: Weights of these points, shape (n,).
-    outside: Points outside the solid, shape (m, 3).
-    outside_weights: Weights of these points, shape (m,).
+    outside: The points outside the solid.
     """
-    guesses = around(piece, [np.eye(3)])
-    points = np.concatenate([piece, outside])
-    weights = np.concatenate([piece_weights, outside_weights])
-    ious = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
+    guesses = around(piece.points, [np.eye(3)])
+    pairs = zip(vars(piece).values(), vars(outside).values(), strict=True)
+    ious = overlaps(guesses, Cloud(*(np.concatenate(pair) for pair in pairs)))
     kinds = guesses.kinds[:, 0]
-    best = [
-        int(np.argmax(np.where(allowed, ious, -1.0)))
-        for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
-        if allowed.any()
-    ]
+    allowed = (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
+    best = [int(np.argmax(np.where(rows, ious, -1.0))) for rows in allowed]
     return guesses.take(np.array(best))
 
 
@@ -166,35 +340,15 @@ def _along(points: Array, R: Array) -> list[tuple[int, Array, Array, Array]]:
     return guesses
 
 
-COARSE_POINTS = 2**11
-"""Number of sample points of the first ascent."""
-NEAR_POINTS, FAR_POINTS = 2**14, 2**12
-"""Numbers of sample points close to the solid and further away."""
-NEAR, FAR = 0.02, 0.35
-"""Margins of their boxes around the bounding box, relative to the solid's size."""
-NUM_CLUSTERINGS = 4
-"""Number of clusterings from which the search for several primitives starts."""
-NUM_REFINED = 2
-"""Number of candidates that are refined on all sample points."""
-DIGITS = 6
-"""Decimals of dimensions and positions in metres; quaternions have three more."""
-
-
 @dataclass(frozen=True)
-class SampledSolid:
+class SampledSolid(Cloud):
     """A solid as sample points in the frame and units of its smallest bounding box.
 
-    In that frame a thin oblique solid is hit by as many points as one along the link's axes.
+    In that frame a thin oblique solid is hit by as many points as one along the link's axes. The
+    points are shuffled, and the mean of their weights is 1; sparse points weigh more.
     """
 
     solid: Solid
-    points: Array
-    """Points over the solid and its surroundings [sizes of the solid], shape (n, 3), shuffled."""
-    inside: NDArray[np.bool_]
-    """Points that are inside the solid, shape (n,)."""
-    weights: Array
-    """Volume that each point represents, mean 1, shape (n,); sparse points weigh more."""
-
     R_link_box: Array
     """Axes of the smallest bounding box in the link frame, shape (3, 3)."""
     centre: Array
@@ -219,18 +373,11 @@ class SampledSolid:
             strict=True,
         ):
             x, y, z = np.maximum(halves, 10.0**-DIGITS).tolist()
-            geometry: Box | Cylinder | Sphere
-            match KINDS[kind]:
-                case "box":
-                    geometry = Box((2 * x, 2 * y, 2 * z))
-                case "cylinder":
-                    geometry = Cylinder(x, 2 * z)
-                case "sphere":
-                    geometry = Sphere(x)
+            geometries = (Box((2 * x, 2 * y, 2 * z)), Cylinder(x, 2 * z), Sphere(x))
             a, b, c = np.round(centre, DIGITS).tolist()
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
             pose = Pose((a, b, c), normalize((w, i, j, k)))
-            shapes.append(canonical(Shape(geometry, pose)))
+            shapes.append(canonical(Shape(geometries[kind], pose)))  # in the order of KINDS
         return tuple(shapes)
 
 
@@ -266,7 +413,7 @@ def sample_solid(solid: Solid, seed: int) -> SampledSolid:
     inside = solid.contains(points * solid.size @ R_link_box.T + centre)
     if inside[:COARSE_POINTS].sum() < 2 * MIN_POINTS:
         raise FitError(f"the solid is too thin: it fills {inside.mean():.2%} of its bounding box")
-    return SampledSolid(solid, points, inside, volumes / volumes.mean(), R_link_box, centre)
+    return SampledSolid(points, inside, volumes / volumes.mean(), solid, R_link_box, centre)
 
 
 def best_single(target: SampledSolid) -> SearchResult:
@@ -274,97 +421,60 @@ def best_single(target: SampledSolid) -> SearchResult:
     with one_torch_thread():
         cloud = target.points[target.inside]
         start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
-        return _refine(target, ascend_coarsely(target, start, target.weights, (0.03, 0.008)))
+        return _refine(target, _ascend_coarsely(target, start, (0.03, 0.008)))
 
 
 def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
     """Return the primitives of largest IoU, one more than in an earlier result.
 
-    Returns:
-        The primitives; None if the solid has too few sample points for them.
+    None if the solid has too few sample points for them.
     """
     seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(NUM_CLUSTERINGS)]
-    subset = slice(4 * COARSE_POINTS)
-    cloud = target.points[subset], target.inside[subset], target.weights[subset]
-    k = len(fewer.shapes) + 1
+    cloud = target.take(slice(4 * COARSE_POINTS))
     with one_torch_thread():
         starts = (
-            by_pieces(*cloud, k, seeds),
-            by_growth(fewer.candidate, *cloud, seeds[0]),
+            by_pieces(cloud, len(fewer.shapes) + 1, seeds),
+            by_growth(fewer.candidate, cloud, seeds[0]),
         )
         guesses = [start for start in starts if start is not None]
         if not guesses:
             return None
-        start = Candidates.stack(guesses)
-        return _refine(target, ascend_coarsely(target, start, target.weights, (0.02, 0.006)))
+        return _refine(target, _ascend_coarsely(target, Candidates.stack(guesses), _TAU))
 
 
 def _refine(target: SampledSolid, coarse: Candidates) -> SearchResult:
     """Improve the best candidates on all points, and return the best one."""
-    points, inside, weights = target.points, target.inside, target.weights
-    order = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")
-    fine = ascend_finely(target, coarse.take(order[:NUM_REFINED]), weights)
-    ious = overlaps(fine, points, inside, weights)
+    order = np.argsort(-overlaps(coarse, target), kind="stable")
+    fine = _ascend_finely(target, coarse.take(order[:NUM_REFINED]))
+    ious = overlaps(fine, target)
     row = int(np.argmax(ious))
     return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))
 
 
-def ascend_coarsely(
-    target: SampledSolid, start: Candidates, weights: Array, tau: tuple[float, float]
-) -> Candidates:
-    """Improve candidates on few sample points; see ``soft_iou.ascend`` for the arguments."""
-    return ascend(
-        start,
-        target.points[:COARSE_POINTS],
-        target.inside[:COARSE_POINTS],
-        weights=weights[..., :COARSE_POINTS],
-        num_steps=100,
-        tau=tau,
-        rate=(0.01, 0.003),
-    )
+def _ascend_coarsely(cloud: Cloud, start: Candidates, tau: tuple[float, float]) -> Candidates:
+    """Improve candidates on few sample points."""
+    few = cloud.take(slice(COARSE_POINTS))
+    return ascend(start, few, num_steps=100, tau=tau, rate=(0.01, 0.003))
 
 
-def ascend_finely(target: SampledSolid, coarse: Candidates, weights: Array) -> Candidates:
-    """Improve candidates on all sample points; see ``soft_iou.ascend`` for the arguments."""
-    return ascend(
-        coarse,
-        target.points,
-        target.inside,
-        weights=weights,
-        num_steps=60,
-        tau=(0.006, 0.0015),
-        rate=(0.004, 0.0004),
-    )
-
-
-NUM_SPHERE_CLUSTERINGS = 2
-"""Number of clusterings from which the search starts; more bring next to nothing."""
-EMPHASES = (6.0, 20.0, 100.0)
-"""Weights of points inside, relative to points outside, of fits that must cover the solid; tuned on
-the Panda and the UR5. The best one is larger the thinner the solid and the fewer the spheres."""
-RESERVE = 0.2
-"""Share of the volume that may stay uncovered by which a fit covers more than it must, because the
-cover is counted on sample points."""
-_TAU = (0.02, 0.006)
-"""Softness of the membership in the first ascent [sizes of the solid]."""
-_MIN_RADIUS = 1e-3
-"""Smallest radius of a guess and after a change of all radii [sizes of the solid]."""
+def _ascend_finely(cloud: Cloud, coarse: Candidates) -> Candidates:
+    """Improve candidates on all sample points."""
+    return ascend(coarse, cloud, num_steps=60, tau=(0.006, 0.0015), rate=(0.004, 0.0004))
 
 
 def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -> SearchResult:
-    """Return the spheres of largest IoU."""
+    """Return the spheres of largest IoU, of those that cover a share of the solid if given."""
     seeds = np.random.SeedSequence(seed).generate_state(NUM_SPHERE_CLUSTERINGS + 1).tolist()
     emphases = (1.0,) if cover is None else EMPHASES
+    # Spheres are chosen for points that did not shape them, or they would cover less of others.
     judge = target if cover is None else sample_solid(target.solid, seeds[-1])
     with one_torch_thread():
         start, weights = _starts(target, n, seeds[:NUM_SPHERE_CLUSTERINGS], emphases)
-        coarse = ascend_coarsely(target, start, weights, _TAU)
-        ious = overlaps(*_judged(target, coarse, cover))
-        best = np.array([np.argmax(ious)])
-        fine = ascend_finely(target, coarse.take(best), weights[best])
-        judged = _judged(judge, fine, cover)
-        (iou,) = overlaps(*judged)
-    final = judged[0]
+        coarse = _ascend_coarsely(replace(target, weights=weights), start, _TAU)
+        best = np.array([np.argmax(overlaps(_covering(target, coarse, cover), target))])
+        fine = _ascend_finely(replace(target, weights=weights[best]), coarse.take(best))
+        final = _covering(judge, fine, cover)
+        (iou,) = overlaps(final, judge)
     return SearchResult(target.shapes(final, 0), float(iou), final)
 
 
@@ -373,8 +483,8 @@ def _starts(
 ) -> tuple[Candidates, Array]:
     """Return guesses from every clustering for every emphasis, and their weights of the points."""
     cloud = target.points[target.inside][: 2 * COARSE_POINTS]
-    centres = np.zeros((len(seeds), n, 3))
-    radii = np.zeros((len(seeds), n))
+    shape = (len(seeds), n)
+    centres, radii = np.zeros((*shape, 3)), np.zeros(shape)
     for row, seed in enumerate(seeds):
         with warnings.catch_warnings():
             # A cluster without points is a guess as good as any.
@@ -384,41 +494,26 @@ def _starts(
         counts = np.maximum(np.bincount(label, minlength=n), 1)
         # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
         radii[row] = np.sqrt(5 / 3 * np.bincount(label, squares, minlength=n) / counts)
-    candidates = _spheres(centres, np.maximum(radii, _MIN_RADIUS))
+    candidates = Candidates(
+        np.full(shape, _SPHERE),
+        centres,
+        np.broadcast_to(IDENTITY, (*shape, 4)).copy(),
+        np.repeat(np.maximum(radii, _MIN_RADIUS)[..., None], 3, axis=2),
+    )
     emphasis = np.repeat(emphases, len(seeds))[:, None]
     weights = np.where(target.inside, emphasis, 1.0) * target.weights
     return Candidates.stack([candidates] * len(emphases)), weights
 
 
-def _spheres(centres: Array, radii: Array) -> Candidates:
-    """Return candidates from centres (n, k, 3) and radii (n, k)."""
-    shape = radii.shape
-    return Candidates(
-        np.full(shape, KINDS.index("sphere")),
-        centres,
-        np.broadcast_to(IDENTITY, (*shape, 4)).copy(),
-        np.repeat(radii[..., None], 3, axis=2),
-    )
-
-
-def _judged(
-    sample: SampledSolid, candidates: Candidates, cover: float | None
-) -> tuple[Candidates, Array, NDArray[np.bool_], Array]:
-    """Return candidates that cover a share of the sample's inside, and the sample's points.
-
-    The radii of each candidate change by one length, up or down.
-
-    Returns:
-        The arguments of ``overlaps``.
-    """
-    points, inside, weights = sample.points, sample.inside, sample.weights
-    if cover is not None:
-        share = 1 - (1 - cover) * (1 - RESERVE)
-        away = distances(candidates, points[inside])
-        order = np.argsort(away, axis=1)
-        covered = np.cumsum(weights[inside][order], axis=1) / weights[inside].sum()
-        last = np.argmax(covered >= share, axis=1)
-        change = np.take_along_axis(away, order, axis=1)[np.arange(len(away)), last]
-        halves = np.maximum(candidates.halves + change[:, None, None], _MIN_RADIUS)
-        candidates = replace(candidates, halves=halves)
-    return candidates, points, inside, weights
+def _covering(cloud: Cloud, candidates: Candidates, cover: float | None) -> Candidates:
+    """Return candidates that cover a share of the solid: the radii change by one length each."""
+    if cover is None:
+        return candidates
+    share = 1 - (1 - cover) * (1 - RESERVE)
+    away = distances(candidates, cloud.points[cloud.inside])
+    order = np.argsort(away, axis=1)
+    weights = cloud.weights[cloud.inside]
+    last = np.argmax(np.cumsum(weights[order], axis=1) / weights.sum() >= share, axis=1)
+    change = np.take_along_axis(away, order, axis=1)[np.arange(len(away)), last]
+    halves = np.maximum(candidates.halves + change[:, None, None], _MIN_RADIUS)
+    return replace(candidates, halves=halves)

@@ -9,8 +9,8 @@ import trimesh
 import morphgen
 from morphgen.errors import FitError, MeshError
 from morphgen.fitting import convex_pieces as module
-from morphgen.fitting.agreement import agreement
 from morphgen.fitting.convex_pieces import MAX_PIECES, as_convex, decompose
+from morphgen.fitting.fitted_robot import agreement
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle

@@ -249,7 +249,3 @@ def test_points_without_volume_are_an_error(points: Array, reason: str) -> None:
 def test_invalid_arguments_raise_value_error() -> None:
     with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
         enclose(CUBE[:, :2])
-    with pytest.raises(ValueError, match="valid: some of box, cylinder, sphere"):
-        enclose(CUBE, [])
-    with pytest.raises(ValueError, match="capsule"):
-        enclose(CUBE, ["box", "capsule"])  # type: ignore[list-item]

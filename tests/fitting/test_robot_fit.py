@@ -12,14 +12,8 @@ from morphgen.cli import main
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting import robot_fit
 from morphgen.fitting import token_shapes as token_shapes_module
-from morphgen.fitting.agreement import agreement
+from morphgen.fitting.fitted_robot import agreement
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
-from morphgen.fitting.part_fits import (
-    COLLISION_OPTIONS,
-    TOKEN_OPTIONS,
-    parts_with_meshes,
-    store_part,
-)
 from morphgen.fitting.quality import quality, signed_distance
 from morphgen.fitting.replace_collision import (
     as_primitives,
@@ -27,7 +21,13 @@ from morphgen.fitting.replace_collision import (
     with_fits,
     with_primitives,
 )
-from morphgen.fitting.robot_fit import fit_links
+from morphgen.fitting.robot_fit import (
+    COLLISION_OPTIONS,
+    TOKEN_OPTIONS,
+    fit_links,
+    parts_with_meshes,
+    store_part,
+)
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle

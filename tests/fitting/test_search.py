@@ -14,14 +14,16 @@ from morphgen.fitting.quality import quality
 from morphgen.fitting.search import (
     DIGITS,
     MIN_POINTS,
+    Cloud,
     around,
     best_several,
     best_single,
     by_growth,
     by_pieces,
+    covered,
+    overlaps,
     sample_solid,
 )
-from morphgen.fitting.soft_iou import covered, overlaps
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
 
@@ -239,7 +241,8 @@ def test_one_initial_guess_is_near_the_true_primitive():
     surroundings += (0.1, 0.0, 0.2)
     local = np.abs((surroundings - (0.1, 0.0, 0.2)) @ R)
     inside = (local <= np.array((0.2, 0.1, 0.05))).all(axis=1)
-    assert overlaps(around(points, [np.eye(3)]), surroundings, inside).max() > 0.8
+    sample = Cloud(surroundings, inside, np.ones(len(inside)))
+    assert overlaps(around(points, [np.eye(3)]), sample).max() > 0.8
 
 
 def test_the_guessed_sphere_matches_points_in_a_ball():
@@ -253,10 +256,7 @@ def test_the_guessed_sphere_matches_points_in_a_ball():
 
 def test_pieces_give_three_reproducible_guesses_per_clustering():
     target = target_of(*ANGLE)
-    seeds = [5, 6]
-    first, second = (
-        by_pieces(target.points, target.inside, target.weights, 2, seeds) for _ in range(2)
-    )
+    first, second = (by_pieces(target, 2, [5, 6]) for _ in range(2))
     assert first is not None
     assert first.kinds.shape == (6, 2)
     assert (first.halves > 0).all()
@@ -265,14 +265,14 @@ def test_pieces_give_three_reproducible_guesses_per_clustering():
     assert first.kinds[2::3].tolist() == [[cylinder, cylinder]] * 2
     for name in ("kinds", "centres", "quaternions", "halves"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    scores = overlaps(first, target.points, target.inside, target.weights)
+    scores = overlaps(first, target)
     assert scores.max() > 0.6
 
 
 def test_a_solid_with_few_points_is_not_split():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
     few = np.arange(500) < 3 * MIN_POINTS
-    assert by_pieces(points, few, np.ones(500), 4, [0, 1, 2]) is None
+    assert by_pieces(Cloud(points, few, np.ones(500)), 4, [0, 1, 2]) is None
 
 
 def test_too_few_points_give_no_further_primitives():
@@ -297,8 +297,8 @@ def test_an_added_primitive_starts_at_the_uncovered_part_of_the_solid():
 def test_a_fully_covered_solid_gives_no_further_guess():
     target = target_of(Shape(Box((0.1, 0.2, 0.3))))
     one = best_single(target)
-    some = target.points[target.inside & covered(one.candidate, target.points)[0]]
-    assert by_growth(one.candidate, some, np.ones(len(some), bool), np.ones(len(some)), 0) is None
+    some = target.take(target.inside & covered(one.candidate, target.points)[0])
+    assert by_growth(one.candidate, some, 0) is None
 
 
 @pytest.mark.slow

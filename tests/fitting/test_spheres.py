@@ -8,11 +8,10 @@ import trimesh
 
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
-from morphgen.fitting.collision_geometry import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
 from morphgen.fitting.quality import quality, signed_distance
-from morphgen.fitting.search import best_spheres, sample_solid
-from morphgen.fitting.soft_iou import Candidates, distances
+from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
+from morphgen.fitting.search import Candidates, best_spheres, distances, sample_solid
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
