@@ -25,7 +25,14 @@ from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.part import load_part
 from morphgen.grammar.syntax import MAX_COUNT, MAX_FAULTS, MAX_PARTS, MAX_SEARCH, Alternative, Item
-from morphgen.grammar.values import Distribution, Scope, distribution_of, evaluate, typical_value
+from morphgen.grammar.values import (
+    Distribution,
+    Draw,
+    Scope,
+    distribution_of,
+    evaluate,
+    typical_value,
+)
 
 
 class SearchError(GrammarError):
@@ -72,11 +79,16 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
                 )
 
 
-def typical_names(grammar: Grammar) -> dict[str, tuple[float, str]]:
-    """Return the typical value and the unit of every name defined by ``let``."""
+def _typical_scope(grammar: Grammar) -> Scope:
+    """Return a scope with typical values of all names and distributions."""
+    return Scope(_let_values(grammar, typical_value), typical_value, "")
+
+
+def _let_values(grammar: Grammar, draw: Draw) -> dict[str, tuple[float, str]]:
+    """Return the value and the unit of every name defined by ``let``."""
     names: dict[str, tuple[float, str]] = {}
     for let in grammar.lets:
-        names[let.name] = evaluate(let.expression, Scope(names, typical_value, ""))
+        names[let.name] = evaluate(let.expression, Scope(names, draw, ""))
     return names
 
 
@@ -124,15 +136,12 @@ def _derivations(grammar: Grammar, library: Library, max_parts: int) -> Iterator
 def _fewest_parts(possible: Mapping[str, Sequence[Alternative]]) -> dict[str, int]:
     """Return the smallest number of parts of each symbol, at most ``MAX_PARTS + 1``."""
     fewest = dict.fromkeys(possible, MAX_PARTS + 1)
-    changed = True
-    while changed:  # fixed-point iteration, as symbols may be recursive
-        changed = False
+    before: dict[str, int] = {}
+    while fewest != before:  # fixed-point iteration, as symbols may be recursive
+        before = dict(fewest)
         for symbol, alternatives in possible.items():
             sizes = (count_fewest_parts(alternative, fewest) for alternative in alternatives)
-            least = min(sizes, default=fewest[symbol])
-            if least < fewest[symbol]:
-                fewest[symbol] = least
-                changed = True
+            fewest[symbol] = min((fewest[symbol], *sizes))
     return fewest
 
 
@@ -171,7 +180,7 @@ def _capped(number: int) -> int:
 
 def _possible_alternatives(grammar: Grammar) -> dict[str, list[Alternative]]:
     """Return the alternatives of each symbol with a positive weight at typical values."""
-    scope = Scope(typical_names(grammar), typical_value, "")
+    scope = _typical_scope(grammar)
     return {
         production.symbol: [
             alternative
@@ -188,6 +197,14 @@ MAX_CHECKED_INFINITE = 40
 """The same limit for a grammar with infinitely many structures."""
 INNER_QUANTILE = 0.381966
 """Quantile of a test value that is neither a bound nor the middle; 1 - 1 / golden ratio."""
+_TESTED: tuple[Draw, ...] = (
+    lambda _, distribution: distribution.bounds[0],
+    lambda _, distribution: distribution.bounds[1],
+    typical_value,
+    # Neither a bound nor the middle, and no integer if it need not be one.
+    lambda _, distribution: distribution.draw(lambda: INNER_QUANTILE, lambda: INNER_QUANTILE),
+)
+"""Selections of the values that ``check_grammar`` tests."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +240,14 @@ def load_sound_grammar(name: str, library: Library) -> Grammar:
 
 def variables(grammar: Grammar) -> list[Variable]:
     """Return every value that the grammar draws."""
-    scope = Scope(typical_names(grammar), typical_value, "")
+    scope = _typical_scope(grammar)
     expressions = [(f"let {let.name}", let.expression) for let in grammar.lets]
-    for production in grammar.productions:
-        for item in production.items():
-            for name, expression in item.arguments:
-                expressions.append((f"{production.symbol}: {item.name}.{name}", expression))
+    expressions += [
+        (f"{production.symbol}: {item.name}.{name}", expression)
+        for production in grammar.productions
+        for item in production.items()
+        for name, expression in item.arguments
+    ]
     return [
         Variable(location, distribution_of(call, scope)[0], str(call))
         for location, expression in expressions
@@ -239,15 +258,12 @@ def variables(grammar: Grammar) -> list[Variable]:
 
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     """Test all items with each distribution at its bounds, its typical and an inner value."""
-    for draw in (_lowest, _highest, typical_value, _inner):
-        names: dict[str, tuple[float, str]] = {}
+    for draw in _TESTED:
         try:
-            for let in grammar.lets:
-                names[let.name] = evaluate(let.expression, Scope(names, draw, ""))
+            scope = Scope(_let_values(grammar, draw), draw, "")
         except GrammarError as error:
             yield str(error)
             return
-        scope = Scope(names, draw, "")
         items = (item for production in grammar.productions for item in production.items())
         faults = (fault for item in items for fault in _faults_of(item, grammar, library, scope))
         reported = dict.fromkeys(islice(faults, MAX_FAULTS))
@@ -273,42 +289,25 @@ def _faults_of(item: Item, grammar: Grammar, library: Library, scope: Scope) -> 
 
 
 def _never_ending(grammar: Grammar) -> Iterator[str]:
-    """Find symbols without a finite derivation, in time linear in the grammar's size."""
+    """Find symbols without a finite derivation."""
     symbols = {production.symbol for production in grammar.productions}
-    unresolved: list[tuple[str, set[str]]] = []
-    """(symbol, symbols of one of its alternatives that are not known to end)."""
-    waiting: dict[str, list[int]] = {}
-    """Indices into ``unresolved`` of the alternatives that contain a symbol."""
-    pending: list[str] = []
-    """Symbols that end and are not processed yet."""
-    for production, alternative in grammar.alternatives():
-        names = {item.name for item in alternative.items} & symbols
-        for name in names:
-            waiting.setdefault(name, []).append(len(unresolved))
-        unresolved.append((production.symbol, names))
-        if not names:
-            pending.append(production.symbol)
+    contents = [
+        (production.symbol, symbols & {item.name for item in alternative.items})
+        for production, alternative in grammar.alternatives()
+    ]
     ending: set[str] = set()
-    while pending:
-        name = pending.pop()
-        if name in ending:
-            continue
-        ending.add(name)
-        for index in waiting.get(name, ()):
-            symbol, names = unresolved[index]
-            names.discard(name)
-            if not names:
-                pending.append(symbol)
-    for p in grammar.productions:
-        if p.symbol not in ending:
-            yield f"{p.location}: {p.symbol!r} never ends: it always holds itself"
+    # A symbol ends if all symbols of one of its alternatives do.
+    while found := {symbol for symbol, names in contents if names <= ending} - ending:
+        ending |= found
+    for production in grammar.productions:
+        if (symbol := production.symbol) not in ending:
+            yield f"{production.location}: {symbol!r} never ends: it always holds itself"
 
 
 def _circular(grammar: Grammar) -> Iterator[str]:
     """Find symbols that can be rewritten to themselves and nothing else."""
-    # scipy is imported here because `morphgen compose` does not need it.
     import numpy as np
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_matrix  # `morphgen compose` does not need it
     from scipy.sparse.csgraph import connected_components
 
     index = {production.symbol: i for i, production in enumerate(grammar.productions)}
@@ -330,19 +329,10 @@ def _circular(grammar: Grammar) -> Iterator[str]:
 
 
 def _unreachable(grammar: Grammar) -> Iterator[str]:
-    reached, pending = {grammar.start}, [grammar.start]
-    while pending:
-        production = grammar.production(pending.pop())
-        for item in production.items() if production else ():
-            if item.name not in reached:
-                reached.add(item.name)
-                pending.append(item.name)
+    reached = _symbol_graph(grammar, {p.symbol: p.alternatives for p in grammar.productions})
     for production in grammar.productions:
-        if production.symbol not in reached:
-            yield (
-                f"{production.location}: {production.symbol!r} cannot be reached from "
-                f"{grammar.start!r}"
-            )
+        if (symbol := production.symbol) not in reached:
+            yield f"{production.location}: {symbol!r} cannot be reached from {grammar.start!r}"
 
 
 def _unused(grammar: Grammar) -> Iterator[str]:
@@ -383,16 +373,3 @@ def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
         if num_structures == 0:
             limits = f"{MAX_PARTS} parts and {MAX_PARTS} levels"
             yield f"{location}: found no structure of at most {limits}"
-
-
-def _lowest(key: str, distribution: Distribution) -> float:
-    return distribution.bounds[0]
-
-
-def _highest(key: str, distribution: Distribution) -> float:
-    return distribution.bounds[1]
-
-
-def _inner(key: str, distribution: Distribution) -> float:
-    """Return a value that is neither bound nor middle; not an integer if it need not be one."""
-    return distribution.draw(lambda: INNER_QUANTILE, lambda: INNER_QUANTILE)

@@ -18,7 +18,7 @@ from lark.visitors import Transformer_NonRecursive
 
 from morphgen.errors import GrammarError
 from morphgen.formats.rounding import format_number
-from morphgen.grammar.syntax import MAX_DERIVATION_TEXT, MAX_PARTS
+from morphgen.grammar.syntax import MAX_DERIVATION_TEXT, MAX_PARTS, require_at_most
 
 _SYNTAX = r"""
 node: NAME "=" NAME ["(" value ("," value)* ")"] ["[" child ("," child)* "]"]
@@ -65,11 +65,8 @@ class Derivation:
 
 def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
     """Parse the text of a derivation."""
-    if len(text) > MAX_DERIVATION_TEXT:
-        raise GrammarError(
-            f"{origin}: a derivation of {len(text):,} characters; expected at most "
-            f"{MAX_DERIVATION_TEXT:,}"
-        )
+    what = f"{origin}: a derivation of {len(text):,} characters"
+    require_at_most(len(text), MAX_DERIVATION_TEXT, what)
     try:
         derivation: Derivation = _Builder(origin).transform(_parser().parse(text))
     except UnexpectedInput as error:
@@ -90,7 +87,14 @@ def outline(derivation: Derivation) -> str:
 
 def difference(a: Derivation, b: Derivation) -> list[str]:
     """Return the differences of two derivations, one line each; empty if they are equal."""
-    return [f"{sign} {line}" for sign, line in _difference(_flat(a), _flat(b))]
+    facts = {"-": _flat(a), "+": _flat(b)}
+    return [
+        f"{sign} {key} = {side[key]}"
+        for key in dict.fromkeys((*facts["-"], *facts["+"]))
+        if facts["-"].get(key) != facts["+"].get(key)
+        for sign, side in facts.items()
+        if key in side
+    ]
 
 
 def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
@@ -111,16 +115,6 @@ def _flat(derivation: Derivation) -> dict[str, str]:
     return facts
 
 
-def _difference(a: dict[str, str], b: dict[str, str]) -> Iterator[tuple[str, str]]:
-    for key in dict.fromkeys((*a, *b)):
-        if a.get(key) == b.get(key):
-            continue
-        if key in a:
-            yield "-", f"{key} = {a[key]}"
-        if key in b:
-            yield "+", f"{key} = {b[key]}"
-
-
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
     return Lark(_SYNTAX, parser="lalr", start="node", maybe_placeholders=False)
@@ -136,11 +130,8 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
 
     def node(self, label: Token, part: Token, *rest: Any) -> Derivation:
         self._parts += 1
-        if self._parts > MAX_PARTS:
-            raise GrammarError(
-                f"{self._origin}: a derivation has more than {MAX_PARTS} parts; expected at most "
-                f"{MAX_PARTS}"
-            )
+        what = f"{self._origin}: a derivation has more than {MAX_PARTS} parts"
+        require_at_most(self._parts, MAX_PARTS, what)
         values = tuple(entry for entry in rest if isinstance(entry[1], float))
         children = tuple(entry for entry in rest if isinstance(entry[1], Derivation))
         return Derivation(str(label), str(part), values, children)

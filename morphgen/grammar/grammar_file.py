@@ -24,6 +24,7 @@ from morphgen.grammar.syntax import (
     Statement,
     Where,
     parse_grammar,
+    require_at_most,
 )
 from morphgen.grammar.values import require_condition
 
@@ -111,21 +112,19 @@ def grammar_from_text(text: str, name: str) -> Grammar:
 
 def grammar_text(grammar: Grammar) -> str:
     """Return the grammar with its includes as one text, the start symbol first."""
-    ordered = sorted(grammar.productions, key=lambda p: p.symbol != grammar.start)
     lines = [f"let {let.name} = {let.expression}" for let in grammar.lets]
-    for production in ordered:
-        alternatives = []
-        for alternative in production.alternatives:
-            weight = f"@weight({alternative.weight}) " if alternative.weight else ""
-            alternatives.append(weight + " ".join(map(_item_text, alternative.items)))
+    for production in sorted(grammar.productions, key=lambda p: p.symbol != grammar.start):
+        alternatives = map(_alternative_text, production.alternatives)
         lines.append(f"{production.symbol} -> {' | '.join(alternatives)}")
     lines += [f"where {condition}" for condition in grammar.wheres]
     text = "".join(f"{line}\n" for line in lines)
-    if len(text) > MAX_TEXT:
-        raise GrammarError(
-            f"{grammar.name}: {len(text):,} characters as one text; expected at most {MAX_TEXT:,}"
-        )
+    require_at_most(len(text), MAX_TEXT, f"{grammar.name}: {len(text):,} characters as one text")
     return text
+
+
+def _alternative_text(alternative: Alternative) -> str:
+    weight = f"@weight({alternative.weight}) " if alternative.weight else ""
+    return weight + " ".join(map(_item_text, alternative.items))
 
 
 def _item_text(item: Item) -> str:
@@ -150,15 +149,11 @@ def _build(
     wheres = tuple(s.condition for s in statements if isinstance(s, Where))
     for where in wheres:
         require_condition(where)
+    # Of several definitions the last counts; a file comes after those that it includes.
+    symbols = {p.symbol: p for p in productions}
+    lets = {s.name: s for s in statements if isinstance(s, Let)}
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
-    return Grammar(
-        name,
-        start,
-        tuple({p.symbol: p for p in productions}.values()),
-        tuple({s.name: s for s in statements if isinstance(s, Let)}.values()),
-        wheres,
-        digest,
-    )
+    return Grammar(name, start, tuple(symbols.values()), tuple(lets.values()), wheres, digest)
 
 
 class _Reader:
@@ -171,11 +166,8 @@ class _Reader:
         """Statements of all files, those of an include before those of the including file."""
         self.texts: list[str] = []
         self._read(path, ())
-        if len(self.statements) > MAX_STATEMENTS:
-            raise GrammarError(
-                f"{path}: {len(self.statements):,} statements with its includes; expected at most "
-                f"{MAX_STATEMENTS:,}"
-            )
+        what = f"{path}: {len(self.statements):,} statements with its includes"
+        require_at_most(len(self.statements), MAX_STATEMENTS, what)
 
     def _read(self, path: Path, above: tuple[Path, ...]) -> None:
         if path.resolve() in (p.resolve() for p in above):

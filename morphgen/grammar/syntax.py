@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import string
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from lark import Lark, Token, Tree, UnexpectedInput, v_args
+from lark import Lark, Token, UnexpectedInput, v_args
 from lark.exceptions import VisitError
 from lark.visitors import Transformer_NonRecursive
 
@@ -48,7 +49,7 @@ include: "include" (STRING | NAME)
 let: "let" NAME "=" sum
 where: "where" or_
 production: NAME _ARROW alternative ("|" alternative)*
-alternative: weight? item+
+alternative: [weight] item+
 weight: _WEIGHT "(" sum ")"
 item: [NAME ":"] NAME ["(" [argument ("," argument)*] ")"] [repetition]
 argument: NAME "=" sum
@@ -117,17 +118,10 @@ _TOKEN_NAMES = {
 }
 
 
-def parse_tree(text: str, origin: str, start: str) -> Tree[Token]:
-    """Parse a text."""
-    if len(text) > MAX_TEXT:
-        raise GrammarError(
-            f"{origin}: a text of {len(text):,} characters; expected at most {MAX_TEXT:,}"
-        )
-    text = text.replace("\r\n", "\n")
-    try:
-        return _parser().parse(text, start=start)
-    except UnexpectedInput as error:
-        raise GrammarError(_message(error, text, origin)) from error
+def require_at_most(number: int, most: int, text: str) -> None:
+    """Require that a size keeps a limit; ``text`` says where it is and what it is of."""
+    if number > most:
+        raise GrammarError(f"{text}; expected at most {most:,}")
 
 
 @lru_cache(maxsize=1)
@@ -136,21 +130,22 @@ def _parser() -> Lark:
 
 
 def _message(error: UnexpectedInput, text: str, origin: str) -> str:
+    """Return the location of a syntax error, what is there, and what may be there."""
     line, column, token = error.line, error.column, getattr(error, "token", None)
-    ended = token is not None and token.type == "$END"
-    if ended:
-        lines = text.rstrip().split("\n")
-        line, column = len(lines), len(lines[-1]) + 1
-    names = getattr(error, "accepts", None) or getattr(error, "expected", None)
-    names = names or getattr(error, "allowed", None) or ()
-    expected = sorted({_TOKEN_NAMES.get(name, name) for name in names})
-    if ended:
-        token_text = "the end"
+    kind = "" if token is None else token.type
+    if kind in ("$END", "_END"):
+        token_text = "the end" if kind == "$END" else "the end of the line"
     elif token is not None:
-        word = str(token) if len(token) <= MAX_WORD else f"{token[:MAX_WORD]}..."
-        token_text = "the end of the line" if token.type == "_END" else repr(word)
+        token_text = repr(str(token) if len(token) <= MAX_WORD else f"{token[:MAX_WORD]}...")
     else:
         token_text = repr(text.split("\n")[line - 1][column - 1 : column])
+    if kind == "$END":
+        lines = text.rstrip().split("\n")
+        line, column = len(lines), len(lines[-1]) + 1
+    # Lark's parser and its lexer name what they expect by different attributes.
+    attributes = (getattr(error, name, None) for name in ("accepts", "expected", "allowed"))
+    names = next(filter(None, attributes), ())
+    expected = sorted({_TOKEN_NAMES.get(name, name) for name in names})
     return f"{origin}:{line}:{column}: found {token_text}, expected {' or '.join(expected)}"
 
 
@@ -185,11 +180,8 @@ class Expression:
 
     def __post_init__(self) -> None:
         levels = 1 + max((operand.levels for operand in self.operands), default=0)
-        if levels > MAX_NESTING:
-            raise GrammarError(
-                f"{self.location}: an expression of more than {MAX_NESTING} levels; expected at "
-                f"most {MAX_NESTING}"
-            )
+        what = f"{self.location}: an expression of more than {MAX_NESTING} levels"
+        require_at_most(levels, MAX_NESTING, what)
         object.__setattr__(self, "levels", levels)
 
     def walk(self) -> Iterator[Expression]:
@@ -291,9 +283,12 @@ def parse_condition(text: str, origin: str = "--where") -> Expression:
 
 
 def _parse(text: str, origin: str, start: str) -> Any:
-    tree = parse_tree(text, origin, start)
+    require_at_most(len(text), MAX_TEXT, f"{origin}: a text of {len(text):,} characters")
+    text = text.replace("\r\n", "\n")
     try:
-        return _Builder(origin).transform(tree)
+        return _Builder(origin).transform(_parser().parse(text, start=start))
+    except UnexpectedInput as error:
+        raise GrammarError(_message(error, text, origin)) from error
     except VisitError as error:
         raise error.orig_exc from error
 
@@ -310,22 +305,16 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         return SourceLocation(self._origin, token.line or 1, token.column or 1)
 
     def _word(self, token: Token) -> Token:
-        if len(token) > MAX_WORD:
-            raise GrammarError(
-                f"{self._location(token)}: a word of {len(token):,} characters; expected at most "
-                f"{MAX_WORD}"
-            )
+        what = f"{self._location(token)}: a word of {len(token):,} characters"
+        require_at_most(len(token), MAX_WORD, what)
         return token
 
     NAME = INT = QUANTITY = _word
 
     def grammar(self, *children: Statement | None) -> list[Statement]:
         statements = [statement for statement in children if statement is not None]
-        if len(statements) > MAX_STATEMENTS:
-            raise GrammarError(
-                f"{self._origin}: {len(statements):,} statements; expected at most "
-                f"{MAX_STATEMENTS:,}"
-            )
+        what = f"{self._origin}: {len(statements):,} statements"
+        require_at_most(len(statements), MAX_STATEMENTS, what)
         return statements
 
     def include(self, target: Token) -> Include:
@@ -339,52 +328,40 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
 
     def production(self, symbol: Token, *alternatives: Alternative) -> Production:
         location = self._location(symbol)
-        if len(alternatives) > MAX_ALTERNATIVES:
-            raise GrammarError(
-                f"{location}: {len(alternatives):,} alternatives of {str(symbol)!r}; expected at "
-                f"most {MAX_ALTERNATIVES:,}"
-            )
+        what = f"{location}: {len(alternatives):,} alternatives of {str(symbol)!r}"
+        require_at_most(len(alternatives), MAX_ALTERNATIVES, what)
         return Production(str(symbol), alternatives, location)
 
     def weight(self, expression: Expression) -> Expression:
         return expression
 
-    def alternative(self, *parts: Item | Expression | None) -> Alternative:
-        items = tuple(part for part in parts if isinstance(part, Item))
-        weights = [part for part in parts if isinstance(part, Expression)]
-        return Alternative(items, weights[0] if weights else None)
+    def alternative(self, weight: Expression | None, *items: Item) -> Alternative:
+        return Alternative(items, weight)
 
     def argument(self, name: Token, expression: Expression) -> tuple[Token, Expression]:
         return (name, expression)
 
     def repetition(self, low: Token, high: Token | None) -> tuple[int, int]:
-        counts = (int(low), int(high if high is not None else low))
-        if not 0 < counts[0] <= counts[1]:
-            raise GrammarError(
-                f"{self._location(low)}: repetition {{{counts[0]},{counts[1]}}} needs 1 <= m <= n"
-            )
-        if counts[1] > MAX_PARTS:
-            raise GrammarError(
-                f"{self._location(low)}: repetition {{{counts[0]},{counts[1]}}}: expected at most "
-                f"{MAX_PARTS}, the most parts of a robot"
-            )
-        return counts
+        m, n = int(low), int(high if high is not None else low)
+        what = f"{self._location(low)}: repetition {{{m},{n}}}"
+        if not 0 < m <= n:
+            raise GrammarError(f"{what} needs 1 <= m <= n")
+        if n > MAX_PARTS:
+            raise GrammarError(f"{what}: expected at most {MAX_PARTS}, the most parts of a robot")
+        return m, n
 
     def item(self, port: Token | None, name: Token, *rest: Any) -> Item:
         arguments: dict[str, Expression] = {}
-        for entry in rest[:-1]:
-            if entry is None:
-                continue
-            if str(entry[0]) in arguments:
-                raise GrammarError(f"{self._location(entry[0])}: {entry[0]} is given twice")
-            arguments[str(entry[0])] = entry[1]
-        return Item(
-            str(name), self._location(name), str(port or ""), tuple(arguments.items()), rest[-1]
-        )
+        for key, value in filter(None, rest[:-1]):
+            if str(key) in arguments:
+                raise GrammarError(f"{self._location(key)}: {key} is given twice")
+            arguments[str(key)] = value
+        given = tuple(arguments.items())
+        return Item(str(name), self._location(name), str(port or ""), given, rest[-1])
 
     def quantity(self, token: Token) -> Expression:
         text = str(token)
-        digits = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ")
+        digits = text.rstrip(string.ascii_letters)
         try:
             value = float(digits)
         except ValueError as error:
