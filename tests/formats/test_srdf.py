@@ -8,7 +8,7 @@ import yaml
 
 from helpers.robots import arm
 from morphgen.errors import FormatError
-from morphgen.fitting.collision_geometry import link_spheres
+from morphgen.fitting.replace_collision import link_spheres
 from morphgen.formats.srdf import (
     BoundingSphere,
     Chain,
