@@ -17,8 +17,6 @@ Arrays of robot ``i`` over T control steps, in SI units, poses as (x, y, z, qw, 
     i/score      (T,)        score of every step, see ``morphgen.tasks``
     i/distance   (T,)        distance to success [m]
     i/success    (T,)        whether the step was successful
-
-Format 1, which is still read, has ``i/goal`` of shape (7,), and ``line`` as a y in ``bodies``.
 """
 
 from __future__ import annotations
@@ -26,12 +24,13 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,8 +50,40 @@ from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
 Array = NDArray[np.float32]
 
 FORMAT = 2
-_FORMAT_1_GOAL_RADIUS = 0.03
-"""Radius of the ball that shows a goal of format 1 [m]."""
+
+
+@dataclass(frozen=True)
+class _Obstacle:
+    size: Vec3
+    pose: tuple[float, float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class _Body:
+    """An entry of ``bodies``."""
+
+    name: str
+    place: str
+    body: str
+    ground: float | None
+    obstacles: tuple[_Obstacle, ...]
+    block: Vec3 | None
+    markers: tuple[Marker, ...]
+
+
+@dataclass(frozen=True)
+class _About:
+    """The text ``about`` of an episode's file."""
+
+    format: int
+    morphgen: str
+    task: str
+    policy: str
+    seed: int
+    obstacles: bool
+    simulator: str
+    period: float
+    bodies: tuple[_Body, ...]
 
 
 class EpisodeError(MorphgenError):
@@ -142,18 +173,18 @@ def snapshot(episode: Episode) -> Episode:
 
 def episode_bytes(episode: Episode) -> bytes:
     """Return an episode's file; the same episode gives the same bytes."""
-    about = {
-        "format": FORMAT,
-        "morphgen": version("morphgen"),
-        "task": episode.task,
-        "policy": episode.policy,
-        "seed": episode.seed,
-        "obstacles": episode.obstacles,
-        "simulator": episode.simulator,
-        "period": episode.period,
-        "bodies": [_about(track) for track in episode.tracks],
-    }
-    arrays: dict[str, Any] = {"about": np.array(json.dumps(about))}
+    about = _About(
+        FORMAT,
+        version("morphgen"),
+        episode.task,
+        episode.policy,
+        episode.seed,
+        episode.obstacles,
+        episode.simulator,
+        episode.period,
+        tuple(map(_body, episode.tracks)),
+    )
+    arrays: dict[str, Any] = {"about": np.array(json.dumps(msgspec.to_builtins(about)))}
     for i, track in enumerate(episode.tracks):
         arrays |= {f"{i}/{name}": values for name, values in _arrays(track).items()}
     content = io.BytesIO()
@@ -165,48 +196,48 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
     """Read an episode's file with its robots."""
     try:
         arrays = read_all(path)
-        about = json.loads(str(arrays["about"]))
-        if about["format"] not in (1, FORMAT) or about["task"] not in TASKS:
-            raise ValueError(f"format {about['format']}, task {about['task']!r}")
+        data = json.loads(str(arrays["about"]))
+        if data["format"] != FORMAT or data["task"] not in TASKS:
+            raise ValueError(f"format {data['format']}, task {data['task']!r}")
+        about = msgspec.convert(data, _About)
         tracks = []
-        for i, row in enumerate(about["bodies"]):
-            prefix = f"{i}/"
-            of_robot = {
-                k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)
-            }
-            tracks.append(_parse_track(row, of_robot, files))
+        for i, body in enumerate(about.bodies):
+            own = {k.partition("/")[2]: v for k, v in arrays.items() if k.startswith(f"{i}/")}
+            tracks.append(_track(body, own, files))
         if not tracks:
             raise ValueError("it has no robots")
-        period = float(about["period"])
-        if not 0 < period < math.inf:
-            raise ValueError(f"a period of {period:g} s")
-        return Episode(
-            about["task"],
-            str(about["policy"]),
-            int(about["seed"]),
-            bool(about["obstacles"]),
-            str(about["simulator"]),
-            period,
-            tracks,
-        )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        if not 0 < about.period < math.inf:
+            raise ValueError(f"a period of {about.period:g} s")
+    except (
+        *(OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError),
+        msgspec.MsgspecError,
+    ) as error:
         raise EpisodeError(f"{path} is not an episode of morphgen view: {error}") from error
+    return Episode(
+        about.task,
+        about.policy,
+        about.seed,
+        about.obstacles,
+        about.simulator,
+        about.period,
+        tracks,
+    )
 
 
-def _about(track: Track) -> dict[str, Any]:
-    """Return the entry of a robot in ``about``."""
-    return {
-        "name": track.robot.name,
-        "place": track.uri,
-        "body": robot_hash(track.robot),
-        "ground": track.ground,
-        "obstacles": [
-            {"size": list(block.size), "pose": [*block.pose.position, *block.pose.quaternion]}
+def _body(track: Track) -> _Body:
+    """Return the entry of a robot in ``bodies``."""
+    return _Body(
+        track.robot.name,
+        track.uri,
+        robot_hash(track.robot),
+        track.ground,
+        tuple(
+            _Obstacle(block.size, (*block.pose.position, *block.pose.quaternion))
             for block in track.obstacles
-        ],
-        "block": track.block_size and list(track.block_size),
-        "markers": [asdict(marker) for marker in track.markers],
-    }
+        ),
+        track.block_size,
+        track.markers,
+    )
 
 
 def _arrays(track: Track) -> dict[str, NDArray[Any]]:
@@ -228,64 +259,33 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _parse_track(
-    row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], files: FileAccess
-) -> Track:
-    """Return a robot's track from its entry in ``about`` and its arrays."""
-    robot = split_colours(read_robot_uri(str(row["place"]), files))
-    if robot_hash(robot) != row["body"]:
+def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -> Track:
+    """Return a robot's track from its entry in ``bodies`` and its arrays."""
+    robot = split_colours(read_robot_uri(body.place, files))
+    if robot_hash(robot) != body.body:
         raise EpisodeError(
-            f"the robot at {row['place']} is not the one that was recorded: it has changed since"
+            f"the robot at {body.place} is not the one that was recorded: it has changed since"
         )
-    q, block = arrays["q"], arrays.get("block")
+    q, block = arrays["q"], arrays["block"] if body.block else None
     if q.ndim != 2 or not len(q):
         raise ValueError(f"q has shape {q.shape}; expected ({robot.dof},) for every moment")
-    if "markers" not in row:
-        row, arrays = _convert_format_1(row, arrays)
-    markers = tuple(
-        Marker(str(marker["name"]), marker["shape"], _edges(marker["size"]))
-        for marker in row["markers"]
-    )
-    if any(marker.shape not in ("frame", "box") for marker in markers):
-        raise ValueError(f"markers {row['markers']}")
-    poses = [marker.name for marker in markers] + ["block"] * (row["block"] is not None)
+    poses = [marker.name for marker in body.markers] + ["block"] * (block is not None)
     _require(arrays, {"q": (len(q), robot.dof), **dict.fromkeys(poses, (len(q), 7))})
     _require(arrays, dict.fromkeys(("score", "distance", "success"), (len(q) - 1,)))
     return Track(
         robot,
-        str(row["place"]),
-        None if row["ground"] is None else float(row["ground"]),
-        tuple(_block(block_row["size"], block_row["pose"]) for block_row in row["obstacles"]),
-        markers,
-        None if block is None else _edges(row["block"]),
+        body.place,
+        body.ground,
+        tuple(Block(obstacle.size, _pose(obstacle.pose)) for obstacle in body.obstacles),
+        body.markers,
+        body.block,
         list(q.astype(np.float32)),
         [] if block is None else list(block.astype(np.float32)),
-        {marker.name: list(arrays[marker.name].astype(np.float32)) for marker in markers},
+        {marker.name: list(arrays[marker.name].astype(np.float32)) for marker in body.markers},
         arrays["score"].tolist(),
         arrays["distance"].tolist(),
         [bool(success) for success in arrays["success"]],
     )
-
-
-def _convert_format_1(
-    row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return a robot of an episode of format 1 with its goal and line as markers of format 2."""
-    markers, moments, converted = [], len(arrays["q"]), dict(arrays)
-    if "goal" in arrays:
-        _require(arrays, {"goal": (7,)})
-        markers.append({"name": "goal", "shape": "frame", "size": [2 * _FORMAT_1_GOAL_RADIUS] * 3})
-        converted["goal"] = np.tile(arrays["goal"], (moments, 1))
-    if row["line"] is not None:
-        _require(arrays, {"block": (moments, 7)})
-        # Where the line was drawn by the viewer that wrote format 1.
-        x, ground = float(arrays["block"][0, 0]), float(row["ground"] or 0.0)
-        length = 2 * (max(map(float, row["block"])) + 0.3)
-        markers.append({"name": "line", "shape": "box", "size": [length, 0.012, 0.002]})
-        converted["line"] = np.tile(
-            [x, float(row["line"]), ground, 1.0, 0.0, 0.0, 0.0], (moments, 1)
-        )
-    return {**row, "markers": markers}, converted
 
 
 def _require(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -298,12 +298,8 @@ def _require(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int,
             raise ValueError(f"{name} is not finite")
 
 
-def _edges(size: Any) -> Vec3:  # noqa: ANN401
-    x, y, z = (float(value) for value in size)
-    return (x, y, z)
-
-
-def _block(size: Any, pose: Any) -> Block:  # noqa: ANN401
-    values = [float(value) for value in pose]
-    w, x, y, z = (np.array(values[3:]) / np.linalg.norm(values[3:])).tolist()
-    return Block(_edges(size), Pose((values[0], values[1], values[2]), (w, x, y, z)))
+def _pose(values: Sequence[float]) -> Pose:
+    """Return a pose (x, y, z, qw, qx, qy, qz), its quaternion normalised."""
+    x, y, z = values[:3]
+    qw, qx, qy, qz = (np.array(values[3:]) / np.linalg.norm(values[3:])).tolist()
+    return Pose((x, y, z), (qw, qx, qy, qz))

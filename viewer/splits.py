@@ -181,6 +181,8 @@ def conclude_study(
     )
 
 
+Sides = tuple[Sequence[Member], Sequence[Member]]
+"""Members to train on, and members to test on."""
 ChooseSides = Callable[[], tuple[list[Row], list[Row]]]
 """Function that returns the robots to train on and those to test on."""
 
@@ -192,35 +194,52 @@ def add_split_form(
     *,
     expanded: bool = False,
 ) -> None:
-    """Add controls that save a new split."""
+    """Add controls that make a new split of robots, for a task that the user chooses."""
     gui = session.client.gui
-    with gui.add_folder("New split", expand_by_default=expanded):
+
+    def add_task() -> Callable[[], Sides]:
         if hint:
             gui.add_html(markup.framed(markup.dim(hint)))
-        name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", SAVED_REGIMES)
         task = gui.add_dropdown("task", tuple(TASKS))
         obstacles = gui.add_checkbox("obstacles", False)
         choose_sides = add_choice()
+
+        def compose_sides() -> Sides:
+            """Compose the robots in the worker processes."""
+            with session.progress("composing {} robots"):
+                train, test = (
+                    make_members(rows, task.value, obstacles.value, session.files, session.workers)
+                    for rows in choose_sides()
+                )
+            session.set_status("")
+            return train, test
+
+        return compose_sides
+
+    add_save_form(session, "New split", add_task, expanded=expanded)
+
+
+def add_save_form(
+    session: Session,
+    title: str,
+    add_sides: Callable[[], Callable[[], Sides]],
+    *,
+    regime: Regime = SAVED_REGIMES[0],
+    expanded: bool = False,
+) -> None:
+    """Add controls that save a split, and show the command that audits it."""
+    gui = session.client.gui
+    with gui.add_folder(title, expand_by_default=expanded):
+        name = gui.add_text("split name", "")
+        regimes = gui.add_dropdown("regime", SAVED_REGIMES, initial_value=regime)
+        find_sides = add_sides()
         text = gui.add_html("")
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
     def save() -> None:
-        """Compose the robots in the worker processes, and write the split."""
-        with session.progress("composing {} robots"):
-            train, test = (
-                make_members(rows, task.value, obstacles.value, session.files, session.workers)
-                for rows in choose_sides()
-            )
-        session.set_status("")
-        path = save_split(name.value, regime.value, train, test, session.files)
-        show_saved(session, path, text)
+        path = save_split(name.value, regimes.value, *find_sides(), session.files)
+        shown = str(path.relative_to(session.files.roots[0]))
+        text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
+        session.notify("Saved", shown)
 
     session.on_change(button, lambda: session.run_in_background(save))
-
-
-def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
-    """Show that a split was written, and the command that audits it."""
-    name = str(path.relative_to(session.files.roots[0]))
-    text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(name)}"))
-    session.notify("Saved", name)

@@ -1,5 +1,6 @@
 """No URL or text from a browser reveals files outside the served folders."""
 
+import json
 import re
 from types import SimpleNamespace
 
@@ -139,9 +140,12 @@ def test_checkpoint_cannot_name_an_outside_robot(shared_viewer, folder, secret, 
 
 
 def test_episode_cannot_name_an_outside_robot(shared_viewer, folder, secret):
-    about = {"format": 1, "task": "reach", "bodies": [{"place": f"{secret}/a.urdf"}]}
+    body = {"name": "a", "place": f"{secret}/a.urdf", "body": "", "ground": None}
+    body |= {"obstacles": [], "block": None, "markers": []}
+    about = {"format": 2, "morphgen": "", "task": "reach", "policy": "zero", "seed": 0}
+    about |= {"obstacles": False, "simulator": "mujoco", "period": 0.02, "bodies": [body]}
     arrays = {f"0/{name}": np.zeros(1) for name in ("q", "score", "distance", "success", "goal")}
-    np.savez(folder / "mine.npz", about=np.array(str(about).replace("'", '"')), **arrays)
+    np.savez(folder / "mine.npz", about=np.array(json.dumps(about)), **arrays)
     with PlainClient(shared_viewer.port, "?play=mine.npz") as client:
         client.shows("outside of the folders")
         assert WORD not in client.text

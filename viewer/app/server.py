@@ -199,17 +199,6 @@ class MessageError(MorphgenError):
     """A message has a value that its control cannot have."""
 
 
-@dataclass
-class _Upload:
-    """An upload that is being received."""
-
-    uuid: str
-    size: int
-    """Announced size [bytes]."""
-    received: int = 0
-    """Size received so far [bytes]."""
-
-
 def message_fault(data: object) -> str:
     """Return why data from a websocket is not a message of a page; empty if it is one."""
     if not isinstance(data, bytes):
@@ -248,7 +237,7 @@ class MessageFilter:
     def __init__(self, client: viser.ClientHandle, report: Callable[[str], object]) -> None:
         """Replace viser's handlers of values for controls and of uploads."""
         self._client, self._report = client, report
-        self._upload: _Upload | None = None
+        self._upload, self._rest = "", 0
         self._viser = replace_handlers(
             client,
             {
@@ -280,25 +269,23 @@ class MessageFilter:
         if reason := _upload_fault(message):
             self._report(f"{message.filename[:MAX_NAME]}: {reason}")
             return
-        self._upload = _Upload(message.transfer_uuid, message.size_bytes)
+        self._upload, self._rest = message.transfer_uuid, message.size_bytes
         self._viser[UploadStart](client_id, message)
 
     def receive_part(self, client_id: Any, message: UploadPart) -> None:  # noqa: ANN401
-        """Receive a part of the current upload."""
-        upload = self._upload
-        if upload is None or upload.uuid != message.transfer_uuid:
+        """Receive a part of the current upload, at most as many bytes as were announced."""
+        if message.transfer_uuid != self._upload:
             return
-        upload.received += len(message.content)
-        if upload.received > upload.size:
+        self._rest -= len(message.content)
+        if self._rest < 0:
             self._drop_upload()
             self._report("an upload was longer than its announced size; it was dropped")
             return
         self._viser[UploadPart](client_id, message)
 
     def _drop_upload(self) -> None:
-        if self._upload is not None:
-            discard_upload(self._client, self._upload.uuid)
-            self._upload = None
+        discard_upload(self._client, self._upload)
+        self._upload = ""
 
 
 def _upload_fault(message: UploadStart) -> str:
@@ -314,46 +301,29 @@ def _upload_fault(message: UploadStart) -> str:
     return ""
 
 
-@functools.singledispatch
-def _valid_value(handle: object, value: object) -> object:
+def _valid_value(handle: Any, value: object) -> object:  # noqa: ANN401
     """Return a browser's value for a control, clipped to the range of a slider or number field."""
-    raise MessageError("that control takes no value")
-
-
-@_valid_value.register(viser.GuiButtonHandle)
-@_valid_value.register(viser.GuiCheckboxHandle)
-def _(handle: object, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise MessageError(f"expected true or false, not {value!r:.80}")
+    match handle:
+        case viser.GuiButtonHandle() | viser.GuiCheckboxHandle():
+            is_valid, expected = isinstance(value, bool), "true or false"
+        case viser.GuiTextHandle():
+            is_valid = isinstance(value, str) and len(value) <= MAX_TEXT
+            expected = f"a text of at most {MAX_TEXT} characters"
+        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
+            if value not in handle.options:
+                raise MessageError(f"{value!r:.80} is not one of the choices")
+            return value
+        case viser.GuiSliderHandle() | viser.GuiNumberHandle():
+            return _clip(value, handle.min, handle.max)
+        case viser.GuiMultiSliderHandle():
+            if isinstance(value, list) and len(value) == len(handle.value):
+                return [_clip(number, handle.min, handle.max) for number in value]
+            is_valid, expected = False, f"{len(handle.value)} numbers"
+        case _:
+            raise MessageError("that control takes no value")
+    if not is_valid:
+        raise MessageError(f"expected {expected}, not {value!r:.80}")
     return value
-
-
-@_valid_value.register
-def _(handle: viser.GuiTextHandle, value: object) -> str:
-    if not isinstance(value, str) or len(value) > MAX_TEXT:
-        raise MessageError(f"expected a text of at most {MAX_TEXT} characters")
-    return value
-
-
-@_valid_value.register(viser.GuiDropdownHandle)
-@_valid_value.register(viser.GuiButtonGroupHandle)
-def _(handle: Any, value: object) -> object:  # noqa: ANN401
-    if value not in handle.options:
-        raise MessageError(f"{value!r:.80} is not one of the choices")
-    return value
-
-
-@_valid_value.register(viser.GuiSliderHandle)
-@_valid_value.register(viser.GuiNumberHandle)
-def _(handle: Any, value: object) -> float:  # noqa: ANN401
-    return _clip(value, handle.min, handle.max)
-
-
-@_valid_value.register(viser.GuiMultiSliderHandle)
-def _(handle: Any, value: object) -> list[float]:  # noqa: ANN401
-    if not isinstance(value, list) or len(value) != len(handle.value):
-        raise MessageError(f"expected {len(handle.value)} numbers, not {value!r:.80}")
-    return [_clip(number, handle.min, handle.max) for number in value]
 
 
 def _clip(value: object, low: float | None, high: float | None) -> float:

@@ -138,10 +138,11 @@ def _apply_address(page: RobotPage) -> None:
     """Restore the configuration, the toggles, the unit and the link from the page's address."""
     state = page.session.address.state
     shown = state.get("show", "visual").split(",")
-    for name, box in page.toggles.items():
-        if box.value != (name in shown):
-            set_value(box, name in shown)
-            apply_toggle(page, name)
+    changed = [name for name, box in page.toggles.items() if box.value != (name in shown)]
+    for name in changed:
+        set_value(page.toggles[name], name in shown)
+    for name in changed:  # after all are set: the address has the state of all
+        apply_toggle(page, name)
     if state.get("angles") in ANGLES:
         set_angles(page, state["angles"])
     if state.get("link") in page.robot.link_index:

@@ -50,70 +50,24 @@ _STEP = 0.01
 
 
 @dataclass(eq=False)
-class WorkspaceView:
+class Workspace:
     """The workspace of a page's robot."""
 
     position: viser.GuiSliderHandle[float]
     """Position y of the slice [m]."""
     legend: viser.GuiHtmlHandle
+    asked: str
+    """Position of the slice in the address; anything but a number means zero."""
     points: Array | None = None
     """Tool positions, shape (n, 3) [m]; None until they are sampled."""
 
-
-def add_controls(session: Session) -> WorkspaceView:
-    """Add the slider and the legend, hidden until the workspace is shown."""
-    gui = session.client.gui
-    slider = gui.add_slider("slice at y [m]", -1.0, 1.0, _STEP, 0.0, visible=False)
-    return WorkspaceView(slider, gui.add_html(""))
-
-
-def show_controls(workspace: WorkspaceView, *, visible: bool) -> None:
-    """Show or hide the slider and the legend."""
-    workspace.position.visible = visible
-    workspace.legend.content = markup.framed(_legend(workspace.points)) if visible else ""
-
-
-def sample(workspace: WorkspaceView, robot: Robot, text: str) -> None:
-    """Sample the workspace and set the range of the slider.
-
-    Args:
-        workspace: The workspace.
-        robot: The robot.
-        text: Position of the slice in the address; anything but a number means zero.
-    """
-    points = workspace.points = sample_workspace(robot)
-    slider = workspace.position
-    slider.min = float(np.floor(points[:, 1].min() / _STEP) * _STEP)
-    slider.max = float(max(np.ceil(points[:, 1].max() / _STEP) * _STEP, slider.min + _STEP))
-    try:
-        y = float(text)
-    except ValueError:
-        y = 0.0
-    y = y if np.isfinite(y) else 0.0
-    set_value(slider, float(np.clip(y, slider.min, slider.max)))
-
-
-def slice_state(workspace: WorkspaceView | None) -> str:
-    """Return the position of the slice for the address; empty at zero."""
-    y = workspace.position.value if workspace is not None else 0.0
-    return f"{y:.3g}" if abs(y) > _STEP / 2 else ""
-
-
-def _legend(points: Array | None) -> str:
-    """Return what the colours of the workspace mean."""
-    if points is None:
-        return ""
-    seldom, often = (f"rgb({r},{g},{b})" for r, g, b in (SELDOM.tolist(), OFTEN.tolist()))
-    low, high = points.min(axis=0), points.max(axis=0)
-    sides = " × ".join(f"{side:.2f}" for side in high - low)  # noqa: RUF001
-    return (
-        f'<div class="scale" style="background:linear-gradient(90deg,{seldom},{often})"></div>'
-        + '<div class="ends"><span>few configurations</span><span>many</span></div>'
-        + markup.dim(
-            f"Surface: outermost tool positions of {NUM_POINTS:,} random configurations, "
-            f"{sides} m. Slice: how many of them lead to each cell."
-        )
-    )
+    @property
+    def state(self) -> str:
+        """Position of the slice for the address; empty at zero."""
+        y = self.position.value
+        if self.points is None:
+            return self.asked
+        return f"{y:.3g}" if abs(y) > _STEP / 2 else ""
 
 
 @dataclass(eq=False)
@@ -155,7 +109,7 @@ class RobotPage:
     link_choice: viser.GuiDropdownHandle[str] | None = None
     layer_shapes: dict[scene_robot.Layer, Sequence[Sequence[Shape]]] = field(default_factory=dict)
     """Shapes by link of the collision layer and the primitives, once they were shown."""
-    workspace: WorkspaceView | None = None
+    workspace: Workspace | None = None
     """Controls of the workspace; None for robots without a tool."""
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
@@ -214,7 +168,7 @@ def page_state(page: RobotPage) -> dict[str, str]:
         "show": "" if toggles == "visual" else toggles or "none",
         "angles": "" if page.angles == "rad" else page.angles,
         "link": page.selected,
-        "slice": slice_state(page.workspace) if is_on(page, "workspace") else "",
+        "slice": page.workspace.state if page.workspace and is_on(page, "workspace") else "",
     }
 
 
@@ -540,8 +494,9 @@ def add_toggles(page: RobotPage) -> None:
         box = page.toggles[name] = gui.add_checkbox(name, name == "visual")
         session.on_change(box, functools.partial(apply_toggle, page, name))
     if has_tool(page.robot):
-        page.workspace = add_controls(page.session)
-        position = page.workspace.position
+        position = gui.add_slider("slice at y [m]", -1.0, 1.0, _STEP, 0.0, visible=False)
+        asked = session.address.state.get("slice", "")
+        page.workspace = Workspace(position, gui.add_html(""), asked)
         session.on_change(position, lambda: _cut_workspace(page), "slice")
 
 
@@ -633,32 +588,55 @@ def _fit_primitives(page: RobotPage) -> None:
     session.enqueue(lambda: _show_layer(page, "primitives"))
 
 
-def _toggle_workspace(page: RobotPage, workspace: WorkspaceView, on: bool) -> None:
+def _toggle_workspace(page: RobotPage, workspace: Workspace, on: bool) -> None:
     """Show the workspace with the camera around it, or remove it and look at the robot again."""
     if on:
         page.session.run_in_background(lambda: _sample_workspace(page, workspace))
         return
     remove_overlay(page.overlays, "workspace")
-    show_controls(workspace, visible=False)
+    workspace.position.visible, workspace.legend.content = False, ""
     look_at(page.session.client, *scene_robot.robot_bounds(page.robot))
 
 
-def _sample_workspace(page: RobotPage, workspace: WorkspaceView) -> None:
+def _sample_workspace(page: RobotPage, workspace: Workspace) -> None:
     page.session.set_status("sampling the workspace")
-    sample(workspace, page.robot, page.session.address.state.get("slice", ""))
+    points = sample_workspace(page.robot)
     page.session.set_status("")
-    page.session.enqueue(lambda: _show_workspace(page, workspace))
+    page.session.enqueue(lambda: _show_workspace(page, workspace, points))
 
 
-def _show_workspace(page: RobotPage, workspace: WorkspaceView) -> None:
+def _show_workspace(page: RobotPage, workspace: Workspace, points: Array) -> None:
+    """Show sampled tool positions, cut at the position that the address asks for."""
     if not is_on(page, "workspace"):
         return
-    show_controls(workspace, visible=True)
+    slider, (low, high) = workspace.position, (points.min(axis=0), points.max(axis=0))
+    slider.min = float(np.floor(low[1] / _STEP) * _STEP)
+    slider.max = float(max(np.ceil(high[1] / _STEP) * _STEP, slider.min + _STEP))
+    try:
+        y = float(workspace.asked)
+    except ValueError:
+        y = 0.0
+    set_value(slider, float(np.clip(y if np.isfinite(y) else 0.0, slider.min, slider.max)))
+    workspace.points, slider.visible = points, True
+    workspace.legend.content = markup.framed(_legend(high - low))
     _cut_workspace(page)
-    low, high = scene_robot.robot_bounds(page.robot)
-    assert workspace.points is not None
-    low = np.minimum(low, workspace.points.min(axis=0))
-    look_at(page.session.client, low, np.maximum(high, workspace.points.max(axis=0)))
+    robot_low, robot_high = scene_robot.robot_bounds(page.robot)
+    low, high = np.minimum(low, robot_low), np.maximum(high, robot_high)
+    look_at(page.session.client, low, high)
+
+
+def _legend(sides: Array) -> str:
+    """Return what the colours of the workspace mean; its sides have shape (3,) [m]."""
+    seldom, often = (f"rgb({r},{g},{b})" for r, g, b in (SELDOM.tolist(), OFTEN.tolist()))
+    size = " × ".join(f"{side:.2f}" for side in sides)  # noqa: RUF001
+    return (
+        f'<div class="scale" style="background:linear-gradient(90deg,{seldom},{often})"></div>'
+        + '<div class="ends"><span>few configurations</span><span>many</span></div>'
+        + markup.dim(
+            f"Surface: outermost tool positions of {NUM_POINTS:,} random configurations, "
+            f"{size} m. Slice: how many of them lead to each cell."
+        )
+    )
 
 
 def _cut_workspace(page: RobotPage) -> None:

@@ -25,7 +25,7 @@ from morphgen.viewer.gallery import (
 from morphgen.viewer.pages.index import show_index
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
-from morphgen.viewer.splits import SAVED_REGIMES, SplitStudy, save_split, show_saved, study_split
+from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
 
 PANEL_WIDTH = 520.0
 """Largest width of the controls [pixels]."""
@@ -64,7 +64,13 @@ def show(session: Session) -> None:
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         add_controls(gallery)
-        _add_split_form(gallery, split)
+        regime = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
+        add_save_form(
+            session,
+            "New split of what is shown",
+            lambda: lambda: _shown_sides(gallery),
+            regime=regime,
+        )
     texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):
         texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
@@ -186,21 +192,9 @@ def _draw_map(page: SplitPage) -> None:
     )
 
 
-def _add_split_form(gallery: Gallery, split: Split) -> None:
-    """Add controls that save the shown members as a new split."""
-    gui, session = gallery.session.client.gui, gallery.session
-    with gui.add_folder("New split of what is shown", expand_by_default=False):
-        name = gui.add_text("split name", "")
-        shown = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
-        regime = gui.add_dropdown("regime", SAVED_REGIMES, initial_value=shown)
-        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-        text = gui.add_html("")
-
-    def save() -> None:
-        sides: dict[str, list[Member]] = {side: [] for side in SIDES}
-        for row in passing_rows(gallery):
-            sides[row.role].append(resolve_member(row.uri, session.files))
-        path = save_split(name.value, regime.value, sides["train"], sides["test"], session.files)
-        show_saved(session, path, text)
-
-    session.on_change(button, save)
+def _shown_sides(gallery: Gallery) -> Sides:
+    """Return the members that pass the filter by their sides."""
+    sides: dict[str, list[Member]] = {side: [] for side in SIDES}
+    for row in passing_rows(gallery):
+        sides[row.role].append(resolve_member(row.uri, gallery.session.files))
+    return sides["train"], sides["test"]
