@@ -1,10 +1,25 @@
-"""Viewer URLs are parsed and formatted consistently."""
+"""Addresses of pages are parsed and formatted consistently, and hold packed texts."""
+
+import base64
+import random
+import string
+import zlib
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morphgen.viewer.app.address import PAGES, Address, AddressError, load_page, parse_address
+from morphgen.viewer.app.address import (
+    MAX_PACKED,
+    MAX_UNPACKED,
+    PAGES,
+    Address,
+    AddressError,
+    load_page,
+    pack_text,
+    parse_address,
+    unpack_text,
+)
 
 KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
@@ -58,3 +73,38 @@ def test_default_state_is_omitted():
 @pytest.mark.parametrize("page", PAGES)
 def test_every_registered_page_can_be_loaded(page):
     assert callable(load_page(page))
+
+
+@given(st.text(max_size=300))
+def test_text_is_restored_from_a_url(text):
+    address = Address("compose", ("chain",), {"text": pack_text(text)})
+    assert "%" not in address.query
+    assert unpack_text(parse_address(address.query).state["text"]) == text
+
+
+def test_a_text_that_is_too_long_is_rejected():
+    letters = random.Random(0).choices(string.printable, k=2 * MAX_PACKED)
+    with pytest.raises(AddressError, match=f"too long for the page.*at most {MAX_PACKED}"):
+        pack_text("".join(letters))
+    with pytest.raises(AddressError, match=f"at most {MAX_PACKED} are read"):
+        unpack_text("A" * (MAX_PACKED + 1))
+
+
+def letters_of(data):
+    return base64.urlsafe_b64encode(data).decode().rstrip("=")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ("!!", "no readable text"),
+        (letters_of(b"no zlib"), "no readable text"),
+        (letters_of(zlib.compress(b"a text")[:-3]), "an incomplete text"),
+        (letters_of(zlib.compress(b"\xff\xfe")), "no readable text"),
+        (letters_of(zlib.compress(b"a" * (MAX_UNPACKED + 1))), f"more than {MAX_UNPACKED} bytes"),
+    ],
+    ids=["letters", "zlib", "cut", "utf-8", "bomb"],
+)
+def test_an_invalid_packed_text_is_rejected(content, why):
+    with pytest.raises(AddressError, match=why):
+        unpack_text(content)

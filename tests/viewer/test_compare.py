@@ -16,7 +16,6 @@ from morphgen.viewer.comparison import (
     fit_quality,
     fit_table,
     format_moves,
-    iou_colour,
     joint_roles,
     normalized_positions,
     parse_moves,
@@ -73,12 +72,6 @@ def test_fits_have_an_iou():
     assert "not fitted yet" in fit_table(robot, {})
 
 
-def test_colours_go_from_red_over_yellow_to_green():
-    assert iou_colour(0.2) == iou_colour(0.5) == (224, 49, 49)
-    assert iou_colour(0.75) == (250, 200, 30)
-    assert iou_colour(1.0) == (47, 158, 68)
-
-
 def test_moves_of_roles_are_kept_in_an_address():
     roles = ["joint 1", "joint 2", "finger 1"]
     state = format_moves({"joint 1": -0.5}, roles)
@@ -108,12 +101,6 @@ def test_points_at_one_place_are_spread():
     assert np.abs(points).max() < 20
     far = np.array([[0.0, 0.0], [10.0, 0.0]])
     np.testing.assert_allclose(spread(far), far, atol=0.1)
-
-
-def test_coincident_points_are_drawn():
-    text = map_svg(np.zeros((3, 2)), list("abc"), ["train"] * 3, list("abc"), {})
-    assert text.count('class="point"') == 3
-    assert "nan" not in text
 
 
 def test_pictures_of_a_map_do_not_cover_each_other():

@@ -37,8 +37,3 @@ def test_primitives_are_coloured_by_their_iou(see, viewer, picture):
     page.get_by_role("cell", name="arm_forearm_link").wait_for()
     picture(page)
     assert not node(on, "/robot0/3/visual0").visible
-
-
-def test_too_many_robots_are_rejected(see):
-    page = see("?" + "&".join(["compare=robots/some-arm"] * 5))
-    page.get_by_text("5 robots to compare: expected 2 to 4").wait_for()

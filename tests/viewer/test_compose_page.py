@@ -81,8 +81,3 @@ def test_edited_grammar_is_kept_in_the_url(see):
     text.fill(edited + "".join(f"# {i**9:x}\n" for i in range(1000)))
     page.get_by_text(re.compile("too long for the page's address")).wait_for()
     page.wait_for_url(re.compile(r"compose=planar_arm$"))
-
-
-def test_sampled_robot_has_a_url(see):
-    page = see("?compose=chain&seed=3&number=2")
-    page.get_by_text("chain-000002").wait_for()

@@ -1,18 +1,20 @@
-"""Generations of robots on the compose page, and their history."""
+"""Mutants of robots on the compose page, and grammars around robots that no grammar has given."""
 
 import numpy as np
 import pytest
 
 from helpers.viser_client import PlainClient
+from morphgen.grammar.analysis import check_grammar
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.grammar_file import find_grammar, load_grammar
+from morphgen.grammar.grammar_file import find_grammar, grammar_from_text, load_grammar
 from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_request
 from morphgen.grammar.sampling import sample_robot
 from morphgen.viewer.app.address import AddressError, pack_text
-from morphgen.viewer.pages.compose import Facts, change_text
 from morphgen.viewer.pages.compose_grammar import (
     NUM_OFFSPRING,
     change_lines,
+    grammar_around,
     make_individual,
     mutants,
     pack_choices,
@@ -52,12 +54,6 @@ def test_invalid_choices_of_an_address_are_refused(text):
         unpack_choices(text)
 
 
-def test_changes_are_said_in_one_line():
-    before, after = Facts(5, 1.0, 1.084), Facts(6, 1.24, 1.678)
-    assert change_text(before, after) == "5 to 6 DoF, reach 1.08 to 1.68 m, mass +0.24 kg"
-    assert change_text(before, Facts(5, 1.001, None)) == ""
-
-
 def test_changes_of_a_derivation_are_lines():
     before = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.1971947)]")
     after = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.3)]")
@@ -92,3 +88,57 @@ def test_mutants_of_a_robot_without_a_grammar_need_no_other_button(shared_viewer
         client.shows("This robot has no grammar whose choices could be drawn again")
         client.change(client.control("ButtonGroup", "show"), "mutants")
         client.shows('data-do="adopt" data-value="8"')
+
+
+LIBRARY = default_library()
+
+
+def around(derivation):
+    text = grammar_around(derivation, LIBRARY)
+    grammar = grammar_from_text(text, "around")
+    assert check_grammar(grammar, LIBRARY) == []
+    return grammar, text, make_individual(grammar, LIBRARY, {})
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["arm=ur5 ee=plane", "base=gantry ee=cube ee.size=0.12", "base=pedestal arm=arm3", "ee=jaw"],
+)
+def test_the_typical_robot_is_that_of_the_words(words):
+    derivation = parse_request(words.split(), LIBRARY)
+    assert around(derivation)[2].derivation == derivation
+
+
+def test_robots_with_several_limbs_keep_their_parts_and_ports():
+    words = "base=pedestal left.arm=ur5 left.ee=plane right.arm=panda arm=ur3 ee=cube"
+    derivation = parse_request(words.split(), LIBRARY)
+    typical = around(derivation)[2].derivation
+
+    def limbs(node):
+        return {
+            (port, child.part, child.parameters, frozenset(limbs(child)))
+            for port, child in node.children
+        }
+
+    assert typical.part == "pedestal"
+    assert limbs(typical) == limbs(derivation)
+
+
+def test_robots_of_grammars_have_grammars_around_them():
+    planar_arm = load_grammar(find_grammar("planar_arm", LIBRARY.folders), LIBRARY.folders)
+    derivation = sample_robot(planar_arm, LIBRARY, 1).derivation
+    typical = around(derivation)[2].derivation
+    # Symbols cannot have the name of a part, so the post is called post2.
+    assert [(node.part, node.parameters) for node in typical.walk()] == [
+        (node.part, node.parameters) for node in derivation.walk()
+    ]
+
+
+def test_what_the_robot_does_not_use_stays_as_it_is():
+    _, text, individual = around(parse_request(["arm=ur5", "ee.mount_yaw=0.5", "ee=cube"], LIBRARY))
+    assert "base -> fixed(spread=0.6)\n" in text  # the distance between ports without a limb
+    assert "cube(size=normal(0.1, 0.03, 0.02, 0.5), mount_yaw=0.5)" in text
+    assert "| panda\n" in text
+    assert "yumi(" not in text
+    assert "none" not in text
+    assert len(individual.choices) == 3  # arm, end-effector, and size

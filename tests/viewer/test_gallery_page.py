@@ -1,4 +1,4 @@
-"""The gallery pages in a browser."""
+"""The gallery pages: cards, the filter and its values in the address, histograms, new splits."""
 
 import re
 
@@ -6,6 +6,9 @@ import pytest
 
 from helpers.viser_client import PlainClient
 from morphgen.benchmark.split_file import read_split
+from morphgen.viewer.app.address import AddressError
+from morphgen.viewer.figures import histogram_svg
+from morphgen.viewer.gallery import parse_range
 
 
 def names(page):
@@ -77,33 +80,6 @@ def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, vie
 
 
 @pytest.mark.slow
-def test_the_library_links_to_everything(see):
-    page = see()
-    page.locator(".card").first.wait_for()
-    for text in ("robots/prims", "extrapolation/arms/reach", "planar_arm", "Compose a robot"):
-        assert page.get_by_role("link", name=text, exact=True).is_visible()
-    page.get_by_role("link", name="robots/prims", exact=True).click()
-    page.get_by_text("30 robots · page 1 of 2").wait_for()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("query", "message"),
-    [
-        ("?gallery=nowhere", "no such file"),
-        ("?gallery=../..", "outside of the folders"),
-        ("?galery=robots", "did you mean 'gallery'"),
-        ("?split=extrapolation/arm/reach", "no such file"),
-    ],
-)
-def test_unknown_url_shows_an_error(see, query, message):
-    page = see(query)
-    page.get_by_text(re.compile(re.escape(message))).first.wait_for()
-    page.get_by_role("link", name="Library").first.click()
-    page.get_by_text("Grammars").wait_for()
-
-
-@pytest.mark.slow
 def test_split_is_created_from_filtered_robots(see, control, folder):
     page = see("?gallery=robots/prims&search=00000")
     page.get_by_text("10 of 30 robots").wait_for()
@@ -115,3 +91,84 @@ def test_split_is_created_from_filtered_robots(see, control, folder):
     split = read_split(folder / "splits" / "from" / "gallery.yaml")
     assert [member.name for member in split.train] == [f"prims-{i:06d}" for i in range(3)]
     assert [member.name for member in split.test] == ["prims-000010", "prims-000011"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", (0.5, 1.5)),
+        ("0.7..1", (0.7, 1.0)),
+        ("0..1", (0.5, 1.0)),
+        ("1..inf", (1.0, 1.5)),
+        ("1.5..9", (1.5, 1.5)),
+    ],
+)
+def test_a_range_is_clipped_to_the_values_of_the_robots(text, expected):
+    assert parse_range("reach", text, (0.5, 1.5)) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "limits", "message"),
+    [
+        ("5..9", (0.5, 1.5), r"reach=5\.\.9 excludes every robot.* they have 0\.5 to 1\.5 m"),
+        ("0..0.2", (0.5, 0.5), r"they have 0\.5 m"),
+        ("9..5", (0.5, 1.5), r"is no range.*expected LOW\.\.HIGH"),
+        ("nan..1", (0.5, 1.5), "is no range"),
+        ("much", (0.5, 1.5), "is no range"),
+        ("0..1", None, "no robot here has a known reach"),
+    ],
+)
+def test_a_range_that_cannot_be_used_is_refused(text, limits, message):
+    with pytest.raises(AddressError, match=message):
+        parse_range("reach", text, limits)
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("reach=50..90", "reach=50..90 excludes every robot, so it was left out"),
+        ("sort=colour", "sort=colour was left out; expected order, -order, name"),
+        ("findings=some", "findings=some was left out; expected all, with, without"),
+        ("size=25", "size=25 was left out; expected 24, 48, 96"),
+        ("role=train", "role=train was left out; expected all"),
+    ],
+)
+def test_a_page_says_which_value_of_its_address_it_leaves_out(viewer, query, message):
+    with PlainClient(viewer().port, f"?gallery=robots/prims&{query}") as client:
+        client.shows(message)
+        client.shows("30 robots · page 1 of 2")
+
+
+def test_an_empty_gallery_names_the_condition_that_excludes_all(viewer):
+    query = "?gallery=robots/prims&search=lost&findings=without"
+    with PlainClient(viewer().port, query) as client:
+        client.shows("No robot passes the filter")
+        client.shows("<td >search: lost</td><td >no robot of 30</td>")
+
+
+@pytest.mark.slow
+def test_conditions_are_cleared_from_an_empty_gallery(see, picture):
+    page = see("?gallery=robots/prims&search=lost&dof=1..2")
+    page.get_by_text("No robot passes the filter").wait_for()
+    picture(page, "gallery-empty")
+    page.locator("tr", has_text="search: lost").get_by_text("clear").click()
+    page.locator(".card").first.wait_for()
+    page.wait_for_function("!location.search.includes('search')")
+    assert page.failures == []
+
+
+def test_a_histogram_counts_all_values_and_greys_those_outside_the_range():
+    svg = histogram_svg([0.0, 0.1, 0.1, 1.0], (0.0, 1.0), (0.0, 0.5))
+    counts = [int(text) for text in re.findall(r"<title>(\d+) robots", svg)]
+    assert sum(counts) == 4
+    assert max(counts) == 2
+    colours = [text.split('"')[0] for text in svg.split('fill="')[1:]]
+    assert len(set(colours[:20])) == 1
+    assert set(colours[21:]) == {"#adb5bd88"}
+    assert colours[0] != colours[-1]
+
+
+def test_a_gallery_shows_the_distributions_of_its_facts(viewer):
+    with PlainClient(viewer().port, "?gallery=robots/prims") as client:
+        client.control("MultiSlider", "Reach (m)")
+        client.shows("robots from")

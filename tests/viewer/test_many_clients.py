@@ -61,14 +61,6 @@ def require_nothing_left(on, sessions):
 
 
 @pytest.mark.slow
-def test_nothing_remains_of_clients_that_have_left(viewer):
-    on = viewer()
-    sessions = crowd(on, 6)
-    assert len(sessions) == 6
-    require_nothing_left(on, sessions)
-
-
-@pytest.mark.slow
 def test_thirty_clients_see_their_own_pages_and_leave_nothing(see, viewer, capfd):
     on = viewer()
     memory = []

@@ -64,22 +64,6 @@ def test_robots_are_chosen_compared_played_and_split(same, control, folder, pict
     assert page.failures == []
 
 
-def test_robots_after_a_gallery_are_drawn_as_large_as_from_their_address(same, viewer):
-    on, distances = viewer(), []
-    page = same("?gallery=robots/prims", on=on)
-    page.locator(".card img").nth(5).wait_for()
-    for i in (0, 3):
-        page.locator("input[data-choose]").nth(i).click()
-    page.locator(TRAY).get_by_text("2 chosen").wait_for()
-    for go in (page.locator(TRAY).get_by_text("compare").click, page.reload):
-        go()
-        page.get_by_text(re.compile("prims-000000 and prims-000003")).wait_for()
-        page.wait_for_timeout(1000)
-        camera = list(on.sessions.values())[-1].client.camera
-        distances.append(float(sum((camera.position - camera.look_at) ** 2) ** 0.5))
-    assert distances[0] == pytest.approx(distances[1], rel=0.2)
-
-
 def test_the_bar_leads_everywhere_and_back_returns(same):
     page = same("?library=")
     page.locator(".card").first.wait_for()
@@ -146,8 +130,3 @@ def test_the_open_tab_is_in_the_address_and_back_returns_to_it(same):
     page.get_by_role("tab", name="Move").click()
     page.wait_for_url(re.compile(r"prims-000001$"))
     assert page.failures == []
-
-
-def test_a_tab_that_does_not_exist_leaves_the_address(same):
-    page = same("?robot=robots/prims/prims-000001&tab=Nothing")
-    page.wait_for_url(re.compile(r"prims-000001$"))

@@ -9,9 +9,7 @@ import pytest
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
-from morphgen.model.geometry import Box
 from morphgen.viewer.scene import overlays as workspace
-from morphgen.viewer.scene.stage import grown_triangles
 
 ARM = "?robot=robots/some-arm"
 
@@ -32,11 +30,6 @@ def test_the_shell_encloses_the_points(ball):
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
 
 
-def test_the_shell_is_open_in_front_of_the_slice(ball):
-    vertices, faces = workspace.shell(ball, 0.2)
-    assert vertices[faces.ravel(), 1].min() >= 0.2
-
-
 def test_a_slice_has_the_hole_of_the_workspace(ball):
     section = workspace.cut(ball, 0.0)
     radii = np.linalg.norm(section.centres - [0, 0, 0.3], axis=1)
@@ -44,22 +37,6 @@ def test_a_slice_has_the_hole_of_the_workspace(ball):
     assert radii.max() < 1.0 + 2 * section.side
     assert len(radii) * section.side**2 == pytest.approx(np.pi * 0.75, rel=0.15)
     assert section.density.max() == pytest.approx(1.0)
-
-
-def test_a_slice_beside_the_workspace_is_empty(ball):
-    assert len(workspace.cut(ball, 2.0).centres) == 0
-
-
-def test_the_workspace_of_a_robot_is_sampled_within_its_reach():
-    points = workspace.sample_workspace(arm())
-    assert points.shape == (workspace.NUM_POINTS, 3)
-    assert np.linalg.norm(points, axis=1).max() < 1.5
-
-
-def test_a_grown_box_is_larger_on_every_side():
-    vertices, _ = grown_triangles(Box((0.2, 0.2, 0.2)), 0.01)
-    assert (np.abs(vertices) > 0.1).all()
-    assert (np.abs(vertices) < 0.111).all()
 
 
 def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):

@@ -1,14 +1,18 @@
-"""The player simulates, displays steps and handles commands in its own thread."""
+"""The player simulates, shows steps and handles commands in its own thread; curves of episodes."""
 
 import threading
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.errors import TaskError
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer.app.address import AddressError
-from morphgen.viewer.pages.play import parse_time
+from morphgen.viewer.episode import Episode, Track, score_until
+from morphgen.viewer.pages.play import curves, parse_time
 from morphgen.viewer.rollout import Player
 
 WAIT = 30
@@ -127,12 +131,6 @@ def test_an_episode_is_loaded_at_a_time_and_simulated_until_then(player, display
     assert display.positions[2] >= 27
 
 
-def test_an_episode_is_loaded_at_its_end_if_the_time_is_later(player, display):
-    player.load(lambda: Counting(steps=10), start=99.0)
-    display.wait_for(lambda: display.steps[-2:] == [10, "stopped"])
-    assert display.positions == [10]
-
-
 @pytest.mark.slow
 def test_slow_steps_are_shown_as_they_arrive(player, display):
     source = Counting(steps=8, pause=0.1)
@@ -190,3 +188,52 @@ def test_times_of_addresses():
     for text in ("-1", "soon", "nan", "inf"):
         with pytest.raises(AddressError, match=f"t={text} is no time; expected seconds, 0 or more"):
             parse_time(text)
+
+
+def track(num_steps):
+    """A robot whose distance falls from 1 m."""
+    values = [1 - 0.1 * i for i in range(num_steps)]
+    q = [np.zeros(4)] * (num_steps + 1)
+    return Track(arm(), "x", None, q=q, score=values, distance=values, success=[False] * num_steps)
+
+
+def episode(*num_steps):
+    return Episode("reach", "zero", 0, False, "mujoco", 0.02, [track(n) for n in num_steps])
+
+
+def test_curves_have_distance_score_and_a_line_at_the_step():
+    scores = [[], []]
+    distances, totals = curves(episode(5, 3), 2, scores)
+    assert distances[0] == pytest.approx(0.02 * np.arange(1, 6))
+    assert distances[1] == pytest.approx([1, 0.9, 0.8, 0.7, 0.6])
+    assert distances[2] == pytest.approx([1, 0.9, 0.8, 0.8, 0.8])  # it ended after three steps
+    assert distances[3] == pytest.approx([0.6, 1, 0.6, 0.6, 0.6])
+    expected = [score_until(track(5), "reach", i) for i in range(1, 6)]
+    assert totals[1] == pytest.approx(expected)
+    assert len(totals) == 4
+
+
+def test_curves_continue_the_scores_that_are_known():
+    scores = [[7.0]]
+    _, totals = curves(episode(3), 1, scores)
+    assert totals[1][0] == 7.0
+    assert len(scores[0]) == 3
+
+
+def test_curves_are_finite_before_the_first_step():
+    for data in curves(episode(0, 0), 0, [[], []]):
+        assert all(np.isfinite(line).all() for line in data)
+        assert {len(line) for line in data} == {1}
+
+
+@pytest.mark.slow
+def test_an_episode_has_curves_under_the_time_slider(see, picture):
+    page = see("?play=reach&robot=robots/some-arm&policy=jacobian")
+    page.get_by_text(f"m from {TASKS['reach'].target}").first.wait_for()
+    page.locator(".uplot canvas").nth(1).wait_for()
+    page.wait_for_function(
+        "Object.values(window.__viserTestpoints?.uplots ?? {}).some("
+        "(plot) => plot.chart.data[0].length > 50)"
+    )
+    picture(page, "curves")
+    assert page.failures == []

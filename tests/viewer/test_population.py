@@ -26,9 +26,9 @@ from morphgen.viewer.population import (
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
 from morphgen.viewer.scene import population as scene_population
-from morphgen.viewer.scene.population import quaternions, world_poses
+from morphgen.viewer.scene.population import quaternions
 from morphgen.viewer.scene.robot import robot_bounds
-from morphgen.viewer.scene.stage import View, batch_colours, fit_camera, project_points
+from morphgen.viewer.scene.stage import View, fit_camera, project_points
 
 
 @pytest.fixture
@@ -57,11 +57,6 @@ def test_poses_of_all_robots_equal_those_of_each(population):
         np.testing.assert_allclose(poses[mine], expected, atol=1e-5)
 
 
-def test_every_shape_is_an_instance(population):
-    shapes = sum(len(link.visuals) for robot in population.robots for link in robot.links)
-    assert len(population.instances.robot) == shapes
-
-
 def test_a_capsule_is_a_cylinder_and_two_balls():
     robot = Robot("pill", (Link("root", visuals=(Shape(Capsule(0.1, 0.4)),)),))
     pill = make_population([ReadRobot(Row("pill", "pill"), robot, np.zeros((2, 3)))])
@@ -78,13 +73,6 @@ def test_a_role_moves_in_every_robot_by_the_same_share(population):
     np.testing.assert_array_equal(move_roles(population, population.home, {}), population.home)
 
 
-def test_robots_stand_at_their_positions(population):
-    positions = np.arange(14.0).reshape(7, 2)
-    moved = world_poses(population, positions, population.home)
-    offset = moved[:, :2, 3] - shape_poses(population, population.home)[:, :2, 3]
-    np.testing.assert_allclose(offset, positions[population.instances.robot], atol=1e-5)
-
-
 def test_quaternions_are_those_of_the_rotations():
     turns = Rotation.random(500, np.random.default_rng(0))
     halves = Rotation.from_rotvec(np.pi * np.eye(3))
@@ -94,10 +82,6 @@ def test_quaternions_are_those_of_the_rotations():
     similarity = np.abs((quaternions(poses) * expected).sum(axis=1))
     np.testing.assert_allclose(similarity, 1, atol=1e-6)
     assert quaternions(poses[:0]).shape == (0, 4)
-
-
-def test_batched_meshes_get_linear_colours():
-    assert batch_colours([(0, 128, 255)]).tolist() == [[0, 55, 255]]
 
 
 def test_rows_are_sorted_and_labelled_by_their_first_robot():

@@ -18,11 +18,6 @@ def wait_until_shown(page):
     ).wait_for()
 
 
-def test_unknown_populations_show_an_error(viewer):
-    with PlainClient(viewer().port, "?population=nowhere") as client:
-        client.shows("no such file or folder")
-
-
 def test_a_click_selects_a_robot_and_one_with_shift_adds_another(viewer):
     on = viewer()
     with PlainClient(on.port, "?population=robots/prims&joint1=0.25") as client:
@@ -119,18 +114,6 @@ def test_selected_robots_are_exported_and_split(see, control, folder):
     split = read_split(folder / "splits" / "from" / "population.yaml")
     assert [member.name for member in split.test] == ["prims-000000", "prims-000001"]
     assert len(split.train) == 28
-
-
-@pytest.mark.slow
-def test_dark_pages_stay_dark(see):
-    page = see("?population=robots/prims&theme=dark")
-    wait_until_shown(page)
-    assert page.locator("html").get_attribute("data-mantine-color-scheme") == "dark"
-    page.goto(page.url.partition("?")[0] + "?library=")
-    page.locator(".card").first.wait_for()
-    page.locator('html[data-mantine-color-scheme="dark"]').wait_for(state="attached")
-    page.get_by_role("link", name="light", exact=True).click()
-    page.locator('html[data-mantine-color-scheme="light"]').wait_for(state="attached")
 
 
 @pytest.mark.slow

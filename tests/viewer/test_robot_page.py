@@ -13,10 +13,8 @@ import zipfile
 import pytest
 from PIL import Image
 
-from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
-from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.model.kinematics import frame_pose
 from morphgen.viewer.pages.robot_show import format_joints
 from morphgen.viewer.robot_uri import read_robot_uri
@@ -52,41 +50,6 @@ def node(viewer, name):
     """Return a scene node of the only browser, as stored on the server."""
     (session,) = viewer.sessions.values()
     return session.client.scene._handle_from_node_name[name]
-
-
-@pytest.mark.slow
-def test_slider_moves_the_robot_and_updates_the_url(see, viewer, folder):
-    on = viewer()
-    page = see(ARM, on=on)
-    wait_for_page(page)
-    robot = read_bundle(folder / "robots" / "some-arm")
-    tool = robot.link_index[robot.frame("tool").link]
-    before = node(on, f"/robot/{tool}").position.copy()
-    slider_number(page, "shoulder").fill("1.2")
-    page.wait_for_url(re.compile(r"q=1\.2,0\.5,0\.01,0\.02"))
-    after = node(on, f"/robot/{tool}").position
-    assert abs(after - before).max() > 0.1
-    q = [1.2, *robot.home[1:]]
-    expected = (frame_pose(robot, q) @ robot.frame("tool").T_link_frame.inverse().matrix)[:3, 3]
-    assert after == pytest.approx(expected, abs=1e-6)
-    assert page.failures == []
-
-
-@pytest.mark.slow
-def test_url_restores_configuration_and_layers(see, viewer, picture):
-    on = viewer()
-    page = see(f"{ARM}&q=0.3,-0.4,0.02,0.01&show=collision,frames,joint axes,inertia", on=on)
-    wait_for_page(page)
-    assert slider_number(page, "elbow").input_value() == "-0.4"
-    assert node(on, "/robot/1/collision0").visible
-    assert not node(on, "/robot/1/visual0").visible
-    assert node(on, "/robot/2").show_axes
-    assert node(on, "/robot/1/axis").visible
-    assert node(on, "/robot/1/inertia").visible
-    show_tab(page, "Show")
-    page.get_by_text("centres of mass").wait_for()
-    picture(page)
-    assert page.failures == []
 
 
 @pytest.mark.slow
@@ -174,17 +137,6 @@ def test_a_broken_robot_shows_its_findings(see, picture):
 
 
 @pytest.mark.slow
-def test_changed_file_is_shown_after_a_reload(see, viewer, folder, tmp_path):
-    bundle = write_bundle(arm(), folder / "robots" / "changing", picture=False)
-    page = see("?robot=robots/changing")
-    wait_for_page(page)
-    assert page.get_by_text("6 links").is_visible()
-    (bundle / "robot.urdf").write_text("<robot name='x'><link/></robot>")
-    page.reload()
-    page.locator(".tag.error").first.wait_for()
-
-
-@pytest.mark.slow
 def test_two_browsers_do_not_disturb_each_other(see, viewer):
     on = viewer()
     first = see(ARM, on=on)
@@ -201,19 +153,6 @@ def test_two_browsers_do_not_disturb_each_other(see, viewer):
     slider_number(third, "shoulder").fill("-1.5")
     third.wait_for_url(re.compile(r"q=-1\.5"))
     assert slider_number(first, "shoulder").input_value() == "1.5"
-
-
-@pytest.mark.slow
-def test_browser_closed_during_page_setup_does_not_affect_others(see, viewer, capfd):
-    on = viewer()
-    for _ in range(3):
-        page = see("?robot=words:arm=panda ee=panda_hand&show=visual,workspace,primitives", on=on)
-        page.wait_for_timeout(700)
-        page.close()
-    page = see(ARM, on=on)
-    wait_for_page(page)
-    assert len(on.sessions) <= 4
-    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow
@@ -239,32 +178,6 @@ def test_killed_browser_leaves_no_resources(see, viewer, browser_command, tmp_pa
     gc.collect()
     assert freed() is None
     assert "Traceback" not in capfd.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("some.urdf", b"this is no URDF", "some.urdf:1:1"),
-        (
-            "some.urdf",
-            b'<robot name="r"><link name="a"><visual><geometry>'
-            b'<mesh filename="../../secret.stl"/></geometry></visual></link></robot>',
-            "leads out of its folder",
-        ),
-        ("large.urdf", b" " * (200 * 2**20), "large.urdf: 200 MB; at most 100 MB are accepted"),
-    ],
-    ids=["no-urdf", "climbs-out", "large"],
-)
-def test_invalid_upload_shows_the_reason(see, tmp_path, name, content, message):
-    page = see("?library=")
-    button = page.get_by_role("button", name="Open a URDF")
-    button.wait_for()
-    (tmp_path / name).write_bytes(content)
-    with page.expect_file_chooser() as chooser:
-        button.click()
-    chooser.value.set_files(tmp_path / name)
-    page.get_by_text(re.compile(re.escape(message))).first.wait_for()
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ import pytest
 from morphgen.viewer.robot_rows import (
     Filter,
     Row,
-    fact_choices,
-    fact_range,
     facts_line,
     select_page,
     sort_rows,
@@ -79,17 +77,6 @@ def test_unknown_sort_keys_are_rejected():
 )
 def test_pages(number, size, expected):
     assert select_page(range(7), number, size) == expected
-
-
-def test_zero_rows_give_one_empty_page():
-    assert select_page([], 3, 24) == ([], 1, 1)
-
-
-def test_ranges_and_choices_of_facts():
-    assert fact_range(ROWS, "reach") == (0.9, 1.2)
-    assert fact_range(ROWS[:1], "reach") == (0.9, 0.9)
-    assert fact_range(ROWS[1:2], "reach") is None
-    assert fact_choices([*ROWS, Row("d", "d")], "category") == ["arms", "hands"]
 
 
 def test_known_facts_are_joined_in_one_line():

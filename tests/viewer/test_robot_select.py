@@ -8,12 +8,11 @@ import pytest
 from helpers.robots import arm, finger
 from helpers.viser_client import PlainClient
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Box, Sphere
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.rotation import to_matrix
 from morphgen.viewer.pages.robot_show import joint_of_link, turn_towards
-from morphgen.viewer.robot_tables import is_about, link_card, rounded
-from morphgen.viewer.scene.overlays import outline_triangles, range_lines
+from morphgen.viewer.robot_tables import is_about, link_card
+from morphgen.viewer.scene.overlays import range_lines
 from morphgen.viewer.scene.robot import RED
 from morphgen.viewer.scene.stage import View, project_points
 
@@ -57,12 +56,6 @@ def test_a_point_on_the_axis_does_not_turn_the_joint():
     assert turn_towards(robot, q, 0, link, np.zeros(3), np.ones(3)) == pytest.approx(q)
 
 
-def test_the_base_has_no_joint_and_fixed_links_have_that_of_an_ancestor():
-    robot = arm()
-    assert joint_of_link(robot, 0) is None
-    assert [joint_of_link(robot, i) for i in range(1, 6)] == [0, 1, 2, 3, 3]
-
-
 def test_the_range_of_a_hinge_is_an_arc_between_its_limits():
     joint = arm().joints[0]
     needle, track, axis = range_lines(joint, 0.2, (0.0, 0.0, 1.0))
@@ -77,15 +70,6 @@ def test_the_range_of_a_slide_is_a_line_between_its_limits():
     joint = finger().joints[0]
     _, track, _ = range_lines(joint, 0.2, (1.0, 0.0, 0.0))
     assert track[0] == pytest.approx(np.array([[0, -3, 0], [0, 3, 0]]))
-
-
-@pytest.mark.parametrize("geometry", [Box((0.1, 0.2, 0.3)), Sphere(0.1)])
-def test_an_outline_surrounds_its_geometry_inside_out(geometry):
-    vertices, faces = outline_triangles(geometry, 0.01)
-    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
-    volume = (a * np.cross(b, c)).sum() / 6
-    inner = 0.006 if isinstance(geometry, Box) else 4 / 3 * np.pi * 0.1**3
-    assert volume < -inner
 
 
 def test_a_card_shows_mass_limits_in_both_units_and_the_findings_of_its_link():
@@ -110,12 +94,6 @@ def test_a_finding_is_about_the_links_and_joints_that_it_names():
     assert is_about(pair, "lower", "")
     assert not is_about(pair, "low", "")
     assert not is_about(Finding("x", "info", "joint ", "", ""), "base", "")
-
-
-def test_values_have_the_digits_of_their_slider():
-    assert rounded(-89.9543, 1.0) == -90
-    assert rounded(1.5707963, 0.01) == 1.57
-    assert rounded(0.02004, 1e-4) == 0.02
 
 
 def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):

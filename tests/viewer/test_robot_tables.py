@@ -9,7 +9,6 @@ from helpers.robots import arm
 from morphgen.model.robot import Inertial
 from morphgen.viewer.pages.robot_show import format_joints, free_configuration, parse_joints
 from morphgen.viewer.robot_tables import (
-    collision_text,
     joint_groups,
     joint_hint,
     link_details,
@@ -17,7 +16,6 @@ from morphgen.viewer.robot_tables import (
     slider_step,
     summary,
 )
-from morphgen.viewer.scene.robot import robot_bounds
 from morphgen.viewer.scene.stage import inertia_box
 
 
@@ -68,12 +66,6 @@ def test_tables_name_every_link_and_escape_it():
     assert summary(robot, 0.9).startswith("6 links · 4 DoF · 1 mimic joint · ")
 
 
-def test_collisions_are_listed_deepest_first():
-    assert "no self-collision" in collision_text({})
-    text = collision_text({("a", "b"): 0.001, ("c", "d"): 0.02})
-    assert text.index("c in d: 20.0 mm") < text.index("a in b: 1.0 mm")
-
-
 def test_configurations_are_restored_from_urls():
     robot = arm()
     q = np.array([0.1234, -1.5, 0.02, 0.04])
@@ -94,12 +86,6 @@ def test_the_box_has_the_inertia_of_the_link():
     assert np.linalg.det(axes) == pytest.approx(1)
     assert inertia_box(Inertial(0.0)) is None
     assert inertia_box(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
-
-
-def test_bounds_contain_base_and_tip():
-    low, high = robot_bounds(arm(), np.zeros(4))
-    assert low[2] == pytest.approx(-0.02)
-    assert high[2] > 0.8
 
 
 def test_random_free_configuration_is_collision_free():

@@ -181,12 +181,6 @@ def test_an_invalid_episode_is_rejected(episode, files, root, arrays, why):
         read_episode(path, files)
 
 
-def test_a_text_file_is_rejected(files, root):
-    (root / "text.npz").write_text("no archive")
-    with pytest.raises(EpisodeError, match="is not an episode of morphgen view"):
-        read_episode(root / "text.npz", files)
-
-
 def test_an_episode_of_a_changed_robot_is_rejected(files, root, cache):
     write_bundle(arm(), root / "robots" / "two", picture=False)
     rollout = Rollout(RolloutConfig("reach", ("robots/two",), "zero"), files)

@@ -50,16 +50,6 @@ def test_the_strip_beside_a_gallery_does_not_decide_the_distance():
     assert looking(0.14).distance == looking(1.0).distance
 
 
-def test_only_the_last_box_is_kept_in_view():
-    camera = Camera(1.5)
-    client = SimpleNamespace(camera=camera)
-    for scale in (3.0, 2.0, 1.0):
-        look_at(client, scale * LOW, scale * HIGH, (0.0, -1.0, 0.2))
-    assert len(camera.callbacks) == 1
-    camera.resize(0.9)
-    assert camera.distance == pytest.approx(looking(0.9).distance)
-
-
 def test_a_camera_that_the_user_has_moved_stays():
     camera = looking(1.2)
     camera.position = camera.position + 0.1

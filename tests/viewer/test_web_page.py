@@ -92,18 +92,6 @@ def test_titles_of_joints_have_their_ranges():
     assert last.startswith(f"joint {arm().dof} of {arm().dof}, ")
 
 
-@pytest.mark.slow
-def test_a_turn_of_the_camera_ends_where_it_began():
-    robot = arm()
-    home = np.array([robot.home])
-    renderer = Renderer(Scene(robot), (), home, turntable_module._ring(robot), (64, 48))
-    state = RenderState(home[0])
-    start, side, end = (renderer.frame(state, turn).astype(int) for turn in (0, 90, 360))
-    renderer.close()
-    assert abs(start - side).mean() > 3
-    assert abs(start - end).mean() < 0.5
-
-
 def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
     derivation = parse_request(["base=gantry", "ee=cube"], default_library())
     robot = compose(derivation, default_library(), "gantry")

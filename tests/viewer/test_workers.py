@@ -1,4 +1,4 @@
-"""Worker processes that die are replaced."""
+"""Worker processes that die are replaced; their results are shared by all browsers."""
 
 import os
 import time
@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from helpers.worker_functions import die_later, power, sleep_from
-from morphgen.viewer.app.workers import WorkerDied, Workers
+from morphgen.viewer.app.workers import SharedResults, WorkerDied, Workers
 
 
 @pytest.fixture
@@ -52,3 +52,15 @@ def alive(process):
     except ProcessLookupError:
         return False
     return True
+
+
+def test_a_result_is_made_once_and_the_least_recently_used_is_dropped():
+    shared, made = SharedResults(max_results=2), []
+
+    def get(key):
+        return shared.get(key, lambda: made.append(key) or key.upper())
+
+    assert [get(key) for key in "aabacab"] == list("AABACAB")
+    assert made == ["a", "b", "c", "b"]
+    assert (get("a"), get("c")) == ("A", "C")
+    assert made[4:] == ["c"]

@@ -227,14 +227,6 @@ class Session:
         attach = getattr(handle, "on_click", None) or handle.on_update
         attach(changed)
 
-    def on_command(self, command: viser.CommandHandle, work: Work) -> None:
-        """Enqueue work whenever the user runs a command, or presses its keys."""
-
-        async def triggered(event: viser.CommandEvent) -> None:
-            self.enqueue(work)
-
-        command.on_trigger(triggered)
-
     def on_close(self, work: Work) -> None:
         """Call quick work when the browser leaves the page; immediately if it already has."""
         with self.lock:

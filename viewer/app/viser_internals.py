@@ -36,7 +36,6 @@ ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
         _messages.SceneNodeClickMessage,
         _messages.SceneNodeDragMessage,
         _messages.ViewerCameraMessage,
-        _messages.CommandTriggerMessage,
         _messages.TransformControlsUpdateMessage,
         _messages.TransformControlsDragStartMessage,
         _messages.TransformControlsDragEndMessage,

@@ -270,8 +270,8 @@ class GrammarTab:
     """Message that the edited text does not fit into the address; else empty."""
     seed: viser.GuiNumberHandle[int]
     number: viser.GuiNumberHandle[int]
-    num_parts: viser.GuiSliderHandle[int]
-    tree: viser.GuiHtmlHandle
+    num_parts: viser.GuiSliderHandle[int] = field(init=False)
+    tree: viser.GuiHtmlHandle = field(init=False)
     derivation: Derivation | None = None
     """Derivation of the whole robot; fewer of its parts may be shown."""
     choices: Choices = field(default_factory=dict)
@@ -296,46 +296,33 @@ def add_grammar_tab(
     """Add the tab, with the text, seed and number that the page's address gives."""
     gui, state = session.client.gui, session.address.state
     name, original = source_text(source, session.files)
-    names = _starts(source)
-
-    def count(key: str) -> int:
-        return parse_count(state.get(key, ""), 0)
-
+    text = unpack_text(state["text"]) if "text" in state else original
     with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
-        dropdown = gui.add_dropdown("start from", names, initial_value=source)
-        text = unpack_text(state["text"]) if "text" in state else original
-        text_field = gui.add_text("grammar", text, multiline=True)
-        fault, too_long = gui.add_html(""), gui.add_html("")
-        seed = gui.add_number("seed", count("seed"), min=0, step=1)
-        number = gui.add_number("robot number", count("number"), min=0, step=1)
-        buttons = gui.add_button_group("robot", ("typical", "this", "next"))
-        num_parts = gui.add_slider(
-            "parts shown", 1, 2, 1, 1, hint="how much of the derivation is shown"
+        tab = GrammarTab(
+            session,
+            show_robot,
+            source,
+            name,
+            original,
+            gui.add_dropdown("start from", _starts(source), initial_value=source),
+            gui.add_text("grammar", text, multiline=True),
+            gui.add_html(""),
+            gui.add_html(""),
+            gui.add_number("seed", parse_count(state.get("seed", ""), 0), min=0, step=1),
+            gui.add_number("robot number", parse_count(state.get("number", ""), 0), min=0, step=1),
         )
-        tree = gui.add_html("")
-    tab = GrammarTab(
-        session,
-        show_robot,
-        source,
-        name,
-        original,
-        dropdown,
-        text_field,
-        fault,
-        too_long,
-        seed,
-        number,
-        num_parts,
-        tree,
-    )
+        buttons = gui.add_button_group("robot", ("typical", "this", "next"))
+        hint = "how much of the derivation is shown"
+        tab.num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
+        tab.tree = gui.add_html("")
     if "choices" in state:
         tab.choices, tab.mode = unpack_choices(state["choices"]), "chosen"
     elif "number" in state:
         tab.mode = "drawn"
-    session.on_change(dropdown, lambda: load_source(tab, dropdown.value))
-    session.on_change(text_field, lambda: show_grammar(tab, tab.mode), "grammar")
+    session.on_change(tab.start, lambda: load_source(tab, tab.start.value))
+    session.on_change(tab.text, lambda: show_grammar(tab, tab.mode), "grammar")
     session.on_change(buttons, lambda: _draw(tab, buttons.value))
-    session.on_change(num_parts, lambda: _show_parts(tab), "parts")
+    session.on_change(tab.num_parts, lambda: _show_parts(tab), "parts")
     return tab
 
 

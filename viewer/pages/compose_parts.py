@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -123,20 +124,16 @@ def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
 
 def controls_of(slot: str, manifest: Manifest) -> list[Control]:
     """Return a slider for every parameter of a part in a slot."""
-    return [
-        _control(f"{slot}.{name}", name, parameter)
-        for name, parameter in parameters_of(slot, manifest).items()
-    ]
+    parameters = parameters_of(slot, manifest)
+    return [_control(f"{slot}.{name}", name, parameters[name]) for name in parameters]
 
 
 def node_controls(node: Derivation, library: Library, *, is_root: bool) -> list[Control]:
     """Return a slider for every parameter of a part of a derivation; the keys are their names."""
     manifest = library.manifest(node.part)
     parameters = manifest.parameters if is_root else manifest.attached_parameters
-    names = dict(node.parameters)
-    return [
-        _control(name, name, parameter) for name, parameter in parameters.items() if name in names
-    ]
+    used = dict(node.parameters)
+    return [_control(name, name, parameters[name]) for name in parameters if name in used]
 
 
 def _control(key: str, name: str, parameter: Parameter) -> Control:
@@ -208,15 +205,12 @@ class PartsTab:
     choice: PartChoice
     fault: viser.GuiHtmlHandle
     folder: viser.GuiFolderHandle
-    slots: dict[str, viser.GuiFolderHandle] = field(default_factory=dict)
+    slots: list[viser.GuiFolderHandle] = field(default_factory=list)
     """Folders with the controls of each slot."""
 
 
 def add_parts_tab(
-    session: Session,
-    tabs: viser.GuiTabGroupHandle,
-    choice: PartChoice,
-    show_robot: ShowRobot,
+    session: Session, tabs: viser.GuiTabGroupHandle, choice: PartChoice, show_robot: ShowRobot
 ) -> Callable[[], None]:
     """Add the tab with a dropdown for the base and the controls of its slots.
 
@@ -234,7 +228,7 @@ def add_parts_tab(
     return lambda: _show_choice(tab)
 
 
-def show_composed(
+def _show_composed(
     session: Session,
     fault: viser.GuiHtmlHandle,
     subject: str,
@@ -258,7 +252,7 @@ def _show_choice(tab: PartsTab) -> None:
     """Show the robot of the chosen parts, or why they do not fit."""
     session, words = tab.session, tab.choice.words
     command = shlex.join(["morphgen", "compose", *words.split()])
-    show_composed(
+    _show_composed(
         session,
         tab.fault,
         words,
@@ -269,50 +263,48 @@ def _show_choice(tab: PartsTab) -> None:
 
 def _add_slots(tab: PartsTab) -> None:
     """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
-    session = tab.session
-    gui, library = session.client.gui, session.files.library
-    for folder in tab.slots.values():
+    gui, library = tab.session.client.gui, tab.session.files.library
+    for folder in tab.slots:
         folder.remove()
     tab.slots.clear()
-    with tab.folder:
-        for slot in ("base", *slots_of(tab.choice, library)):
-            folder = tab.slots[slot] = gui.add_folder(slot)
-            with folder:
-                if slot != "base":
-                    _add_part_dropdown(tab, slot)
-                if part := tab.choice.parts.get(slot):
-                    for control in controls_of(slot, library.manifest(part, kind_of(slot))):
-                        _add_slider(tab, control)
+    for slot in ("base", *slots_of(tab.choice, library)):
+        with tab.folder:
+            folder = gui.add_folder(slot)
+        tab.slots.append(folder)
+        with folder:
+            if slot != "base":
+                _add_part_dropdown(tab, slot)
+            if part := tab.choice.parts.get(slot):
+                for control in controls_of(slot, library.manifest(part, kind_of(slot))):
+                    _add_choice_slider(tab, control)
 
 
 def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
-    session = tab.session
-    names = part_options(slot, session.files.library)
-    chosen = tab.choice.parts.get(slot)
-    dropdown = session.client.gui.add_dropdown(
-        kind_of(slot),
-        tuple(names),
-        initial_value=chosen if chosen in names else NO_PART,
+    names, chosen = part_options(slot, tab.session.files.library), tab.choice.parts.get(slot)
+    dropdown = tab.session.client.gui.add_dropdown(
+        kind_of(slot), tuple(names), initial_value=chosen if chosen in names else NO_PART
     )
-    session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
+    tab.session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
 
 
-def _add_slider(tab: PartsTab, control: Control) -> None:
-    """Add the slider of a part's parameter."""
-    slider = tab.session.client.gui.add_slider(
-        control.label,
-        control.low,
-        control.high,
-        control.step,
-        tab.choice.values.get(control.key, control.default),
-        hint=control.hint,
-    )
-
-    def set_parameter() -> None:
-        tab.choice = with_value(tab.choice, control, slider.value)
+def _add_choice_slider(tab: PartsTab, control: Control) -> None:
+    def change(value: float) -> None:
+        tab.choice = with_value(tab.choice, control, value)
         _show_choice(tab)
 
-    tab.session.on_change(slider, set_parameter, control.key)
+    value = tab.choice.values.get(control.key, control.default)
+    _add_slider(tab.session, control, value, control.key, change)
+
+
+def _add_slider(
+    session: Session, control: Control, value: float, key: str, change: Callable[[float], None]
+) -> None:
+    """Add the slider of a part's parameter."""
+    low, high = control.low, control.high
+    slider = session.client.gui.add_slider(
+        control.label, low, high, control.step, min(max(value, low), high), hint=control.hint
+    )
+    session.on_change(slider, lambda: change(slider.value), key)
 
 
 def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
@@ -322,39 +314,43 @@ def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
     _show_choice(tab)
 
 
-@dataclass(eq=False)
-class ParametersTab:
-    """Controls of the tab in one browser."""
-
-    session: Session
-    show_robot: ShowRobot
-    derivation: Derivation
-    fault: viser.GuiHtmlHandle
-
-
 def add_parameters_tab(
-    session: Session,
-    tabs: viser.GuiTabGroupHandle,
-    derivation: Derivation,
-    show_robot: ShowRobot,
+    session: Session, tabs: viser.GuiTabGroupHandle, derivation: Derivation, show_robot: ShowRobot
 ) -> Callable[[], None]:
-    """Add the tab with a folder of sliders for every part.
-
-    derivation: Derivation of the robot, of any shape.
+    """Add the tab with a folder of sliders for every part of any derivation.
 
     Returns:
         Function that shows the robot.
     """
-    gui = session.client.gui
+    gui, library, root = session.client.gui, session.files.library, derivation
+
+    def show() -> None:
+        """Show the robot, or why its values do not fit."""
+        uri = f"{DERIVATION}{derivation}"
+        _show_composed(
+            session,
+            fault,
+            uri,
+            lambda: (derivation, default_name(derivation, library)),
+            lambda robot, _: show_robot(robot, derivation, f"# {derivation}", uri),
+        )
+
+    def change(label: str, name: str, value: float) -> None:
+        nonlocal derivation
+        derivation = with_parameter(derivation, label, name, value)
+        show()
+
     with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
-        tab = ParametersTab(session, show_robot, derivation, gui.add_html(""))
-        for node in derivation.walk():
-            controls = node_controls(node, session.files.library, is_root=node is derivation)
+        fault = gui.add_html("")
+        for node in root.walk():
+            controls = node_controls(node, library, is_root=node is root)
             if controls:
                 with gui.add_folder(part_title(node.label, node.part)):
                     for control in controls:
-                        _add_parameter_slider(tab, node, control)
-    return lambda: _show(tab)
+                        key, value = control.key, dict(node.parameters)[control.key]
+                        set_value = functools.partial(change, node.label, key)
+                        _add_slider(session, control, value, f"{node.label}.{key}", set_value)
+    return show
 
 
 def with_parameter(derivation: Derivation, label: str, name: str, value: float) -> Derivation:
@@ -367,33 +363,3 @@ def with_parameter(derivation: Derivation, label: str, name: str, value: float) 
         (port, with_parameter(child, label, name, value)) for port, child in derivation.children
     )
     return replace(derivation, parameters=parameters, children=children)
-
-
-def _add_parameter_slider(tab: ParametersTab, node: Derivation, control: Control) -> None:
-    slider = tab.session.client.gui.add_slider(
-        control.label,
-        control.low,
-        control.high,
-        control.step,
-        min(max(dict(node.parameters)[control.key], control.low), control.high),
-        hint=control.hint,
-    )
-
-    def change() -> None:
-        tab.derivation = with_parameter(tab.derivation, node.label, control.key, slider.value)
-        _show(tab)
-
-    tab.session.on_change(slider, change, f"{node.label}.{control.key}")
-
-
-def _show(tab: ParametersTab) -> None:
-    """Show the robot, or why its values do not fit."""
-    derivation, library = tab.derivation, tab.session.files.library
-    uri = f"{DERIVATION}{derivation}"
-    show_composed(
-        tab.session,
-        tab.fault,
-        uri,
-        lambda: (derivation, default_name(derivation, library)),
-        lambda robot, _: tab.show_robot(robot, derivation, f"# {derivation}", uri),
-    )
