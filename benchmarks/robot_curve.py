@@ -2,15 +2,15 @@
 
     python benchmarks/robot_curve.py [--variants reach obstacles pose push push-long]
         [--robots 10 30 100 300 1000] [--seeds 0 1] [--steps N] [--agent me-graph]
-        [--out results/robot-curve] [--report]
+        [--out results/robot-curve.json] [--report]
 
 Each policy is trained in MuJoCo with robots of the grammar ``serial``, none of which is in a split,
 on one variant of a task: reach, reach among obstacles, reach with a goal pose, or push. It is
 judged on the test robots of splits, and on ten real arms with a stick, 20 episodes each. Robots and
-training of a seed have this seed. Finished evaluations are kept in one file for each policy;
-tables are of all seeds that are there, and ``--report`` only prints them. A cell has the mean score
-over the seeds, in brackets the lowest and the highest score, and the mean success; push, whose
-score is the success, has the latter alone.
+training of a seed have this seed. Finished evaluations are kept in one file, by policy; tables are
+of all seeds that are there, and ``--report`` only prints them. A cell has the mean score over the
+seeds, in brackets the lowest and the highest score, and the mean success; push, whose score is the
+success, has the latter alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ REAL_ARMS = (
     *("jaco2", "lwr", "widowx", "z1", "ur10"),
 )
 REAL_EPISODES = 20
-AGENT, OUT = "me-graph", Path("results/robot-curve")
+AGENT, OUT = "me-graph", Path("results/robot-curve.json")
 
 
 @dataclass(frozen=True)
@@ -98,21 +98,29 @@ def tests_of(variant: Variant) -> dict[str, tuple[str, ...]]:
     return tests
 
 
-def file_of(out: Path, name: str, robots: int, seed: int) -> Path:
-    """Return the file with the scores of a policy."""
-    return out / f"{name}-serial{robots}-seed{seed}.json"
+def policy_name(name: str, robots: int, seed: int) -> str:
+    """Return the name of a policy in the file of scores."""
+    return f"{name}-serial{robots}-seed{seed}"
+
+
+def read_scores(out: Path) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """Return the rows of all robots by policy and test."""
+    scores: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    if out.exists():
+        scores = json.loads(out.read_text("utf-8"))
+    return scores
 
 
 def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace) -> None:
     """Train one policy, and write its scores on each split and real arm that has none."""
-    variant, path = VARIANTS[name], file_of(args.out, name, robots, seed)
-    scores = json.loads(path.read_text("utf-8")) if path.exists() else {}
+    variant, policy = VARIANTS[name], policy_name(name, robots, seed)
+    scores = read_scores(args.out).get(policy, {})
     missing = {test: words for test, words in tests_of(variant).items() if test not in scores}
     if not missing:
         return
     own = "" if args.agent == AGENT else f"-{args.agent}"
     own += f"-{args.steps}" if args.steps else ""
-    run = Path("runs/robot-curve") / f"{name}-serial{robots}-seed{seed}{own}"
+    run = Path("runs/robot-curve") / f"{policy}{own}"
     if not is_trained(run):  # else train would draw the robots again before it finds that out
         morphgen(
             *("train", f"task={variant.task}", *variant.options),
@@ -130,7 +138,8 @@ def train_and_judge(name: str, robots: int, seed: int, args: argparse.Namespace)
                 *("--out", str(rows)),
             )
             scores[test] = json.loads(rows.read_text("utf-8"))["deterministic"]
-        write_atomic(path, json.dumps(scores, indent=1) + "\n")
+        everything = read_scores(args.out) | {policy: scores}
+        write_atomic(args.out, json.dumps(dict(sorted(everything.items())), indent=1) + "\n")
 
 
 def is_trained(run: Path) -> bool:
@@ -154,8 +163,8 @@ def cell(seeds: list[list[dict[str, Any]]]) -> str:
 
 def stored_scores(name: str, robots: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the rows of each test, for each seed that has scores."""
-    paths = sorted(args.out.glob(f"{name}-serial{robots}-seed*.json"))
-    return [json.loads(path.read_text("utf-8")) for path in paths]
+    prefix = policy_name(name, robots, 0).removesuffix("0")
+    return [rows for policy, rows in read_scores(args.out).items() if policy.startswith(prefix)]
 
 
 def real_arm_rows(stored: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
@@ -199,7 +208,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> None:
     """Train and judge what is missing, and print the tables."""
     args = arguments()
-    args.out.mkdir(parents=True, exist_ok=True)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     for name in args.variants:
         if not args.report:
             for robots in args.robots:

@@ -1,7 +1,7 @@
 """Which similarity of an unseen robot to the training robots predicts zero-shot success best.
 
     python benchmarks/similarity_transfer.py [--variants reach obstacles pose push]
-        [--robots 10 30 100 300 1000] [--seeds 0 1] [--results results/robot-curve]
+        [--robots 10 30 100 300 1000] [--seeds 0 1] [--results results/robot-curve.json]
         [--runs runs/robot-curve] [--jobs 1] [--out results/similarity-transfer.json]
         [--figure FILE.png] [--report]
 
@@ -53,7 +53,7 @@ from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.drawn_robots import read_drawn
 from morphgen.typing import Array
-from robot_curve import REAL_ARMS, VARIANTS, file_of
+from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 
 COLUMNS = (*MEASURES, "joints", "reach")
 OUT = Path("results/similarity-transfer.json")
@@ -95,14 +95,15 @@ def read_policies(args: argparse.Namespace, library: Library) -> Iterator[Policy
     make = RobotFactory(library.folders)
     recipes = [ComposedRecipe((f"arm={arm}", "ee=stick")) for arm in REAL_ARMS]
     arms = {arm.name: arm for arm in members(map(make, recipes), ("reach",), obstacles=False)}
+    stored = read_scores(args.results)
     for variant, robots, seed in product(args.variants, args.robots, args.seeds):
-        path = file_of(args.results, variant, robots, seed)
-        if not path.exists():
+        policy = policy_name(variant, robots, seed)
+        if policy not in stored:
             continue
-        train = {member.robot_hash: member for member in read_drawn(args.runs / path.stem)}
+        train = {member.robot_hash: member for member in read_drawn(args.runs / policy)}
         test: dict[str, Member] = {}
         successes: dict[str, list[float]] = {}
-        for name, rows in json.loads(path.read_text("utf-8")).items():
+        for name, rows in stored[policy].items():
             tested = arms if name in arms else {m.name: m for m in read_split(name).test}
             for row in rows:
                 member = tested[row["robot"]]
@@ -240,7 +241,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--robots", type=int, nargs="+", default=[10, 30, 100, 300, 1000])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--results", type=Path, default=Path("results/robot-curve"))
+    parser.add_argument("--results", type=Path, default=Path("results/robot-curve.json"))
     parser.add_argument("--runs", type=Path, default=Path("runs/robot-curve"))
     parser.add_argument("--jobs", type=int, default=1, help="processes that compare robots")
     parser.add_argument("--out", type=Path, default=OUT, help="a row per policy and robot")

@@ -10,11 +10,12 @@ robots.png and similarity.png.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import runpy
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -23,11 +24,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from morphgen.benchmark.split import SIDES, Side
-from morphgen.formats.data_files import read_json
-from morphgen.rl.runs.checkpoint import read_config
-from morphgen.rl.scores.scores import Interval, Score, score_from_json, success_of
-from morphgen.rl.scores.study import stored_cell, tuned_name
+from morphgen.benchmark.split import SIDES
+from morphgen.rl.scores.episode_table import EPISODES, name_of, read_table
+from morphgen.rl.scores.leaderboard import relative_scores
+from morphgen.rl.scores.score_tables import ResultRow, result_rows
+from morphgen.rl.scores.scores import Interval, success_interval
+from morphgen.rl.scores.submission import Submission
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
@@ -46,8 +48,6 @@ SPLITS = (
 )
 FIGURE_SPLITS = SPLITS[:5]
 TUNED_STEPS = (10_000, 30_000)
-TUNED = ("deterministic", *map(tuned_name, TUNED_STEPS))
-"""Modes of a run before and after fine-tuning."""
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
 AGENTS = {
@@ -64,62 +64,40 @@ COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
 CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030", "#805ad5")
 sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
-CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve")])
+CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 
 
-@dataclass(frozen=True)
-class Result:
-    """Scores of the robots of a side, over all seeds of an agent."""
-
-    seeds: int
-    score: float
-    """Mean score over seeds and robots."""
-    success: Interval
-    """Success rate of all episodes with its Wilson interval."""
+@cache
+def episodes_of(study: str) -> dict[str, Submission]:
+    """Return the episodes of a study in results/, by split, method, seed and mode."""
+    table = read_table(ROOT / "results" / study / EPISODES)
+    return {name_of(submission): submission for submission in table}
 
 
-Modes = Mapping[str, Mapping[Side, Result]]
-"""Results by mode, or by the name of a baseline."""
+@cache
+def rows_of(study: str) -> list[ResultRow]:
+    """Return the rows of a study for policies that act by their mean, and baselines."""
+    episodes = episodes_of(study).items()
+    return result_rows({k: v for k, v in episodes if v.mode != "stochastic" and not v.finetuned})
 
 
-def results_of(study: str, split: str, task: str | None = None) -> dict[tuple[str, int], Modes]:
-    """Return the results of a split by agent and transitions; baselines have 0 transitions.
+def results_of(study: str, split: str, task: str | None = None) -> dict[tuple[str, int], ResultRow]:
+    """Return the rows of a split by agent and transitions; baselines have 0 transitions.
 
     Args:
         study: Folder in results/.
         split: Name of the split.
-        task: Task of the robots; by default all robots of the split.
+        task: Task of the robots; by default that of all robots of the split.
     """
-    found: dict[tuple[str, int], dict[str, dict[Side, list[list[Score]]]]] = {}
-    for path in sorted((ROOT / "results" / study / split).glob("*/**/scores.json")):
-        agent, steps = path.parent.name, 0
-        if path.with_name("config.json").exists():
-            agent = path.parent.parent.name
-            steps = read_config(path.parent).ppo.total_timesteps
-        modes = found.setdefault((agent, steps), {})
-        for mode, scores in stored_cell(path, read_json(path)).scores.items():
-            for side in SIDES:
-                own = [s for s in scores if s.side == side and task in (None, s.task)]
-                if own:
-                    modes.setdefault(mode, {}).setdefault(side, []).append(own)
-    return {
-        key: {
-            mode: {side: _result(seeds) for side, seeds in sides.items()}
-            for mode, sides in modes.items()
-        }
-        for key, modes in found.items()
-    }
+    rows = [row for row in rows_of(study) if row.split == split and task in (None, row.task)]
+    return {(row.method, row.transitions or 0): row for row in rows}
 
 
-def _result(seeds: list[list[Score]]) -> Result:
-    scores = [score for seed in seeds for score in seed]
-    return Result(len(seeds), mean(score.score for score in scores), success_of(scores))
-
-
-def by_mean(modes: Modes) -> Mapping[Side, Result]:
-    """Return the results of a policy that acts by its mean, or of a baseline."""
-    return modes.get("deterministic") or next(iter(modes.values()))
+def rates_on_test(submission: Submission) -> tuple[list[float], list[int]]:
+    """Return success rate and number of episodes of each test robot."""
+    own = [robot.success for robot in submission.robots if robot.side == "test"]
+    return [mean(each) for each in own], [len(each) for each in own]
 
 
 def split_table(task: str) -> str:
@@ -127,16 +105,16 @@ def split_table(task: str) -> str:
     lines = []
     with_scores = task.startswith("reach")  # the score of push is its success
     for split in SPLITS:
-        found: dict[tuple[str, int, str], Modes] = {}
+        found: dict[tuple[str, int, str], ResultRow] = {}
         for study in STUDIES:
             note = ", four epochs" if "4epochs" in study else ""
-            for (agent, steps), modes in results_of(study, f"{split}/{task}").items():
+            for (agent, steps), row in results_of(study, f"{split}/{task}").items():
                 if agent in (*AGENTS, *BASELINES):
-                    found[agent, steps, note] = modes
+                    found[agent, steps, note] = row
         order = [*AGENTS, *BASELINES]
         for agent, steps, note in sorted(found, key=lambda key: (order.index(key[0]), key[1:])):
-            modes = found[agent, steps, note]
-            lines.append([split, *_line(agent, steps, note, modes, with_scores)])
+            row = found[agent, steps, note]
+            lines.append([split, *_line(agent, steps, note, row, with_scores)])
             split = ""
     score = ["MT", "success", "ZS", "success"] if with_scores else ["MT", "ZS"]
     headers = ["split", "agent", "transitions", "seeds", *score]
@@ -151,12 +129,12 @@ def ee_task_table() -> str:
     keys = [key for key in {*push, *reach} if key[0] in order]
     for key in sorted(keys, key=lambda key: order.index(key[0])):
         agent, steps = key
-        by_task = [by_mean(found[key]) if found.get(key) else {} for found in (push, reach)]
-        pushing, reaching = by_task
-        seeds = max(result.seeds for sides in by_task for result in sides.values())
+        rows = [found[key] for found in (push, reach) if key in found]
+        pushing, reaching = (found[key].sides if key in found else {} for found in (push, reach))
+        seeds = max(len(row.seeds) for row in rows)
         columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
         rates = [column.success.as_percent() if column else "" for column in columns]
-        score = f"{reaching['train'].score:.1f}" if reaching else ""
+        score = f"{reaching['train'].mean:.1f}" if reaching else ""
         lines.append([*_run_cells(agent, steps, seeds), rates[0], score, *rates[1:]])
     headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
@@ -169,34 +147,38 @@ def _run_cells(agent: str, steps: int, seeds: int, note: str = "") -> list[str]:
     return [name, *([f"{round(steps / 1e6)} million{share}", str(seeds)] if steps else ["", ""])]
 
 
-def _names(run: Path) -> list[str]:
-    """Return split, agent and seed of a run's folder, relative to results/."""
-    _, *split, agent, seed = run.parts
-    return ["/".join(split), AGENTS[agent], seed.removeprefix("seed")]
+def _names(submission: Submission) -> list[str]:
+    """Return split, agent and seed of a run."""
+    seed = str(submission.training_seed)
+    return [submission.split.name, AGENTS[submission.method], seed]
 
 
-def _line(agent: str, steps: int, note: str, modes: Modes, with_scores: bool) -> list[str]:
-    sides = by_mean(modes)
-    cells = _run_cells(agent, steps, sides["test"].seeds, note)
+def _line(agent: str, steps: int, note: str, row: ResultRow, with_scores: bool) -> list[str]:
+    sides = row.sides
+    cells = _run_cells(agent, steps, len(row.seeds), note)
     for side in SIDES:
         if side not in sides:
             cells += [""] * (2 if with_scores else 1)
             continue
         success = sides[side].success.as_percent()
-        cells += [f"{sides[side].score:.1f}", success] if with_scores else [success]
+        cells += [f"{sides[side].mean:.1f}", success] if with_scores else [success]
     return cells
 
 
-def fine_tuned_runs() -> dict[str, list[tuple[list[str], list[Result]]]]:
-    """Return runs by their test task: split, agent and seed, and results by mode of ``TUNED``."""
-    found: dict[str, list[tuple[list[str], list[Result]]]] = {}
-    for path in sorted((ROOT / "results").glob("*-30m/**/scores.json")):
-        scores = stored_cell(path, read_json(path)).scores
-        if not scores.keys() >= set(TUNED):
-            continue
-        tests = [[score for score in scores[mode] if score.side == "test"] for mode in TUNED]
-        names = _names(path.parent.relative_to(ROOT / "results"))
-        found.setdefault(tests[0][0].task, []).append((names, [_result([rows]) for rows in tests]))
+def fine_tuned_runs() -> dict[str, list[tuple[list[str], list[Interval]]]]:
+    """Return runs by their test task: split, agent and seed, and success by steps of tuning."""
+    found: dict[str, list[tuple[list[str], list[Interval]]]] = {}
+    for study in ("ee-task-30m", "push-30m", "reach-30m"):
+        runs: dict[tuple[object, ...], dict[int, Submission]] = {}
+        for each in episodes_of(study).values():
+            if each.mode == "deterministic":
+                run = runs.setdefault((each.split.name, each.method, each.training_seed), {})
+                run[each.finetuned] = each
+        for run in runs.values():
+            if run.keys() >= set(TUNED_STEPS):
+                task = next(robot.task for robot in run[0].robots if robot.side == "test")
+                rates = [success_interval(*rates_on_test(run[n])) for n in (0, *TUNED_STEPS)]
+                found.setdefault(task, []).append((_names(run[0]), rates))
     return found
 
 
@@ -204,8 +186,11 @@ def fine_tuning_table() -> str:
     """Return success on the test robots before and after fine-tuning."""
     lines = []
     for task, rows in sorted(fine_tuned_runs().items()):
-        lines += [[*names, *(x.success.as_percent() for x in results)] for names, results in rows]
-        means = [mean(results[i].success.value for _, results in rows) for i in range(len(TUNED))]
+        lines += [[*names, *(x.as_percent() for x in rates)] for names, rates in rows]
+        means = [
+            mean(rate.value for rate in column)
+            for column in zip(*(r for _, r in rows), strict=True)
+        ]
         lines.append([f"**mean of {len(rows)}, {task}**", "", "", *(f"**{x:.1%}**" for x in means)])
     steps = [f"{number:,} steps" for number in TUNED_STEPS]
     headers = ["split", "agent", "seed", "zero-shot", *steps]
@@ -216,22 +201,24 @@ def pybullet_table() -> str:
     """Return scores on the test robots in MuJoCo and in PyBullet, for runs that have both."""
     lines: list[list[str]] = []
     differences: dict[str, list[float]] = {}
-    for path in sorted((ROOT / "results/pybullet").rglob("seed*.json")):
-        run = path.relative_to(ROOT / "results/pybullet").with_suffix("")
-        stored = ROOT / "results" / run / "scores.json"
-        ours = stored_cell(stored, read_json(stored)).scores["deterministic"]
-        tests = [score for score in ours if score.side == "test"]
-        mujoco = _result([tests])
-        bullet = _result([[score_from_json(row) for row in read_json(path)["deterministic"]]])
-        rates = [100 * result.success.value for result in (mujoco, bullet)]
+    stored = json.loads((ROOT / "results/pybullet.json").read_text("utf-8"))
+    for run, bullet in stored.items():
+        study, _, name = run.partition("/")
+        split, method, seed = name.rsplit("/", 2)
+        mujoco = episodes_of(study)[f"{split} {method} {seed} deterministic"]
+        tests = [robot for robot in mujoco.robots if robot.side == "test"]
+        rates = [100 * mean(rates_on_test(mujoco)[0]), 100 * mean(row["success"] for row in bullet)]
         differences.setdefault(tests[0].task, []).append(rates[1] - rates[0])
-        split, agent, seed = _names(run)
-        if run.parts[0].endswith("100m"):
-            agent += ", 100 million"
-        cells = [split, agent, seed, *(f"{rate:.0f}%" for rate in rates)]
+        names = _names(mujoco)
+        if study.endswith("100m"):
+            names[1] += ", 100 million"
+        cells = [*names, *(f"{rate:.0f}%" for rate in rates)]
         cells.append(f"{rates[1] - rates[0]:+.0f} points")
         if tests[0].task == "reach":  # the score of push is its success
-            scores = mujoco.score, bullet.score
+            scores = (
+                mean(relative_scores(x).mean() for x in tests),
+                mean(x["score"] for x in bullet),
+            )
             cells += [*(f"{x:.1f}" for x in scores), f"{scores[1] - scores[0]:+z.1f}"]
         lines.append(cells)
     for task, values in sorted(differences.items()):
@@ -277,10 +264,10 @@ def bar_figure(task: str, baseline: str) -> Figure:
     for i, (agent, name) in enumerate(names.items()):
         label: str | None = name.replace("`", "")
         for x, found in enumerate(results):
-            modes = [modes for (of, _), modes in found.items() if of == agent]
-            if not modes:
+            rows = [row for (of, _), row in found.items() if of == agent]
+            if not rows:
                 continue
-            rate = by_mean(modes[0])["test"].success
+            rate = rows[0].sides["test"].success
             axes.bar(
                 x + (i - (len(names) - 1) / 2) * width,
                 100 * rate.value,
@@ -303,8 +290,8 @@ def fine_tuning_figure() -> Figure:
     figure = Figure(figsize=(6.5, 3.2), layout="constrained")
     axes = figure.subplots()
     by_split: dict[str, list[list[float]]] = {}
-    for (split, *_), results in fine_tuned_runs()["push"]:
-        by_split.setdefault(split, []).append([100 * x.success.value for x in results])
+    for (split, *_), rates in fine_tuned_runs()["push"]:
+        by_split.setdefault(split, []).append([100 * rate.value for rate in rates])
     steps = [0, *(number / 1000 for number in TUNED_STEPS)]
     for i, (split, rows) in enumerate(by_split.items()):
         label = f"{split.removesuffix('/push')} ({len(rows)})"

@@ -14,8 +14,7 @@ import pytest
 from morphgen.benchmark.split import sided_members
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.cli import main
-from morphgen.rl.scores.leaderboard import relative_scores
-from morphgen.rl.scores.score_tables import read_submissions
+from morphgen.rl.scores.episode_table import EPISODES, read_table
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = re.findall(
@@ -58,12 +57,12 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypa
     assert run_here(command, monkeypatch) == 0
     rows = json.loads((tmp_path / study / "results.json").read_text("utf-8"))["rows"]
     means = {
-        (row["split"], row["task"], row["agent"]): {
-            f"{group['mean']:{'.0%' if row['task'] == 'push' else '.1f'}}"
-            for group in row["groups"].values()
+        (row["split"], row["task"], row["method"]): {
+            f"{side['mean']:{'.0%' if row['task'] == 'push' else '.1f'}}"
+            for side in row["sides"].values()
         }
         for row in rows
-        if row["mode"] == "deterministic"
+        if row["mode"] == "deterministic" and not row["finetuned"]
     }
     assert means
     for agent, numbers in means.items():
@@ -79,20 +78,6 @@ def test_results_of_many_episodes_are_those_of_the_page(file):
     column = {"mujoco": 2, "pybullet": 4}[sim]
     cells = [line[column : column + 2] for line in DOCS if line[1:2] and f"`{name}`" in line[1]]
     assert [score, f"{row['success']:.1%}"] in cells
-
-
-def test_scores_follow_from_the_stored_episodes():
-    submissions = read_submissions([ROOT / "results"])
-    assert len(submissions) > 60
-    for path, submission in ((Path(file), each) for file, each in submissions.items()):
-        mode = path.stem if submission.training is None else submission.mode
-        if submission.training is not None and submission.training.finetuned:
-            mode = f"fine-tuned {submission.training.finetuned:,}"
-        stored = json.loads((path.parent / "scores.json").read_text("utf-8"))["scores"][mode]
-        for robot, score in zip(submission.robots, stored, strict=True):
-            assert (robot.robot, robot.side) == (score["robot"], score["side"]), path
-            assert relative_scores(robot).mean() == pytest.approx(score["score"]), path
-            assert sum(robot.success) == pytest.approx(score["success"] * score["episodes"]), path
 
 
 def test_the_page_of_results_has_the_tables_of_its_command():
@@ -111,8 +96,9 @@ def test_the_docs_have_the_table_of_the_stored_conformance(monkeypatch, capsys):
 @pytest.mark.parametrize("page", ["differences.md", "training.md"])
 def test_the_docs_have_the_constants_of_the_stored_runs(page):
     stored = {}
-    for path in (ROOT / "results").rglob("config.json"):
-        config = json.loads(path.read_text("utf-8"))
+    tables = (ROOT / "results").rglob(EPISODES)
+    configs = [run.config for path in tables for run in read_table(path) if run.config]
+    for config in configs:
         agent, constants = config["policy"]["agent"], config | config["ppo"]
         (name,) = [
             name for name, agents, sims in RUNS if re.match(agents, agent) and config["sim"] in sims

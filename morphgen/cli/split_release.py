@@ -83,14 +83,10 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.rl.scores.reference_scores import (
-            collect_references,
-            reference_files,
-            submitted_results,
-        )
+        from morphgen.rl.scores.reference_scores import collect_references, reference_files
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
-        extra, results = reference_files(references), submitted_results(references)
+        extra, results = reference_files(references), references.results()
     request = ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -182,7 +178,6 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
     from morphgen.rl.scores.leaderboard import (
-        random_scores,
         ranking_data,
         ranking_table,
         score_submission,
@@ -203,7 +198,7 @@ def score(args: argparse.Namespace) -> None:
     ]
     for where, submission in named:
         check_submission(submission, where, split, protocol, expected, version)
-    random = random_scores(references.random) if references.random else None
+    random = references.random
     tasks = sorted({each.member.task for each in expected})
     relative = [task for task in tasks if TASKS[task].relative_to_random]
     warnings = []
@@ -214,7 +209,7 @@ def score(args: argparse.Namespace) -> None:
             f"edited random_score changes a score of {' and '.join(relative)}; rank submissions in "
             "a release that has one (split release --scores)"
         )
-    rows = [score_submission(each, random) for each in submissions] + references.all_rows()
+    rows = [score_submission(each, random) for each in submissions] + references.rows()
     data = {
         "split": split.name,
         "random": "release" if random else "submission",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,8 +64,8 @@ PAPER = "paper"
     opt.LIBRARY,
     details="A cell is an agent with a seed on a split, or a baseline on a split. The command "
     "trains and evaluates each cell, and writes tables and curves. Finished cells are skipped; "
-    "several processes with one folder share the work. The exit code is 1 if a cell failed. The "
-    "folder of a cell also gets its episodes, which morphgen score reads.",
+    "several processes with one folder share the work. The exit code is 1 if a cell failed. "
+    "All episodes are in episodes.csv.gz of the folder, which morphgen score reads.",
     examples=(
         "study paper --seeds 0..1 --steps 30e6 --finetune 10000,30000 --out results",
         "study interpolation/arm3/reach --agents se,me-mlp,me-tf --seeds 0..2 --out study",
@@ -76,14 +76,14 @@ PAPER = "paper"
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
     from morphgen.rl.scores.score_tables import TABLE, write_tables
-    from morphgen.rl.scores.study import read_scores, require_cells
+    from morphgen.rl.scores.study import require_cells
 
     execution_config(args)  # refuses invalid options before the work
     cells = _cells(args)
     require_cells(cells)
     args.out.mkdir(parents=True, exist_ok=True)
     failures = 0 if args.report else _run_cells(args, cells)
-    written = write_tables(args.out, {cell: read_scores(cell) for cell in cells})
+    written = write_tables(args.out, cells)
     print((args.out / TABLE).read_text(encoding="utf-8"))
     for path in written:
         print(path)
@@ -210,7 +210,7 @@ MODES = ("deterministic", "stochastic", "all")
         nargs="+",
         type=Path,
         metavar="FILE",
-        help="submission, or a folder with submissions at any depth, such as that of a study",
+        help="submission, table of a study, or a folder with such files at any depth",
     ),
     option(
         "--mode",
@@ -231,21 +231,10 @@ MODES = ("deterministic", "stochastic", "all")
 )
 def score(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    from morphgen.rl.scores.score_tables import (
-        cells_without_episodes,
-        read_submissions,
-        result_rows,
-        result_tables,
-    )
-    from morphgen.rl.scores.scores import finite_or_none
+    from morphgen.rl.scores.episode_table import read_submissions
+    from morphgen.rl.scores.score_tables import NOTE, result_rows, result_tables, rows_data
 
     submissions = read_submissions(args.files)
-    if num_left := cells_without_episodes(args.files, submissions):
-        print(
-            f"morphgen: {num_left} cells of studies are left out: they have scores.json and no "
-            "episodes; delete it, and morphgen study evaluates their checkpoints again",
-            file=sys.stderr,
-        )
     modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
     found = {where: each for where, each in submissions.items() if each.mode in modes}
     if not found:
@@ -254,7 +243,5 @@ def score(args: argparse.Namespace) -> None:
             f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
         )
     rows = result_rows(found)
-    data = [finite_or_none(asdict(row)) for row in rows]
-    notes = "MT: train robots, ZS: test robots; intervals: 95%"
     style = "github" if args.markdown else "simple"
-    opt.print_result(args, data, lambda: f"{result_tables(rows, style)}\n{notes}")
+    opt.print_result(args, rows_data(rows), lambda: f"{result_tables(rows, style)}\n{NOTE}")

@@ -559,14 +559,19 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
 
 def require_same_run(folder: Path, config: RunConfig) -> None:
     """Require that a folder has a run with this config."""
-    theirs, ours = _flat(read_config(folder)), _flat(config)
+    require_same_config(read_config(folder), config, str(folder))
+
+
+def require_same_config(stored: RunConfig, config: RunConfig, where: str) -> None:
+    """Require that a stored run has this config."""
+    theirs, ours = _flat(stored), _flat(config)
     differences = [
         f"{name} {_short(theirs.get(name))}, not {_short(value)}"
         for name, value in ours.items()
         if theirs.get(name) != value
     ]
     if differences:
-        raise TaskError(f"{folder} has another run: {'; '.join(differences)}")
+        raise TaskError(f"{where} has another run: {'; '.join(differences)}")
 
 
 def _flat(config: RunConfig) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import msgspec
@@ -12,7 +13,6 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.errors import BenchmarkError
-from morphgen.formats.records import FiniteNumber, Record
 from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores.scores import (
     Interval,
@@ -25,42 +25,35 @@ from morphgen.rl.scores.submission import RobotOutcomes, Submission
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 
-Source = Literal["submission", "reference", "study"]
+Source = Literal["submission", "reference"]
 RandomScores = Mapping[tuple[Side, str], Sequence[float]]
 """Scores of the random policy's episodes, by side and name of the robot."""
 
 
-class SideScore(Record, frozen=True):
+@dataclass(frozen=True)
+class SideScore:
     """Mean result over the robots of a side that do one task."""
 
     side: Side
     task: str
     robots: int
-    score: FiniteNumber
+    score: float
     """Mean score, relative to the random policy where the task wants it."""
-    success: FiniteNumber
+    success: float
     """Mean success rate, 0 to 1."""
-    low: FiniteNumber | None = None
+    low: float | None = None
     """Lower end of the 95% interval of ``score``; None if it is not known."""
-    high: FiniteNumber | None = None
+    high: float | None = None
     """Upper end of the interval."""
 
-    def __post_init__(self) -> None:
-        if self.robots < 1 or not 0 <= self.success <= 1:
-            raise ValueError(
-                f"{self.robots} robots, success {self.success:g}: expected 1 robot or more, and a "
-                "success rate from 0 to 1"
-            )
-        if (self.low is None) != (self.high is None):
-            raise ValueError("an interval with one end; expected low and high, or neither")
 
-
-class Row(Record, frozen=True):
+@dataclass(frozen=True)
+class Row:
     """A method in a ranking."""
 
     method: str
     source: Source
-    """``submission``; ``reference``, a submission in a release; or ``study``, its stored scores."""
+    """``submission``; or ``reference``, a submission in a release."""
     mode: str
     seeds: tuple[int, ...]
     """Seeds of the training; empty for a baseline."""
@@ -69,18 +62,6 @@ class Row(Record, frozen=True):
     sides: tuple[SideScore, ...]
     finetuned: int = 0
     """Transitions of fine-tuning on the test robots."""
-
-    def __post_init__(self) -> None:
-        if not self.method.isprintable():
-            raise ValueError(f"method {self.method!r}; expected printable characters")
-        groups = [(side.side, side.task) for side in self.sides]
-        if len(set(groups)) < len(groups):
-            raise ValueError("a side and task is there twice; expected once")
-
-    @property
-    def run(self) -> tuple[object, ...]:
-        """Method, mode, seeds and fine-tuning: no two rows of a split share all four."""
-        return self.method, self.mode, self.seeds, self.finetuned
 
     @property
     def label(self) -> str:

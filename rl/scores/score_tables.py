@@ -6,14 +6,13 @@ seeds, success rates with Wilson intervals, and paired differences to a referenc
 
 from __future__ import annotations
 
-import csv
 import io
-import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tabulate import tabulate
@@ -24,64 +23,31 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.files import write_file
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.runs.recorders import read_metrics
-from morphgen.rl.runs.robot_source import tasks_of
 from morphgen.rl.runs.training import subruns_of
+from morphgen.rl.scores.episode_table import name_of
 from morphgen.rl.scores.leaderboard import relative_scores
+from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores.scores import (
-    SCORE_KEYS,
     UNSTABLE,
     Interval,
-    Score,
     finite_or_none,
     iqm_interval,
     score_decimals,
-    scores_to_json,
     stratified_mean_interval,
     success_interval,
-    success_of,
 )
-from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
-from morphgen.rl.scores.study import SCORES, Cell, as_record
+from morphgen.rl.scores.study import Cell, stored_results
 from morphgen.rl.scores.submission import (
     RobotOutcomes,
     Submission,
-    is_submission,
-    json_files,
-    require_each_once,
-    require_full_lists,
+    require_comparable,
     require_same_random,
-    submission_from,
 )
 from morphgen.typing import Array
 
-TABLE, DATA, ROBOTS, CURVES = "table.md", "results.json", "results.csv", "curves.png"
-MISSING, NONE = "missing", "-"
-HEADERS = (
-    "agent",
-    "mode",
-    "seeds",
-    "MT mean",
-    "MT IQM",
-    "MT success",
-    "ZS mean",
-    "ZS IQM",
-    "ZS success",
-)
-
-Results = Mapping[Cell, Mapping[str, Sequence[Score]] | None]
-"""Scores by cell and mode; None for a cell that is not done."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Averages over seeds and over the robots of one side of a split."""
-
-    mean: float
-    """Mean score."""
-    iqm: Interval
-    """Interquartile mean of the scores, with its bootstrap interval."""
-    success: Interval
-    """Mean success rate, 0 to 1, with its Wilson interval over the episodes of robots and seeds."""
+TABLE, DATA, CURVES = "table.md", "results.json", "curves.png"
+MISSING = "missing"
+NOTE = "MT: train robots, ZS: test robots; intervals: 95%"
 
 
 @dataclass(frozen=True)
@@ -96,102 +62,44 @@ class Curve:
     """Whether all updates of the run have been made."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Results of an agent on the robots of a split that do one task."""
-
-    split: str
-    """Name of the split."""
-    task: str
-    """Name of the task."""
-    agent: str
-    """Label of the agent, or name of the baseline."""
-    mode: str
-    """Mode of the policies; empty if all scores are missing."""
-    seeds: tuple[int | None, ...]
-    """Seeds with scores; None for a baseline."""
-    missing: tuple[int | None, ...]
-    """Seeds without scores yet; None for a baseline."""
-    groups: Mapping[Side, Group]
-    """Averages by side, for sides with scores."""
-    sides: tuple[Side, ...]
-    """Sides that the agent is evaluated on, now or later."""
-    unstable: int = 0
-    """Number of episodes that ended because the simulation diverged."""
-
-
-def rows(results: Results) -> list[Row]:
-    """Return a row for every split, task, agent and mode, in the order of the cells."""
-    table: list[Row] = []
-    for split, agent in dict.fromkeys((cell.split, cell.agent) for cell in results):
-        cells = [cell for cell in results if (cell.split, cell.agent) == (split, agent)]
-        source, sides = cells[0].source, cells[0].sides
-        scored = {cell: results[cell] or {} for cell in cells}
-        modes = dict.fromkeys(mode for own in scored.values() for mode in own)
-        if not modes:
-            task, seeds = next(iter(tasks_of(source)), ""), tuple(cell.seed for cell in cells)
-            table.append(Row(split, task, agent, "", (), seeds, {}, sides))
-        tasks = dict.fromkeys(
-            score.task for own in scored.values() for scores in own.values() for score in scores
-        )
-        for task, mode in itertools.product(tasks, modes):
-            done = {cell: own[mode] for cell, own in scored.items() if mode in own}
-            seeds = tuple(cell.seed for cell in done)
-            missing = tuple(cell.seed for cell in cells if cell not in done)
-            own_scores = [s for scores in done.values() for s in scores if s.task == task]
-            unstable = sum(score.unstable for score in own_scores)
-            groups = _groups(done, task)
-            table.append(Row(split, task, agent, mode, seeds, missing, groups, sides, unstable))
-    return table
-
-
-def write_tables(folder: Path, results: Results) -> list[Path]:
-    """Write Markdown, JSON, CSV and curves; return their paths."""
-    table = rows(results)
-    write_file(folder / TABLE, table_text(table))
-    cells = [
-        as_record(cell)
-        | {"scores": None if scores is None else {m: scores_to_json(s) for m, s in scores.items()}}
-        for cell, scores in results.items()
+def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
+    """Write Markdown, JSON and curves of the cells of a study that are done; return their paths."""
+    done: dict[str, Submission] = {}
+    missing: list[str] = []
+    for cell in cells:
+        results = stored_results(cell)
+        done |= {name_of(each): each for each in results.values()}
+        seed = "" if cell.seed is None else f" seed {cell.seed}"
+        modes = [mode for mode in cell.modes if mode not in results]
+        if modes:
+            which = f" ({', '.join(modes)})" if results else ""
+            missing.append(f"{cell.split} {cell.agent}{seed}{which}")
+    rows = result_rows(done)
+    diverged = {name: sum(map(sum, (r.diverged for r in own.robots))) for name, own in done.items()}
+    notes = [
+        *(f"{MISSING}: {each}" for each in missing),
+        *(f"{name}: {UNSTABLE}: {count}" for name, count in diverged.items() if count),
     ]
-    data = {"rows": [finite_or_none(asdict(row)) for row in table], "cells": cells}
+    lines = [result_tables(rows, "github"), NOTE, *(f"- {each}" for each in notes)]
+    write_file(folder / TABLE, "\n".join(lines) + "\n")
+    data = {"rows": rows_data(rows), MISSING: missing}
     write_file(folder / DATA, json.dumps(data, indent=2) + "\n")
-    write_file(folder / ROBOTS, _csv(results))
-    write_file(folder / CURVES, curves(results))
-    return [folder / name for name in (TABLE, DATA, ROBOTS, CURVES)]
+    write_file(folder / CURVES, curves(cells))
+    return [folder / name for name in (TABLE, DATA, CURVES)]
 
 
-def table_text(table: Sequence[Row]) -> str:
-    """Return Markdown with a table for each split and task."""
-    parts = []
-    for split in dict.fromkeys(row.split for row in table):
-        own = [row for row in table if row.split == split]
-        tasks = dict.fromkeys(row.task for row in own if row.mode) or {own[0].task: None}
-        for task in tasks:
-            lines = [_report_line(row) for row in own if not row.mode or row.task == task]
-            title = split if len(tasks) == 1 else f"{split}: {task}"
-            text = tabulate(lines, HEADERS, tablefmt="github", disable_numparse=True)
-            parts.append(f"## {title}\n\n{text}\n")
-            parts += [
-                f"{row.agent} {row.mode}: {UNSTABLE}: {row.unstable}\n"
-                for row in own
-                if row.unstable and row.task == task
-            ]
-    return "\n".join(parts)
-
-
-def curves(results: Results) -> bytes:
+def curves(cells: Sequence[Cell]) -> bytes:
     """Return a PNG of training scores, a panel per split: mean over seeds, and their range."""
     from matplotlib.figure import Figure
 
-    splits = list(dict.fromkeys(cell.split for cell in results))
+    splits = list(dict.fromkeys(cell.split for cell in cells))
     figure = Figure(figsize=(7.0, 4.8 * len(splits)), layout="constrained")
     panels = figure.subplots(len(splits), 1, squeeze=False)[:, 0]
     for panel, split in zip(panels, splits, strict=True):
         panel.set(title=split, xlabel="transitions", ylabel="score of a step, in training")
         panel.grid(alpha=0.3)
-        for agent in dict.fromkeys(c.agent for c in results if c.split == split and c.config):
-            own = [c for c in results if (c.split, c.agent) == (split, agent)]
+        for agent in dict.fromkeys(c.agent for c in cells if c.split == split and c.config):
+            own = [c for c in cells if (c.split, c.agent) == (split, agent)]
             runs = [curve for curve in map(_curve, own) if curve is not None]
             if not runs:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
@@ -228,71 +136,6 @@ def _curve(cell: Cell) -> Curve | None:
     steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
     scores = [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
     return Curve(steps, scores, all(length == run.config.num_updates for run in runs))
-
-
-def _groups(done: Mapping[Cell, Sequence[Score]], task: str) -> dict[Side, Group]:
-    """Return averages by side over the cells (seeds) of one agent in one mode, for one task."""
-    cell = next(iter(done))
-    per_robot = cell.config is not None and AGENTS[cell.config.policy.agent].per_robot
-    groups: dict[Side, Group] = {}
-    for side in SIDES:
-        table = [
-            [score for score in scores if (score.side, score.task) == (side, task)]
-            for scores in done.values()
-        ]
-        if not table[0]:
-            continue
-        values = np.array([[score.score for score in seed] for seed in table])
-        success = success_of([score for seed in table for score in seed])
-        # Policies of single robots are independent samples on the robots that they learned.
-        iqm = iqm_interval(values, together=not (per_robot and side == cell.source.side))
-        groups[side] = Group(float(values.mean()), iqm, success)
-    return groups
-
-
-def _report_line(row: Row) -> list[str]:
-    cells: list[str] = []
-    for side in SIDES:
-        group = row.groups.get(side)
-        if group is not None:
-            cells += [f"{group.mean:.2f}", _interval(group.iqm), group.success.as_percent()]
-        elif not row.mode and side in row.sides:
-            cells += [MISSING] * 3
-        else:
-            cells += [NONE] * 3
-    return [row.agent, row.mode if row.mode != row.agent else "", _seeds(row), *cells]
-
-
-def _seeds(row: Row) -> str:
-    if row.seeds == (None,) or row.missing == (None,):
-        return NONE
-    count = str(len(row.seeds))
-    if not row.missing:
-        return count
-    gone = ", ".join(map(str, row.missing))
-    return f"{count} of {len(row.seeds) + len(row.missing)} ({MISSING}: {gone})"
-
-
-def _interval(interval: Interval) -> str:
-    if math.isnan(interval.low):
-        return f"{interval.value:.2f}"
-    return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
-
-
-def _csv(results: Results) -> str:
-    """Return CSV text with a line per cell, mode and robot, or one per missing cell."""
-    text = io.StringIO()
-    names = ["split", "agent", "seed", "status", "mode", *SCORE_KEYS]
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    for cell, scores in results.items():
-        if scores is None:
-            writer.writerow(as_record(cell) | {"status": MISSING})
-            continue
-        for mode, mode_scores in scores.items():
-            for record in scores_to_json(mode_scores):
-                writer.writerow(as_record(cell) | {"status": "done", "mode": mode} | record)
-    return text.getvalue()
 
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -337,33 +180,6 @@ class ResultRow:
     sides: Mapping[Side, SideResult]
 
 
-def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
-    """Return the submissions in files and below folders, by the path of their file."""
-    found: dict[str, Submission] = {}
-    for path in paths:
-        before = len(found)
-        for file, data in json_files(path, "**/*.json"):
-            if is_submission(data) or file == path:
-                found[str(file)] = submission = submission_from(data, file)
-                if not submission.robots:
-                    raise BenchmarkError(f"{file}: robots: none; expected one or more")
-                require_each_once(submission, str(file))
-                for robot in submission.robots:
-                    require_full_lists(robot, f"{file}: {robot.side} robot {robot.robot}")
-        if len(found) == before:
-            raise BenchmarkError(
-                f"{path}: no submissions below it; morphgen study writes them beside scores.json"
-            )
-    return found
-
-
-def cells_without_episodes(paths: Sequence[Path], submissions: Mapping[str, Submission]) -> int:
-    """Return the number of cells of studies below folders that have scores and no submission."""
-    with_episodes = {Path(where).parent for where in submissions}
-    cells = {file.parent for path in paths for file in path.rglob(SCORES)}
-    return len(cells - with_episodes)
-
-
 def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
     """Return a row for every split, task, method, mode, training and amount of fine-tuning."""
     by_split: dict[str, dict[str, Submission]] = {}
@@ -371,7 +187,8 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
         by_split.setdefault(each.split.name, {})[where] = each
     rows: list[ResultRow] = []
     for split, own in by_split.items():
-        _require_comparable(split, own)
+        require_comparable(own)
+        _require_shipped_robots(split, own)
         require_same_random(list(own.items()))
         groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
         for where, each in own.items():
@@ -421,19 +238,8 @@ def _key(submission: Submission) -> _Key:
     )
 
 
-def _require_comparable(split: str, submissions: Mapping[str, Submission]) -> None:
-    """Require one set of robots and rules, and robots of a split of morphgen as it is."""
-    (first, other), *rest = submissions.items()
-    for where, each in rest:
-        for name, own, theirs in (
-            ("split.id", each.split.id, other.split.id),
-            ("evaluation", each.evaluation, other.evaluation),
-        ):
-            if own != theirs:
-                raise BenchmarkError(
-                    f"{where}: {name} {json.dumps(own)}; expected {json.dumps(theirs)}, as in "
-                    f"{first}"
-                )
+def _require_shipped_robots(split: str, submissions: Mapping[str, Submission]) -> None:
+    """Require the robots of a split of morphgen as it is, if it has this name."""
     if split not in split_names():
         return
     shipped = read_split(split)
@@ -465,6 +271,8 @@ def _side_results(
         scores = np.array(
             [[relative_scores(table[name]).mean() for name in robots] for table in tables]
         )
+        # Policies of single robots are independent samples on the robots that they learned.
+        together = not any(_learned_alone(run, side) for run in runs)
         successes = [table[name].success for table in tables for name in robots]
         episodes = [len(each) for each in successes]
         yield (
@@ -473,11 +281,19 @@ def _side_results(
                 len(robots),
                 sum(episodes),
                 float(scores.mean()),
-                iqm_interval(scores, together=True),
+                iqm_interval(scores, together=together),
                 success_interval([np.mean(each) for each in successes], episodes),
                 _difference(tables, robots, _outcomes(reference, side, task) if reference else {}),
             ),
         )
+
+
+def _learned_alone(run: Submission, side: Side) -> bool:
+    """Return whether a run has a policy for each robot of a side, as its study says."""
+    if run.config is None or run.config["source"]["side"] != side:
+        return False
+    agent = run.config["policy"]["agent"]
+    return agent in AGENTS and AGENTS[agent].per_robot
 
 
 def _outcomes(run: Submission, side: Side, task: str) -> dict[str, RobotOutcomes]:
@@ -507,6 +323,11 @@ def _difference(
         ]
         strata.append(np.mean(seeds, axis=0) - own)
     return stratified_mean_interval(strata)
+
+
+def rows_data(rows: Sequence[ResultRow]) -> list[Any]:
+    """Return rows as JSON values, with null for ends of intervals that are not known."""
+    return [finite_or_none(asdict(row)) for row in rows]
 
 
 def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import re
 import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from filelock import FileLock, Timeout
 
 from morphgen.benchmark.split import Side, Split, split_id
-from morphgen.benchmark.split_file import parse_split
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError
-from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, write_atomic
+from morphgen.errors import MorphgenError, TaskError
+from morphgen.formats.files import LOCK
 from morphgen.processes import ray_cluster, require_ray
 from morphgen.progress import stage
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.aliases import renamed
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
     EvalConfig,
@@ -33,117 +28,37 @@ from morphgen.rl.evaluation import (
     evaluate_run,
 )
 from morphgen.rl.inference import MODES, Mode
-from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig, require_open, require_same_run
-from morphgen.rl.runs.robot_source import (
-    RobotSource,
-    identity,
-    members,
-    other_side,
-    split_of,
-    tasks_of,
+from morphgen.rl.runs.checkpoint import (
+    CHECKPOINT,
+    RunConfig,
+    config_from,
+    require_open,
+    require_same_config,
 )
+from morphgen.rl.runs.robot_source import RobotSource, members, other_side, split_of, tasks_of
 from morphgen.rl.runs.training import ExecutionConfig, ShowMetrics, Subrun, finetuning_config, train
-from morphgen.rl.scores.scores import Score, score_from_json, scores_to_json
-from morphgen.rl.scores.submission import SubmissionRecorder, Training, write_submission
-from morphgen.tasks.goals.eval_protocol import EvalProtocol
-from morphgen.tasks.registry import SIMULATORS, TASKS, evaluation_simulator
-from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
+from morphgen.rl.scores.episode_table import (
+    EPISODES,
+    append_submission,
+    mode_of,
+    name_of,
+    read_table,
+)
+from morphgen.rl.scores.submission import Submission, SubmissionRecorder, Training
+from morphgen.tasks.goals.eval_protocol import rules_data
+from morphgen.tasks.registry import evaluation_simulator
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
-_FINE_TUNED = re.compile(r"fine-tuned (\d[\d,]*)")
-
-
-@dataclass(frozen=True, eq=False)
-class StoredCell:
-    """The content of a cell's ``scores.json``."""
-
-    simulator: str
-    """Name of the simulator of the evaluation."""
-    episodes: int
-    """Minimum number of episodes per robot."""
-    seed: int
-    """Seed of the episodes."""
-    goals: GoalConfig
-    """Seed of the goals, and constants of the tasks."""
-    version: str | None
-    """Version of morphgen that ran the episodes; None before 0.2.0, which did not write it."""
-    scores: Mapping[str, tuple[Score, ...]]
-    """Scores by mode, or by the baseline's name."""
-
-
-def stored_split(file: Path, data: object) -> str:
-    """Return the id of the split that a cell's scores are of; empty if they are of no split."""
-    try:
-        text = _source(data).split
-        return text and split_id(parse_split(text, file).split)
-    except (ValueError, KeyError, TypeError, AttributeError, MorphgenError) as error:
-        raise _malformed(file, error) from error
-
-
-def stored_cell(file: Path, data: object) -> StoredCell:
-    """Return the scores of a cell and the configuration of their evaluation."""
-    try:
-        table: dict[str, Any] = renamed("scores", data)
-        rules = table["eval"]
-        constants = {name: values for name, values in rules.items() if name in TASKS}
-        goals = GoalConfig(_source(data).goal_seed, task_configs(constants))
-        scores = {
-            mode: tuple(score_from_json(record) for record in records)
-            for mode, records in table["scores"].items()
-        }
-        version = str(table["morphgen"]) if "morphgen" in table else None
-        return StoredCell(rules["sim"], rules["episodes"], rules["seed"], goals, version, scores)
-    except (ValueError, KeyError, TypeError, AttributeError, MorphgenError) as error:
-        raise _malformed(file, error) from error
-
-
-def _source(data: object) -> RobotSource:
-    return RobotSource(**renamed("source", renamed("scores", data)["source"]))
-
-
-def _malformed(file: Path, error: Exception) -> BenchmarkError:
-    is_message = isinstance(error, ValueError | MorphgenError)
-    return BenchmarkError(
-        f"{file}: neither a submission nor the scores of a study's cell: "
-        f"{error if is_message else repr(error)}"
-    )
-
-
-def tuned_name(steps: int) -> str:
-    """Return the name of the mode of a policy after a number of transitions of fine-tuning."""
-    return f"fine-tuned {steps:,}"
-
-
-def acting(name: str) -> tuple[str, int]:
-    """Return how a policy acts, and the transitions of its fine-tuning."""
-    match = _FINE_TUNED.fullmatch(name)
-    return (MODES[0], int(match[1].replace(",", ""))) if match else (name, 0)
-
-
-def require_all_robots(scores: Sequence[Score], split: Split, file: Path) -> None:
-    """Require a score of every robot of a side with a task: means of fewer do not compare."""
-    for side, task in {(score.side, score.task): None for score in scores}:
-        found = sorted(s.robot for s in scores if (s.side, s.task) == (side, task))
-        expected = sorted(each.name for each in split.side(side) if each.task == task)
-        if found != expected:
-            raise BenchmarkError(
-                f"{file}: scores of {side} robots at {task}: {', '.join(found)}; expected one of "
-                f"each: {', '.join(expected) or 'none'}"
-            )
-
-
-SCORES = "scores.json"
 FINETUNED = "finetuned"
 """Folder of fine-tuned policies in the folder of a run."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """An agent with a seed on a split, or a baseline on a split; done when it has scores."""
+    """An agent with a seed on a split, or a baseline on a split; done when it has episodes."""
 
-    folder: Path
-    """Folder of the run and its scores."""
-    split: str
-    """Name of the split."""
+    study: Path
+    """Folder of the study, with the table of episodes."""
     agent: str
     """Label of the agent, or name of the baseline."""
     seed: int | None
@@ -159,8 +74,19 @@ class Cell:
     from the end of the run."""
 
     @property
+    def split(self) -> str:
+        """Name of the split."""
+        return self.source.name
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run, or of the lock of a baseline."""
+        folder = self.study / self.split / self.agent
+        return folder if self.seed is None else folder / f"seed{self.seed}"
+
+    @property
     def modes(self) -> dict[str, tuple[Mode | None, int]]:
-        """Names under which the cell has scores: how the policy acts, and its fine-tuning.
+        """Names of what the cell has episodes of: how the policy acts, and its fine-tuning.
 
         The mode is None for a baseline, and the number is that of the transitions of fine-tuning.
         """
@@ -168,7 +94,7 @@ class Cell:
             return {self.agent: (None, 0)}
         modes: dict[str, tuple[Mode | None, int]] = {mode: (mode, 0) for mode in MODES}
         for steps in self.finetune:
-            modes[tuned_name(steps)] = (MODES[0], steps)
+            modes[f"fine-tuned {steps:,}"] = (MODES[0], steps)
         return modes
 
     @property
@@ -182,7 +108,7 @@ def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
     eval_config = replace(eval_config, workers=1)  # scores do not depend on it
     return [
-        Cell(folder / source.name / name, source.name, name, None, source, eval_config)
+        Cell(folder, name, None, source, eval_config)
         for name in BASELINES
         if BASELINES[name].suits(tasks)
     ]
@@ -197,11 +123,9 @@ def agent_cell(
 ) -> Cell:
     """Return the cell of a run."""
     source, eval_config = config.source, replace(eval_config, workers=1)
-    run_folder = folder / source.name / agent / f"seed{config.seed}"
     if AGENTS[config.policy.agent].per_robot or source.side == "test":
         finetune = ()
-    tuned = tuple(finetune)
-    return Cell(run_folder, source.name, agent, config.seed, source, eval_config, config, tuned)
+    return Cell(folder, agent, config.seed, source, eval_config, config, tuple(finetune))
 
 
 def matched_budget(config: RunConfig) -> RunConfig:
@@ -219,50 +143,52 @@ def matched_budget(config: RunConfig) -> RunConfig:
     return replace(config, ppo=ppo, num_envs=-(-config.num_envs * num_test // num_train))
 
 
-def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
-    """Return the scores of a cell by mode, or by the baseline's name; None if it is not done."""
-    path = cell.folder / SCORES
-    if not path.is_file():
-        return None
-    try:
-        data = renamed("scores", read_json(path))
-        scores = {
-            mode: [score_from_json(record) for record in records]
-            for mode, records in data["scores"].items()
-        }
-        source = RobotSource(**renamed("source", data["source"]))
-        stored = _plain([_with_defaults(data["eval"]), identity(source)])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, TaskError) as error:
-        raise FormatError(
-            f"{path}: not the scores of a cell: {error}; delete it to evaluate the cell again"
-        ) from error
-    expected = _plain([cell.eval_config.as_data(), identity(cell.source)])
-    for what, theirs, ours in zip(("evaluation", "set of robots"), stored, expected, strict=True):
+def stored_results(cell: Cell) -> dict[str, Submission]:
+    """Return the episodes of a cell in the table of its study, by the names of ``Cell.modes``."""
+    path = cell.study / EPISODES
+    results: dict[str, Submission] = {}
+    for each in read_table(path) if path.is_file() else ():
+        if (each.split.name, each.method, each.training_seed) == (
+            cell.split,
+            cell.agent,
+            cell.seed,
+        ):
+            _require_same(each, cell, f"{path}: {name_of(each)}")
+            results[mode_of(each) or cell.agent] = each
+    return results
+
+
+def _require_same(stored: Submission, cell: Cell, where: str) -> None:
+    """Require that stored episodes are of the robots, the evaluation and the run of a cell."""
+    split = split_of(cell.source)
+    for what, theirs, ours in (
+        ("set of robots", stored.split.id, split_id(split)),
+        ("evaluation", stored.evaluation, _rules(cell, split)),
+    ):
         if theirs != ours:
-            raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
-    return scores
+            raise TaskError(f"{where}: of another {what}; name another --out")
+    if cell.config is not None and stored.config is not None:
+        require_same_config(config_from(stored.config), _without_split(cell.config), where)
 
 
-def _with_defaults(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored evaluation with the defaults of constants that tasks did not have then."""
-    constants = {name: values for name, values in stored.items() if name in TASKS}
-    return {**stored, **GoalConfig(tasks=task_configs(constants)).as_data()}
+def _rules(cell: Cell, split: Split) -> dict[str, Any]:
+    """Return the rules of a cell's evaluation."""
+    config = cell.eval_config
+    goals = GoalConfig(seed=cell.source.goal_seed, tasks=config.tasks)
+    return rules_data(config.sim, config.episodes, config.seed, goals, split)
 
 
-def _plain(values: Sequence[object]) -> list[Any]:
-    """Return values as JSON reads them: lists instead of tuples."""
-    plain: list[Any] = json.loads(json.dumps(values))
-    return plain
+def _without_split(config: RunConfig) -> RunConfig:
+    """Return a config without the text of its split, of which a submission has name and id."""
+    return replace(config, source=replace(config.source, split=""))
 
 
 def require_cells(cells: Sequence[Cell]) -> None:
-    """Require that the folders of cells have no other runs or scores; write nothing."""
+    """Require that the folders of cells have no other runs or episodes; write nothing."""
     for cell in cells:
         if cell.config is not None:
             require_open(cell.folder, cell.config, resume=True)
-        # The scores do not say how their policy was trained; the config beside them does.
-        if read_scores(cell) is not None and cell.config is not None:
-            require_same_run(cell.folder, cell.config)
+        stored_results(cell)
 
 
 def do_cell(
@@ -272,11 +198,11 @@ def do_cell(
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
-    The scores and the episodes of a mode are written when it is evaluated. Policies are evaluated
+    The episodes of a mode are written when it is evaluated. Policies are evaluated
     on the CPU, so that a machine without the GPU of the training gives the same scores.
     """
-    scores = read_scores(cell) or {}
-    if scores.keys() >= cell.modes.keys():
+    done = stored_results(cell)
+    if done.keys() >= cell.modes.keys():
         return
 
     def learn(folder: Path, config: RunConfig) -> None:
@@ -294,7 +220,7 @@ def do_cell(
     eval_config = replace(cell.eval_config, workers=execution.workers)
     split = split_of(cell.source)
     for name, (mode, steps) in cell.modes.items():
-        if name in scores:
+        if name in done:
             continue
         folder, config, sides = cell.folder, cell.config, cell.sides
         if config is not None and steps:
@@ -302,20 +228,17 @@ def do_cell(
             config = finetuning_run(cell, config, steps)
             learn(folder, config)
         recorder = SubmissionRecorder(split)
-        records: list[Score] = []
         for side in sides:
             title = f"{cell.agent}{f' {name}' if mode else ''} on {side}"
             if config is not None and mode is not None:
                 with stage(title):
-                    records += evaluate_run(folder, side, eval_config, mode, record=recorder)
+                    evaluate_run(folder, side, eval_config, mode, record=recorder)
             # A baseline is not evaluated on a side without a robot for it.
             elif BASELINES[cell.agent].suits(tasks_of(other_side(cell.source, side))):
                 source = other_side(cell.source, side)
                 with stage(title):
-                    records += evaluate_baseline(cell.agent, source, eval_config, record=recorder)
-        scores[name] = records
-        _write_episodes(cell, name, split, recorder)
-        _write_scores(cell, scores)
+                    evaluate_baseline(cell.agent, source, eval_config, record=recorder)
+        append_submission(cell.study / EPISODES, _submission(cell, name, split, recorder))
 
 
 def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
@@ -329,40 +252,16 @@ def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
     return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
 
 
-def _write_episodes(cell: Cell, name: str, split: Split, recorder: SubmissionRecorder) -> None:
-    """Write the episodes of one of the modes of a cell as a submission.
-
-    A submission must be in a simulator that comes with morphgen; episodes in others are not kept.
-    """
-    config, evaluation = cell.config, cell.eval_config
-    if evaluation.sim not in SIMULATORS.builtin:
-        return
-    goals = GoalConfig(seed=cell.source.goal_seed, tasks=evaluation.tasks)
-    rules = EvalProtocol(evaluation.sim, evaluation.episodes, evaluation.seed, goals)
-    mode, steps = cell.modes[name]
-    training = None
+def _submission(cell: Cell, name: str, split: Split, recorder: SubmissionRecorder) -> Submission:
+    """Return the episodes of one of the modes of a cell."""
+    config, (mode, steps) = cell.config, cell.modes[name]
+    training = data = None
     if config is not None:
         training = Training(config.sim, config.ppo.total_timesteps, steps)
-    submission = recorder.submission(
-        cell.agent, mode or "", cell.seed, rules.as_data(split), training
+        data = msgspec.to_builtins(_without_split(config).as_data())
+    return recorder.submission(
+        cell.agent, mode or "", cell.seed, _rules(cell, split), training, data
     )
-    file = f"fine-tuned-{steps}" if steps else name
-    write_submission(cell.folder / f"{file}.json", submission)
-
-
-def _write_scores(cell: Cell, scores: Mapping[str, Sequence[Score]]) -> None:
-    data = {
-        "morphgen": version("morphgen"),
-        "eval": cell.eval_config.as_data(),
-        "source": asdict(cell.source),
-        "scores": {mode: scores_to_json(records) for mode, records in scores.items()},
-    }
-    write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
-
-
-def as_record(cell: Cell) -> dict[str, Any]:
-    """Return the columns of tables that identify a cell."""
-    return {"split": cell.split, "agent": cell.agent, "seed": cell.seed}
 
 
 POLL = 2.0
@@ -420,7 +319,7 @@ def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
         with ray_cluster(address):
             remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
             running = {
-                remote.remote(replace(cell, folder=cell.folder.resolve()), execution): cell
+                remote.remote(replace(cell, study=cell.study.resolve()), execution): cell
                 for cell in cells
             }
             while running:

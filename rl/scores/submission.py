@@ -94,6 +94,8 @@ class Submission(Record, frozen=True):
     robots: tuple[RobotOutcomes, ...]
     training: Training | None = None
     """How the policy was trained, if it is known."""
+    config: dict[str, Any] | None = None
+    """Config of the run in a study, without the text of its split."""
 
     @property
     def finetuned(self) -> int:
@@ -149,6 +151,7 @@ class SubmissionRecorder:
         training_seed: int | None,
         evaluation: dict[str, Any],
         training: Training | None = None,
+        config: dict[str, Any] | None = None,
     ) -> Submission:
         """Return the submission of the recorded episodes; for the arguments see ``Submission``."""
         data = {
@@ -161,6 +164,7 @@ class SubmissionRecorder:
             "split": {"name": self._split.name, "id": split_id(self._split)},
             "evaluation": evaluation,
             "training": msgspec.to_builtins(training),
+            "config": config,
             "robots": msgspec.to_builtins(self.robots),
         }
         return read_record(data, Submission, "submission", BenchmarkError)
@@ -170,8 +174,9 @@ def submission_text(submission: Submission) -> str:
     """Return the text of a submission: a line per list of a robot."""
     data = msgspec.to_builtins(submission)
     robots = data.pop("robots")
-    if submission.training is None:
-        del data["training"]
+    for name in ("training", "config"):
+        if data[name] is None:
+            del data[name]
     head = json.dumps(data, indent=2).removesuffix("\n}")
     blocks = [
         ",\n".join(f"      {json.dumps(key)}: {json.dumps(value)}" for key, value in robot.items())
@@ -221,9 +226,9 @@ def read_submission(path: Path) -> Submission:
     return submission_from(data, path)
 
 
-def submission_from(data: object, path: Path) -> Submission:
+def submission_from(data: object, where: Path | str) -> Submission:
     """Return the submission of a JSON file's content, and check its form."""
-    return read_record(data, Submission, str(path), BenchmarkError)
+    return read_record(data, Submission, str(where), BenchmarkError)
 
 
 LISTS = ("success", "score", "distance", "steps", "diverged")
@@ -277,6 +282,32 @@ def require_each_once(submission: Submission, where: str) -> None:
             at = f"{where}: {outcomes.side} robot {outcomes.robot}"
             raise BenchmarkError(f"{at}: is there twice; expected once")
         seen.add((outcomes.side, outcomes.robot))
+
+
+def require_comparable(submissions: Mapping[str, Submission]) -> None:
+    """Require that submissions have the robots and the evaluation of the first one."""
+    (first, other), *rest = submissions.items()
+    for where, each in rest:
+        if each.split.id != other.split.id:
+            raise BenchmarkError(
+                f"{where}: split.id {each.split.id}; expected {other.split.id}, as in {first}"
+            )
+        found, expected = (dict(_values("evaluation", x.evaluation)) for x in (each, other))
+        for key in expected | found:
+            if found.get(key) != expected.get(key):
+                raise BenchmarkError(
+                    f"{where}: {key} {found.get(key)!r}; expected {expected.get(key)!r}, as in "
+                    f"{first}; scores of different evaluations do not compare"
+                )
+
+
+def _values(name: str, value: object) -> Iterator[tuple[str, object]]:
+    """Yield the values in nested dictionaries by their dotted names."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _values(f"{name}.{key}", item)
+    else:
+        yield name, value
 
 
 def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:

@@ -58,15 +58,7 @@ class EvalProtocol:
 
     def as_data(self, split: Split) -> dict[str, Any]:
         """Return the rules as JSON data, with the constants of the split's tasks."""
-        tasks = tasks_of_split(split)
-        constants = self.goals.as_data(tasks)
-        return {
-            "simulator": self.simulator,
-            "episodes": self.episodes,
-            "seed": self.seed,
-            "goal_seed": self.goals.seed,
-            "constants": {task: _plain(constants[task]) for task in tasks},
-        }
+        return rules_data(self.simulator, self.episodes, self.seed, self.goals, split)
 
 
 @dataclass(frozen=True)
@@ -79,6 +71,21 @@ class ExpectedRobot:
     """Key of the goal set."""
     reach: float
     """Reach [m]."""
+
+
+def rules_data(
+    simulator: str, episodes: int, seed: int, goals: GoalConfig, split: Split
+) -> dict[str, Any]:
+    """Return rules as JSON data, also of an evaluation in a simulator of another package."""
+    tasks = tasks_of_split(split)
+    constants = goals.as_data(tasks)
+    return {
+        "simulator": simulator,
+        "episodes": episodes,
+        "seed": seed,
+        "goal_seed": goals.seed,
+        "constants": {task: _plain(constants[task]) for task in tasks},
+    }
 
 
 def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:

@@ -7,15 +7,19 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
+from msgspec.structs import replace as replaced
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import sided_members
+from morphgen.benchmark.split import sided_members, split_id
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.grammar.library import default_library
+from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
+from morphgen.rl.scores.submission import SplitName
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 STUDY = Path(__file__).parents[2] / "results" / "reach-30m"
@@ -60,34 +64,30 @@ def test_table_json_and_csv_have_a_row_per_robot(run, small):
 
 
 def test_several_splits_have_the_baselines_of_all_their_tasks(run, small):
-    folder = Path("study") / "mine" / "some"
-    content = json.loads((STUDY / ARM3 / "zero" / "scores.json").read_text())
     split = combined()
-    scores, result = content["scores"]["zero"], {"score": -0.04, "success": 0.5}
+    stored = {each.method: each for each in read_table(STUDY / EPISODES) if each.split.name == ARM3}
+    (first, *_), table = stored["zero"].robots, Path("study") / EPISODES
+    table.parent.mkdir()
+    push = {"task": "push", "score": (-0.09, 0.01) * 17}  # of 34 episodes
+    robot = replaced(first, success=(True, False) * 17, **push)
+    robots = [replaced(robot, robot=x.name, side=side) for side, x in sided_members(split)]
     for name in ("scripted", "zero"):
-        content["source"] |= {"name": split.name, "split": split_text(split)}
-        content["scores"] = {
-            name: [
-                scores[0] | {"robot": each.name, "side": side, "task": "push"} | result
-                for side, each in sided_members(split)
-            ]
-        }
-        (folder / name).mkdir(parents=True)
-        (folder / name / "scores.json").write_text(json.dumps(content))
-    shutil.copytree(STUDY / ARM3, Path("study") / ARM3)
+        name_and_id = {"name": split.name, "id": split_id(split)}
+        other = replaced(stored["zero"], method=name, robots=tuple(robots))
+        append_submission(table, replaced(other, split=SplitName(**name_and_id)))
+    names = ["random", "zero", "jacobian", "ik", "scripted"]
+    for name in names[:-1]:
+        append_submission(table, stored[name])
     Path("push.yaml").write_text(split_text(split))
     code, out, err = run(*WORDS, "push.yaml", ARM3, "--study", "study", "--csv", "a.csv")
     assert (code, err) == (0, "")
     header, *lines = csv.reader(Path("a.csv").read_text().splitlines())
-    names = ["random", "zero", "jacobian", "ik", "scripted"]
     assert header[-10::2] == [f"{name}_score" for name in names]
     rows = [dict(zip(header, line, strict=True)) for line in lines]
     push, reach = rows[0], rows[-1]
     assert [push[f"{name}_success"] for name in names] == ["", "0.500000", "", "", "0.500000"]
-    files = {name: STUDY / ARM3 / name / "scores.json" for name in names[:-1]}
-    stored = {name: json.loads(file.read_text())["scores"][name] for name, file in files.items()}
     assert [reach[f"{name}_success"] for name in names] == [
-        *(f"{stored[name][-1]['success']:.6f}" for name in names[:-1]),
+        *(f"{np.mean(stored[name].robots[-1].success):.6f}" for name in names[:-1]),
         "",
     ]
     first, second = out.split(f"\n\n{ARM3}\n")
@@ -107,13 +107,13 @@ def test_bad_input_is_refused(refused, small):
     refusal = refused(*WORDS, small, "--csv", small)  # which would replace the split
     assert "--csv small.yaml: expected a name that ends in .csv" in refusal
     assert "0: expected a whole number" in refused(*WORDS, small, "--jobs", "0")
-    assert "none: no such folder" in refused(*WORDS, small, "--study", "none")
+    assert "none: no episodes.csv.gz" in refused(*WORDS, small, "--study", "none")
     err = refused(*WORDS, small, "--study", STUDY)
-    assert "no scores of baselines on split 'mine/small'" in err
+    assert "no episodes of baselines on split 'mine/small'" in err
     assert "interpolation/arm3/reach" in err
     Path("other.yaml").write_text(Path(small).read_text().replace("mine/small", ARM3))
     err = refused(*WORDS, "other.yaml", "--study", STUDY)
-    assert "interpolation/arm3/reach/random/scores.json: of other robots: split id " in err
+    assert "interpolation/arm3/reach ik: of other robots: split id " in err
 
 
 def test_nothing_is_written_if_a_robot_is_broken(refused):

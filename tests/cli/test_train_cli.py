@@ -13,6 +13,7 @@ from helpers.runs import ROLLOUT, RUN, SMALL, equal, weights
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.recorders import METRICS, read_metrics
 from morphgen.rl.runs.robot_source import specs_of
+from morphgen.rl.scores.episode_table import read_table
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -283,13 +284,15 @@ def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, mon
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
     assert run(*words)[0] == 0
     folder = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0"
-    scores = (folder / "scores.json").read_bytes()
-    (folder / "scores.json").unlink()
+    table = tmp_path / "study" / "episodes.csv.gz"
+    scores = read_table(table)
+    table.unlink()
     config = (folder / "config.json").read_text()
     assert '"device": "cpu"' in config
     (folder / "config.json").write_text(config.replace('"device": "cpu"', '"device": "cuda"'))
     assert run(*words, "--device", "cuda")[0] == 0
-    assert (folder / "scores.json").read_bytes() == scores
+    again = read_table(table)
+    assert [run.robots for run in again] == [run.robots for run in scores]
     (folder / CHECKPOINT).unlink()
     code, _, err = run(*words, "--device", "cuda")
     assert code == 2
@@ -302,21 +305,16 @@ def test_study_prints_a_table(run, split_yaml, tmp_path):
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
     code, out, _ = run(*words, "--report")
     assert code == 0
-    assert out.count("missing") == 6 * 6 + 2
-    assert not list((tmp_path / "study").glob("mine/**/scores.json"))
+    assert out.count("- missing: mine/small ") == 8
+    assert not list((tmp_path / "study").glob("**/episodes.csv.gz"))
     code, out, err = run(*words)
     assert code == 0
     assert "missing" not in out
     assert "8 of 8: " in err
+    policies = ("me-mlp", "me-mlp (stochastic)")
     assert [line.split("|")[1].strip() for line in out.splitlines()[4:12]] == [
-        "random",
-        "zero",
-        "jacobian",
-        "ik",
-        "me-mlp",
-        "me-mlp",
-        "me-mlp-discrete",
-        "me-mlp-discrete",
+        *("random", "zero", "jacobian", "ik", *policies),
+        *("me-mlp-discrete", "me-mlp-discrete (stochastic)"),
     ]
     before = tree(tmp_path / "study" / "mine")
     code, again, _ = run(*words)
@@ -327,7 +325,7 @@ def test_study_prints_a_table(run, split_yaml, tmp_path):
     assert "another run: ppo.gamma 0.99, not 0.5" in err
     code, _, err = run(*words, "--eval-steps", "600", "--report")
     assert code == 2
-    assert "scores.json: of another evaluation" in err
+    assert "of another evaluation" in err
 
 
 def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_path):

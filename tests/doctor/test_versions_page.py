@@ -23,7 +23,7 @@ FORMATS = {
     runs.CONFIG: READABLE,
     runs.CHECKPOINT: READABLE,
     drawn_robots.FILE: drawn_robots.FORMAT,
-    "scores.json": "",
+    "episodes.csv.gz": "",
     "release.json": release_file.FORMAT,
     "eval --submission": submission.FORMAT,
     ".npz": f"{episode.FORMAT}; 1 is read",

@@ -1,6 +1,5 @@
 """Tables of results from episodes."""
 
-import json
 import math
 from pathlib import Path
 
@@ -11,12 +10,7 @@ from helpers.submissions import SPLIT, data
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split
 from morphgen.errors import BenchmarkError
-from morphgen.rl.scores.score_tables import (
-    cells_without_episodes,
-    read_submissions,
-    result_rows,
-    result_tables,
-)
+from morphgen.rl.scores.score_tables import result_rows, result_tables
 from morphgen.rl.scores.submission import submission_from
 
 BASELINE = {"mode": "", "training_seed": None}
@@ -114,42 +108,6 @@ def test_runs_of_other_trainings_have_rows_of_their_own():
     ]
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({"score": []}, "score: no episodes; expected one or more"),
-        ({"random_score": [], "random_success": []}, "random_score: no episodes; expected one"),
-        ({"success": []}, "success: 0 episodes; expected 4, as in score"),
-        ({"random_success": []}, "random_score: 4 episodes, random_success: 0; expected as many"),
-    ],
-)
-def test_lists_of_other_lengths_are_refused(tmp_path, changes, why):
-    (tmp_path / "a.json").write_text(json.dumps(changed(data(), **changes)))
-    with pytest.raises(BenchmarkError, match=rf"a\.json: train robot \S+: {why}"):
-        read_submissions([tmp_path])
-
-
-def test_a_submission_without_robots_is_refused(tmp_path):
-    (tmp_path / "a.json").write_text(json.dumps(data() | {"robots": []}))
-    with pytest.raises(BenchmarkError, match=r"a\.json: robots: none; expected one or more"):
-        read_submissions([tmp_path])
-
-
-def test_a_robot_that_is_there_twice_is_refused(tmp_path):
-    robots = data()["robots"]
-    (tmp_path / "a.json").write_text(json.dumps(data() | {"robots": [*robots, robots[0]]}))
-    with pytest.raises(BenchmarkError, match=r"a\.json: train robot \S+: is there twice; expected"):
-        read_submissions([tmp_path])
-
-
-def test_cells_without_episodes_are_counted(tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "scores.json").write_text("{}")
-    (tmp_path / "a" / "deterministic.json").write_text(json.dumps(data()))
-    assert cells_without_episodes([tmp_path], read_submissions([tmp_path])) == 1
-
-
 def test_small_scores_have_two_decimals():
     for near, shown in ((0.25, "2.69"), (150.0, "115.0")):
         (line,) = result_tables(result_rows(read(a=data(near=near)))).splitlines()[4:5]
@@ -165,11 +123,14 @@ SHIPPED = read_split("interpolation/arm3/reach")
         ({"a": data(), "b": data()}, "b: the same run, seed and mode as a"),
         (
             {"a": data(), "b": data("other") | {"split": {"name": SPLIT.name, "id": "x"}}},
-            'b: split.id "x"; expected',
+            "b: split.id x; expected",
         ),
         (
-            {"a": data(), "b": data("other") | {"evaluation": {"episodes": 3}}},
-            r'b: evaluation {"episodes": 3}; expected .*, as in a$',
+            {
+                "a": data(),
+                "b": data("other") | {"evaluation": data()["evaluation"] | {"episodes": 3}},
+            },
+            "b: evaluation.episodes 3; expected 4, as in a; scores of different",
         ),
         (
             {"a": data() | {"split": {"name": SHIPPED.name, "id": split_id(SHIPPED)}}},
@@ -188,18 +149,3 @@ SHIPPED = read_split("interpolation/arm3/reach")
 def test_submissions_that_do_not_compare_are_refused(files, why):
     with pytest.raises(BenchmarkError, match=why):
         result_rows(read(**files))
-
-
-def test_submissions_are_found_below_folders(tmp_path):
-    deep = tmp_path / "study" / "cell"
-    deep.mkdir(parents=True)
-    (deep / "deterministic.json").write_text(json.dumps(data()))
-    (deep / "scores.json").write_text("{}")
-    assert list(read_submissions([tmp_path])) == [str(deep / "deterministic.json")]
-    (deep / "deterministic.json").unlink()
-    with pytest.raises(BenchmarkError, match=r"no submissions below it"):
-        read_submissions([tmp_path])
-    with pytest.raises(BenchmarkError, match=r"none: no such file"):
-        read_submissions([tmp_path / "none"])
-    with pytest.raises(BenchmarkError, match=r"scores\.json: "):
-        read_submissions([deep / "scores.json"])

@@ -4,6 +4,7 @@ import copy
 import json
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
 from morphgen.rl.scores import reference_scores
+from morphgen.rl.scores.episode_table import EPISODES, append_submission
 from morphgen.rl.scores.leaderboard import (
     Row,
     SideScore,
@@ -206,7 +208,7 @@ def test_the_mean_of_strata_counts_each_alike():
 
 
 def row(method, *sides):
-    return Row(method, "study", "", (), 34, tuple(SideScore(*side) for side in sides))
+    return Row(method, "submission", "", (), 34, tuple(SideScore(*side) for side in sides))
 
 
 def test_rows_are_ranked_by_the_test_robots():
@@ -226,7 +228,7 @@ def test_rows_are_ranked_by_the_test_robots():
     assert [each.method for each in ranked([partial, *mixed])] == ["b", "a", "ik"]
     header, _, first, *_ = ranking_table(rows).splitlines()
     assert header.split()[:4] == ["rank", "method", "from", "seeds"]
-    assert first.split()[:6] == ["1", "high", "study", "-", "20.0", "10%"]
+    assert first.split()[:6] == ["1", "high", "submission", "-", "20.0", "10%"]
 
 
 def test_fine_tuned_policies_are_told_from_others(tmp_path, monkeypatch):
@@ -235,53 +237,47 @@ def test_fine_tuned_policies_are_told_from_others(tmp_path, monkeypatch):
     tuned = data() | {"training": training | {"finetuned": 30_000}}
     for name, values in (("zero-shot", data() | {"training": training}), ("tuned", tuned)):
         (tmp_path / f"{name}.json").write_text(json.dumps(values))
-    write_cell(tmp_path / "study" / "mine" / "small" / "ours" / "seed0", tuned=True)
-    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json", "study")]
+    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json")]
     references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
     assert set(reference_files(references)) == {
         *("scores.json", "submissions/ours-seed0.json"),
         "submissions/ours-fine-tuned-30000-seed0.json",
     }
-    rows = references.all_rows()
-    assert {(each.source, each.label) for each in rows} == {
-        ("reference", "ours"),
-        ("reference", "ours (fine-tuned 30,000)"),
-        ("study", "ours (fine-tuned 10,000)"),
-    }
-    assert "ours (fine-tuned 30,000)" in ranking_table(rows)
+    assert [each.label for each in references.rows()] == ["ours (fine-tuned 30,000)", "ours"]
+    assert "ours (fine-tuned 30,000)" in ranking_table(references.rows())
 
 
-def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
+def test_references_are_submissions_and_episodes_of_studies(tmp_path, monkeypatch):
     monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
     baseline = data("random") | {"mode": "", "training_seed": None}
     for method, values in (("random", baseline), ("ours", data()), ("other", data("random"))):
         (tmp_path / f"{method}.json").write_text(json.dumps(values))
-    cell = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed3"
-    write_cell(cell)
+    policy = data("me-mlp") | {"training_seed": 3, "config": {"of": "its study"}}
+    (tmp_path / "study").mkdir()
+    append_submission(tmp_path / "study" / EPISODES, submission(policy))
     names = ("random.json", "ours.json", "other.json", "study")
     paths = [tmp_path / name for name in names]
     files = reference_files(collect_references(paths, SPLIT, PROTOCOL, LIBRARY))
     assert set(files) == {
         *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
-        "submissions/random-seed0.json",  # a policy of this name
+        *("submissions/me-mlp-seed3.json", "submissions/random-seed0.json"),  # of this name
     }
     again = collect_references(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
     assert files == reference_files(again)
     for name, content in files.items():
         (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "release" / name).write_bytes(content)
-    references = read_references(tmp_path / "release")
-    assert references.random.training_seed is None
-    rows = references.all_rows()
+    rows = read_references(tmp_path / "release").rows()
     assert {(each.method, each.source, each.seeds) for each in rows} == {
         ("ours", "reference", (0,)),
         ("random", "reference", ()),
         ("random", "reference", (0,)),
-        ("me-mlp", "study", (3,)),
+        ("me-mlp", "reference", (3,)),
     }
-    study = next(each for each in rows if each.source == "study")
-    assert study.group("test", "reach").low == 1
-    assert read_references(tmp_path).rows == ()
+    assert json.loads(files["scores.json"])["rows"] == json.loads(
+        json.dumps(msgspec.to_builtins(rows))
+    )
+    assert read_references(tmp_path).rows() == []
     baseline["robots"] = baseline["robots"][TEST:]
     (tmp_path / "random.json").write_text(json.dumps(baseline))
     with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
@@ -290,67 +286,18 @@ def test_references_are_submissions_and_cells_of_studies(tmp_path, monkeypatch):
         score_submission(submission(), random_scores(submission(baseline)))
 
 
-def write_cell(folder, *, tuned=False, **changes):
-    """Write the scores of a study's cell, of one that was fine-tuned too."""
-    from dataclasses import asdict
-
-    from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.scores.scores import Score
-
-    scores = [
-        vars(Score(each.member.name, each.side, "reach", 4, 1200, 2.0, 1.0, 3.0, 1, -1, 1, 0, 0, 0))
-        for each in EXPECTED
-    ]
-    content = {
-        "eval": EvalConfig(episodes=4, sim="mujoco").as_data(),
-        "source": asdict(small_source()),
-        "scores": {"deterministic": scores, **({"fine-tuned 10,000": scores} if tuned else {})},
-    }
-    folder.mkdir(parents=True)
-    (folder / "scores.json").write_text(json.dumps(content | changes))
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"robots": 0}, "0 robots"),
-        ({"success": 1.5}, "success 1.5"),
-        ({"high": None}, "an interval with one end"),
-    ],
-)
-def test_malformed_scores_of_a_release_are_refused(tmp_path, change, why):
-    side = {"side": "test", "task": "reach", "robots": 1, "score": 1, "success": 1}
-    side |= {"low": 0, "high": 2} | change
-    values = {"method": "a", "source": "study", "mode": "", "seeds": [], "episodes": 4}
-    content = {"format": 1, "rows": [values | {"sides": [side]}]}
-    (tmp_path / "scores.json").write_text(json.dumps(content))
-    with pytest.raises(BenchmarkError, match=why) as caught:
-        read_references(tmp_path)
-    assert "\n" not in str(caught.value)
-    content["rows"] = [values | {"method": "a\nb", "sides": []}]
-    (tmp_path / "scores.json").write_text(json.dumps(content))
-    with pytest.raises(BenchmarkError, match="expected printable characters"):
-        read_references(tmp_path)
-
-
-def test_references_of_other_splits_and_rules_are_refused(tmp_path):
-    write_cell(tmp_path / "a" / "seed0", eval={"sim": "pybullet", "episodes": 4, "seed": 0})
-    with pytest.raises(BenchmarkError, match=r"evaluation\.simulator: 'pybullet'"):
-        collect_references([tmp_path / "a"], SPLIT, PROTOCOL, LIBRARY)
-    write_cell(tmp_path / "e" / "seed0")
-    path = tmp_path / "e" / "seed0" / "scores.json"
-    content = json.loads(path.read_text())
-    del content["scores"]["deterministic"][0]
-    path.write_text(json.dumps(content))
-    with pytest.raises(BenchmarkError, match=r"scores of train robots at reach: .*; expected one"):
-        collect_references([tmp_path / "e"], SPLIT, PROTOCOL, LIBRARY)
-    write_cell(tmp_path / "b" / "seed0")
+def test_references_of_other_splits_and_rules_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
+    append_submission(tmp_path / EPISODES, submission())
     other = small_split(task="push")
-    with pytest.raises(BenchmarkError, match=r"b: no scores of split mine/small, id "):
-        collect_references([tmp_path / "b"], other, PROTOCOL, LIBRARY)
-    (tmp_path / "c.json").write_text('{"ik": []}')
-    with pytest.raises(BenchmarkError, match="neither a submission nor the scores of a study"):
-        collect_references([tmp_path / "c.json"], SPLIT, PROTOCOL, LIBRARY)
+    with pytest.raises(BenchmarkError, match=r"no scores of split mine/small, id "):
+        collect_references([tmp_path], other, PROTOCOL, LIBRARY)
+    (tmp_path / "a.json").write_text(json.dumps(data(near=100.0)))
+    with pytest.raises(BenchmarkError, match=r"another submission of ours is there"):
+        collect_references([tmp_path], SPLIT, PROTOCOL, LIBRARY)
+    strict = EvalProtocol(episodes=5)
+    with pytest.raises(BenchmarkError, match=r"evaluation\.episodes: 4; expected 5 or more"):
+        collect_references([tmp_path], SPLIT, strict, LIBRARY)
     with pytest.raises(BenchmarkError, match="no such file or folder"):
         collect_references([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
 
