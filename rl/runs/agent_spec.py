@@ -10,7 +10,6 @@ from typing import Any
 from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
-from morphgen.rl.aliases import current_name
 from morphgen.rl.config import NUMBERS, PolicyConfig, PPOConfig
 from morphgen.tasks.registry import CHANNELS, TASKS
 
@@ -24,6 +23,8 @@ SWITCHES = (
 )
 """Names of switches on the command line, in the order in which a spec prints them: first those of
 ``PPOConfig``, then those of ``PolicyConfig``, then observation channels."""
+_FIELDS = {"fixed-deviation": "fixed_std", "mask-morphology": "proprioceptive_only"}
+"""Fields of ``PolicyConfig`` of switches that have the paper's names; others have the field's."""
 ABLATION = (
     "se-symlog-slow-critic-discrete",
     "se-symlog-slow-critic-discrete@test",
@@ -98,7 +99,7 @@ def configs_of(
     values = dict(changes)
     for name, on in spec.switches.items():
         if name not in OBSERVATION_SWITCHES:
-            values[current_name(name.replace("-", "_"))] = on
+            values[_FIELDS.get(name) or name.replace("-", "_")] = on
     values["observe"] = tuple(
         channel
         for channel, name in zip(CHANNELS, OBSERVATION_SWITCHES, strict=True)
@@ -119,17 +120,13 @@ def configs_of(
 
 
 def parse_constants(texts: Sequence[str]) -> dict[str, Any]:
-    """Read ``name=value`` for numbers of ``PPOConfig`` and of the networks of any agent.
-
-    Earlier names are read, too; see ``morphgen.rl.aliases``.
-    """
+    """Read ``name=value`` for numbers of ``PPOConfig`` and of the networks of any agent."""
     valid = {**{name: default for name, default, _ in network_fields()}, **NUMBERS}
     values: dict[str, Any] = {}
     for text in texts:
-        given, _, value = text.partition("=")
-        name = current_name(given)
+        name, _, value = text.partition("=")
         if name not in valid:
-            raise TaskError(f"unknown constant {given!r}{nearest(given, valid)}")
+            raise TaskError(f"unknown constant {name!r}{nearest(name, valid)}")
         try:
             values[name] = type(valid[name])(value)
         except ValueError as error:

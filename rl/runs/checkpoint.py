@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import logging
 import math
 import pickle
 import pickletools
@@ -25,7 +24,6 @@ from morphgen.errors import FormatError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.aliases import current_learner, current_run
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
@@ -126,10 +124,8 @@ def _require_optimiser(
                 raise TaskError(f"{where}: {name} of parameter {number} is not of shape {shape}")
 
 
-_log = logging.getLogger(__name__)
-
 HASH = "sha256"
-"""Key of the hash of all other content; checkpoints of older versions have none."""
+"""Key of the hash of all other content."""
 MAX_BYTES = 512 * 2**20
 """Largest size of a checkpoint's file, and of its tensors together [bytes]."""
 MAX_INDEX_BYTES = 32 * 2**20
@@ -159,8 +155,8 @@ def packed(content: Mapping[str, Any], where: str) -> bytes:
     return file.getvalue()
 
 
-def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
-    """Return the content of a checkpoint's file without its hash, and whether it has one."""
+def unpacked(file: Path) -> dict[str, Any]:
+    """Return the content of a checkpoint's file without its hash."""
     try:
         _require_container(file)
         # Mapped, a storage that claims more than its record has cannot reach beyond the file.
@@ -182,25 +178,16 @@ def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
         AssertionError,
     ) as error:
         raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
-    if not isinstance(data, dict):
+    if not isinstance(data, dict) or HASH not in data:
         raise TaskError(f"{file} is not a checkpoint of morphgen train")
-    digest = data.pop(HASH, None)
+    digest = data.pop(HASH)
     _require_plain(data, str(file))
-    if digest is not None and digest != _digest(data):
+    if digest != _digest(data):
         raise TaskError(
             f"{file} is damaged: its content does not have the hash that was stored with it; use "
             "another copy"
         )
-    return {key: in_main_memory(value) for key, value in data.items()}, digest is not None
-
-
-@lru_cache(maxsize=1024)
-def warn_of_no_hash(file: Path) -> None:
-    """Warn once per file."""
-    _log.warning(
-        "morphgen: %s has no hash, as those of older versions: damage to it would not be noticed",
-        file,
-    )
+    return {key: in_main_memory(value) for key, value in data.items()}
 
 
 def _require_container(file: Path) -> None:
@@ -330,9 +317,7 @@ def in_main_memory(value: object) -> object:
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
 FORMAT = 3
-"""Version of the files' format. Format 2 has other names of keys; see ``aliases``."""
-READABLE = (2, FORMAT)
-"""Versions that can be read. Format 1 had other defaults of the networks' logit scale."""
+"""Version of the files' format."""
 
 
 @dataclass(frozen=True)
@@ -485,10 +470,10 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def config_from(data: object) -> RunConfig:
-    """Return the run config of a JSON file or a checkpoint; earlier names of keys are read, too."""
+    """Return the run config of a JSON file or a checkpoint."""
     if not isinstance(data, Mapping):
         raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
-    entries = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
+    entries = {k: v for k, v in data.items() if k not in ("format", "morphgen")}
     tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
@@ -533,7 +518,7 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
         raise TaskError(f"{file}: no such checkpoint")
-    data, is_hashed = unpacked(file)
+    data = unpacked(file)
     if data.keys() != {"format", "run", "learner"}:
         raise TaskError(f"{file} is not a checkpoint of morphgen train")
     _require_format(file, data)
@@ -541,19 +526,16 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
         config = config_from(data["run"])
     except TaskError as error:
         raise TaskError(f"{file}: {error}") from error
-    learner = current_learner(data["learner"])
-    require_learner(learner, str(file))
-    if not is_hashed:
-        warn_of_no_hash(file)
-    return config, learner
+    require_learner(data["learner"], str(file))
+    return config, data["learner"]
 
 
 def _require_format(path: Path, data: Mapping[str, Any]) -> None:
     found = data["format"]
-    if type(found) is not int or found not in READABLE:
+    if type(found) is not int or found != FORMAT:
         raise TaskError(
-            f"{path} has format {shown(found)}; expected {' or '.join(map(str, READABLE))}: it "
-            "was written by another version of morphgen"
+            f"{path} has format {shown(found)}; expected {FORMAT}: it was written by another "
+            "version of morphgen"
         )
 
 

@@ -37,7 +37,7 @@ class RobotSource:
     side: Side = "train"
     """Side of the split."""
     robot_hash: str = ""
-    """Hash of the one robot; empty in runs from before it was kept. A split has one for each."""
+    """Hash of the one robot; empty with a split, which has one for each."""
     member: str | None = None
     """Name of the only member that is meant; None for all of the side."""
     goal_seed: int = 0

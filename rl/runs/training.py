@@ -96,7 +96,7 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         "processes": learner.processes.size,
     }
     stored = asdict(PPOConfig(**state["config"]))
-    processes = len(_states(state["generators"]["actions"]))
+    processes = len(state["generators"]["actions"])
     run = {"updates": state["updates"], "device": state["device"], "processes": processes}
     _require_same({**stored, **run}, ours)
     _resume_batch(learner, state["batch"])
@@ -104,14 +104,9 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         network.load_state_dict(state[name])
     learner.optimiser.load_state_dict(state["optimiser"])
     for name, generator in learner.generators.items():
-        generator.set_state(_states(state["generators"][name])[learner.processes.rank].cpu())
+        generator.set_state(state["generators"][name][learner.processes.rank].cpu())
     learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
     learner.restart_episodes()
-
-
-def _states(generators: torch.Tensor) -> torch.Tensor:
-    """Return the state of a generator in each process, a row each; older files have one."""
-    return generators if generators.ndim > 1 else generators[None]
 
 
 def _resume_batch(learner: Learner, state: Mapping[str, Any]) -> None:

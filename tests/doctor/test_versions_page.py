@@ -13,15 +13,14 @@ from morphgen.tasks.goals import split_goals
 from morphgen.viewer import episode
 
 PAGE = (Path(__file__).parents[2] / "docs" / "versions.md").read_text(encoding="utf-8")
-READABLE = f"{runs.FORMAT}; {runs.READABLE[0]} is read"
 FORMATS = {
     "NAME.yaml": split.FORMAT,
     "build.json": split_folder.FORMAT,
     "goals/index.json": split_goals.FORMAT,
     "card.json": bundle.CARD_FORMAT,
     "set.json": SetConfig(Path(), "", "", 0, (), False, False, ()).settings()["format"],
-    runs.CONFIG: READABLE,
-    runs.CHECKPOINT: READABLE,
+    runs.CONFIG: runs.FORMAT,
+    runs.CHECKPOINT: runs.FORMAT,
     drawn_robots.FILE: drawn_robots.FORMAT,
     "episodes.csv.gz": "",
     "release.json": release_file.FORMAT,
