@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
-from typing import Any, get_type_hints
+from functools import cache
+from typing import Any, cast, get_type_hints
 
 import msgspec
+from msgspec import NODEFAULT
 
-from morphgen.errors import TaskError, nearest, shortened
+from morphgen.errors import TaskError
+from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
@@ -84,35 +87,29 @@ class PolicyConfig:
 def read_fields(
     data: object, kind: type, where: str, given: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return stored values of a dataclass's fields, converted to the types that these declare."""
-    if not isinstance(data, Mapping):
-        raise TaskError(f"{where}: invalid value {shown(data)}; expected keys and values")
-    hints, values = get_type_hints(kind), {}
-    known = {each.name: each for each in fields(kind) if each.name not in given}
-    for name, value in data.items():
-        if name not in known:
-            raise TaskError(f"{where}: unknown key {shown(name)}{nearest(str(name), known)}")
-        try:
-            values[name] = msgspec.convert(value, hints[name], strict=True)
-        except msgspec.ValidationError as error:
-            expected = str(error).partition(", got")[0].replace("`", "").replace("E", "e", 1)
-            raise TaskError(f"{where}: {name}: invalid value {shown(value)}; {expected}") from error
-    for name, each in known.items():
-        if name not in data and each.default is MISSING and each.default_factory is MISSING:
-            raise TaskError(f"{where}: missing key {name!r}")
-    return values
+    """Return stored values of a dataclass's fields, except those that are given otherwise."""
+    record = read_record(data, _record_of(kind, frozenset(given)), where, TaskError)
+    return {name: getattr(record, name) for name in cast(Mapping[str, Any], data)}
 
 
-def shown(value: object) -> str:
-    """Return a value for a message, shortened."""
-    return shortened(repr(value))
+@cache
+def _record_of(kind: type, given: frozenset[str]) -> type[msgspec.Struct]:
+    """Return a record with the fields of a dataclass: unlike this it has no unknown keys."""
+    hints, declared = get_type_hints(kind), []
+    for each in fields(kind):
+        default = NODEFAULT if each.default is MISSING else each.default
+        if each.default_factory is not MISSING:
+            default = msgspec.field(default_factory=each.default_factory)
+        if each.name not in given:
+            declared.append((each.name, hints[each.name], default))
+    return msgspec.defstruct(kind.__name__, declared, bases=(Record,), frozen=True, kw_only=True)
 
 
 def policy_from(stored: object, where: str = "policy") -> PolicyConfig:
     """Return the policy config that ``dataclasses.asdict`` made a dictionary of."""
     data = dict(stored) if isinstance(stored, Mapping) else stored
     sizes = data.pop("network", None) if isinstance(data, dict) else None
-    values = read_fields(data, PolicyConfig, where)
+    values = read_fields(data, PolicyConfig, where, ("network",))
     try:
         policy = PolicyConfig(**values)
     except TaskError as error:
@@ -120,7 +117,7 @@ def policy_from(stored: object, where: str = "policy") -> PolicyConfig:
     if sizes is None:
         return policy
     config = AGENTS[policy.agent].config
-    return replace(policy, network=config(**read_fields(sizes, config, where)))
+    return replace(policy, network=config(**read_fields(sizes, config, f"{where}: network")))
 
 
 @dataclass(frozen=True)

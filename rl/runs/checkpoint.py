@@ -12,7 +12,6 @@ import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,12 @@ from typing import Any
 import torch
 
 from morphgen.benchmark.tokens import MAX_LINKS
-from morphgen.errors import FormatError, TaskError, nearest
+from morphgen.errors import FormatError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic
+from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
+from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
 from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
@@ -38,41 +38,42 @@ from morphgen.tasks.task import TaskConfig
 
 MAX_ROWS = 100_000
 """Largest number of links, obstacles or points of an observation, and of numbers of a token."""
-_KINDS: Mapping[str, type | tuple[type, ...]] = {
-    **dict.fromkeys(("actor", "critic", "optimiser", "generators", "batch"), dict),
-    **dict.fromkeys(("layout", "policy", "config"), dict),
-    **dict.fromkeys(("update", "updates"), int),
-    "actor_lr_scale": (int, float),
-    "device": str,
-}
-"""Entries of every learner, and their types."""
+
+
+class _Learner(Record, frozen=True):
+    """The state of a learner, as ``training.state_of`` returns it."""
+
+    actor: dict[str, Any]
+    critic: dict[str, Any]
+    target_critic: dict[str, Any]
+    optimiser: dict[str, Any]
+    generators: dict[str, Any]
+    batch: dict[str, Any]
+    layout: dict[str, Any]
+    policy: dict[str, Any]
+    config: dict[str, Any]
+    update: int
+    updates: int
+    actor_lr_scale: float
+    device: str
 
 
 def require_learner(learner: object, where: str) -> None:
     """Require that the state of a learner is complete, and its weights have the right shapes."""
-    if not isinstance(learner, dict):
-        raise TaskError(f"{where}: {shown(learner)}: expected a learner")
-    for name, kind in _KINDS.items():
-        if name not in learner:
-            raise TaskError(f"{where}: its learner has no {name}")
-        if not isinstance(learner[name], kind) or isinstance(learner[name], bool):
-            raise TaskError(f"{where}: {name} of its learner is {shown(learner[name])}")
-    layout = _layout(learner["layout"], f"{where}: layout")
+    state = read_record(learner, _Learner, f"{where}: learner", TaskError)
+    layout = _layout(state.layout, f"{where}: layout")
     try:
-        PPOConfig(**read_fields(learner["config"], PPOConfig, "config"))
-        policy = policy_from(learner["policy"])
+        PPOConfig(**read_fields(state.config, PPOConfig, "config"))
+        policy = policy_from(state.policy)
         with torch.device("meta"):  # shapes alone: nothing is allocated
             actor, critic = make_networks(policy, layout, 0)
     except TaskError as error:
         raise TaskError(f"{where}: {error}") from error
-    wanted = {"actor": actor.state_dict(), "critic": critic.state_dict()}
-    for name in ("actor", "critic", "target_critic"):
-        if name in learner:
-            _require_network(
-                learner[name], wanted["actor" if name == "actor" else "critic"], f"{where}: {name}"
-            )
+    _require_network(state.actor, actor.state_dict(), f"{where}: actor")
+    for name, weights in (("critic", state.critic), ("target_critic", state.target_critic)):
+        _require_network(weights, critic.state_dict(), f"{where}: {name}")
     parameters = [*actor.parameters(), *critic.parameters()]
-    _require_optimiser(learner["optimiser"], parameters, f"{where}: optimiser")
+    _require_optimiser(state.optimiser, parameters, f"{where}: optimiser")
 
 
 def _layout(stored: Mapping[str, Any], where: str) -> Layout:
@@ -86,17 +87,17 @@ def _layout(stored: Mapping[str, Any], where: str) -> Layout:
     return layout
 
 
-def _require_network(stored: object, wanted: Mapping[str, torch.Tensor], where: str) -> None:
-    if not isinstance(stored, dict):
-        raise TaskError(f"{where} is {shown(stored)}; expected weights")
+def _require_network(
+    stored: Mapping[str, Any], wanted: Mapping[str, torch.Tensor], where: str
+) -> None:
     for name in wanted:
         if name not in stored:
             raise TaskError(f"{where} has no {name}")
     for name, tensor in stored.items():
         if name not in wanted:
-            raise TaskError(f"{where} has {shown(name)}, which its sizes do not ask for")
+            raise TaskError(f"{where} has {shortened(repr(name))}, which its sizes do not ask for")
         if not isinstance(tensor, torch.Tensor):
-            raise TaskError(f"{where}: {name} is {shown(tensor)}; expected a tensor")
+            raise TaskError(f"{where}: {name} is {shortened(repr(tensor))}; expected a tensor")
         actual = (tuple(tensor.shape), tensor.dtype)
         expected = (tuple(wanted[name].shape), wanted[name].dtype)
         if actual != expected:
@@ -114,9 +115,9 @@ def _require_optimiser(
         raise TaskError(f"{where} has no state or no param_groups")
     for number, moments in state.items():
         if not isinstance(number, int) or not 0 <= number < len(parameters):
-            raise TaskError(f"{where}: state of an unknown parameter {shown(number)}")
+            raise TaskError(f"{where}: state of an unknown parameter {shortened(repr(number))}")
         if not isinstance(moments, dict):
-            raise TaskError(f"{where}: state {number} is {shown(moments)}")
+            raise TaskError(f"{where}: state {number} is {shortened(repr(moments))}")
         for name in ("exp_avg", "exp_avg_sq"):
             moment = moments.get(name)
             shape = tuple(parameters[number].shape)
@@ -471,21 +472,19 @@ def read_config(folder: Path) -> RunConfig:
 
 def config_from(data: object) -> RunConfig:
     """Return the run config of a JSON file or a checkpoint."""
-    if not isinstance(data, Mapping):
-        raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
+    data = read_record(data, dict[str, Any], "run", TaskError)
     entries = {k: v for k, v in data.items() if k not in ("format", "morphgen")}
     tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
     for name, values in tasks.items():
-        if not isinstance(values, Mapping):
-            raise TaskError(f"run: {name}: invalid value {shown(values)}; expected keys and values")
+        values = read_record(values, dict[str, Any], f"run: {name}", TaskError)
         read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
     for name, values in entries.items():
         if isinstance(values, Mapping) and name not in RunConfig.__dataclass_fields__:
             raise TaskError(
-                f"run: unknown task {shown(name)}; run the script that registers it, or install "
-                "its package"
+                f"run: unknown task {shortened(repr(name))}; run the script that registers it, or "
+                "install its package"
             )
     nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
     values = read_fields(entries, RunConfig, "run", given=nested)
@@ -534,8 +533,8 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
     found = data["format"]
     if type(found) is not int or found != FORMAT:
         raise TaskError(
-            f"{path} has format {shown(found)}; expected {FORMAT}: it was written by another "
-            "version of morphgen"
+            f"{path} has format {shortened(repr(found))}; expected {FORMAT}: it was written by "
+            "another version of morphgen"
         )
 
 

@@ -154,8 +154,6 @@ def _table(values: ArrayLike, axes: int) -> NDArray[np.float64]:
     return table
 
 
-_TEXTS = ("robot", "side", "task")
-"""Fields of a score that are no numbers."""
 _SUCCESS_ENDS = ("success_low", "success_high")
 """Ends of the 95% Wilson interval of ``success``, which follow from the fields of a score."""
 
@@ -229,26 +227,6 @@ def finite_or_none(value: Any) -> Any:  # noqa: ANN401
 def score_decimals(scores: Iterable[float]) -> int:
     """Return the number of decimals of a task's scores in tables, for at least three digits."""
     return 1 if any(abs(score) >= 10 for score in scores) else 2
-
-
-def score_from_json(data: Mapping[str, Any]) -> Score:
-    """Return the score that ``scores_to_json`` made a dictionary of."""
-    values: dict[str, Any] = {
-        key: math.nan if value is None else value
-        for key, value in data.items()
-        if key not in _SUCCESS_ENDS
-    }
-    score = Score(**values)
-    where = f"{score.side} robot {score.robot}"
-    for field in fields(Score):
-        value = getattr(score, field.name)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if is_number is (field.name in _TEXTS):
-            expected = "text" if field.name in _TEXTS else "a number"
-            raise ValueError(f"{where}: {field.name} {value!r}; expected {expected}")
-        if field.name in ("score", "success") and not math.isfinite(value):
-            raise ValueError(f"{where}: {field.name} {value!r}; expected a finite number")
-    return score
 
 
 SIDES = {"train": "MT", "test": "ZS"}
