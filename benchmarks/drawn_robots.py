@@ -26,10 +26,9 @@ from tabulate import tabulate
 
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
-from morphgen.rl.runs import drawn_robots
+from morphgen.rl.runs import robot_source as drawn_robots
 from morphgen.rl.runs.checkpoint import RunConfig
-from morphgen.rl.runs.drawn_robots import draw, drawn_source
-from morphgen.rl.runs.robot_source import RobotSource
+from morphgen.rl.runs.robot_source import RobotSource, draw, drawn_source
 from morphgen.rl.runs.training import SLICE_STEPS, TrainingBatches, use_batch
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig

@@ -51,7 +51,7 @@ from morphgen.benchmark.survey import Fault, SplitSurvey, survey_split
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
-from morphgen.rl.runs.drawn_robots import read_drawn
+from morphgen.rl.runs.robot_source import read_drawn
 from morphgen.typing import Array
 from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 

@@ -28,12 +28,18 @@ from tqdm import tqdm
 from morphgen.errors import TaskError, one_line
 from morphgen.grammar.library import default_library
 from morphgen.processes import parallel_map
-from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate
+from morphgen.rl.evaluation import (
+    EvalConfig,
+    ZeroShotResult,
+    eval_config_of,
+    evaluate,
+    result_of,
+    zero_shot,
+)
 from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source
 from morphgen.rl.scores.scores import finite_or_none
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
-from morphgen.rl.zeroshot import ZeroShotResult, result_of, zero_shot
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import observation_config

@@ -1,4 +1,4 @@
-"""Score a policy or a baseline robot by robot, relative to the random policy."""
+"""Score a policy or a baseline robot by robot; a shipped policy beside controllers, zero-shot."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress
-from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines import BASELINES, ZERO, baselines_for
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files
-from morphgen.rl.scores.scores import Score, episode_interval
+from morphgen.rl.scores.scores import Interval, Score, episode_interval, success_interval
+from morphgen.rl.shipped_policies import name_of
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -326,3 +327,53 @@ def eval_config_of(
     """Return the config to evaluate a run in its tasks, and its simulator if that has contacts."""
     sim = evaluation_simulator(config.sim)
     return EvalConfig(episodes, sim, seed, workers, config.evaluation_tasks)
+
+
+@dataclass(frozen=True)
+class ZeroShotResult:
+    """Result of a controller on a robot."""
+
+    controller: str
+    """Name of the controller."""
+    episodes: int
+    """Number of episodes."""
+    success: Interval
+    """Success rate with its 95% Wilson interval."""
+    distance: float
+    """Mean distance from success at the end of an episode [m]."""
+    angle: float
+    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
+    score: float
+    """Mean score of the episodes; that of reach is relative to the random policy."""
+
+
+def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> list[ZeroShotResult]:
+    """Run a policy on a robot, and the controllers that do not learn.
+
+    All of them have the same starts and goals.
+    """
+    task, name = str(source.task), name_of(policy)
+    require_trained_tasks(read_checkpoint(policy)[0], [source], name)
+    (score,) = evaluate_checkpoints([policy], source, config, "deterministic")
+    scores = [(name, score)]
+    for baseline in compared_with(task):
+        (score,) = evaluate_baseline(baseline, source, config)
+        scores.append((baseline, score))
+    return [result_of(controller, score) for controller, score in scores]
+
+
+def compared_with(task: str) -> tuple[str, ...]:
+    """Return the baselines of a task that a policy is compared with: all but zero actions."""
+    return tuple(name for name in baselines_for(task) if name != ZERO.name)
+
+
+def result_of(controller: str, score: Score) -> ZeroShotResult:
+    """Return the result of a controller from its score on a robot."""
+    return ZeroShotResult(
+        controller,
+        score.episodes,
+        success_interval(score.success, score.episodes),
+        score.distance,
+        score.angle,
+        score.score,
+    )

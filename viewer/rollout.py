@@ -23,8 +23,7 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.play import ControllerSpec, make_env_and_controller, read_controller
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.drawn_robots import FILE, read_drawn
-from morphgen.rl.runs.robot_source import members
+from morphgen.rl.runs.robot_source import FILE, members, read_drawn
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS, installed_simulators

@@ -298,7 +298,7 @@ def _given_robots(
     config: EvalConfig,
 ) -> list[RobotSource]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
-    from morphgen.rl.runs.drawn_robots import fresh_source
+    from morphgen.rl.runs.robot_source import fresh_source
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
     if args.words:
@@ -330,7 +330,7 @@ def _simulator(args: argparse.Namespace) -> str | None:
 
 def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
-    from morphgen.rl.runs.drawn_robots import FILE, trained_on
+    from morphgen.rl.runs.robot_source import FILE, trained_on
 
     if not (folder / FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"

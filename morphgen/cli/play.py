@@ -21,10 +21,9 @@ from morphgen.rl.shipped_policies import POLICIES
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
-    from morphgen.rl.evaluation import EvalConfig
+    from morphgen.rl.evaluation import EvalConfig, ZeroShotResult
     from morphgen.rl.rollouts import Episode
     from morphgen.rl.runs.robot_source import RobotSource
-    from morphgen.rl.zeroshot import ZeroShotResult
 
 
 OBSTACLES = flag("--obstacles", "place the robot among obstacles")
@@ -222,12 +221,11 @@ FILM_EPISODES = 3
 )
 def zeroshot(args: argparse.Namespace) -> None:
     """Run the episodes, print the table, and write the video."""
-    from morphgen.rl.evaluation import eval_config_of
+    from morphgen.rl.evaluation import eval_config_of, zero_shot
     from morphgen.rl.runs.checkpoint import read_checkpoint
     from morphgen.rl.runs.robot_source import robot_source
     from morphgen.rl.scores.scores import finite_or_none
     from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
-    from morphgen.rl.zeroshot import zero_shot
     from morphgen.tasks.reach import GOAL_KINDS
     from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
     from morphgen.tasks.render.renderer import require_video_path

@@ -17,7 +17,7 @@ from morphgen.tasks.registry import TASKS
 if TYPE_CHECKING:
     from morphgen.benchmark.difficulty import BaselineResults
     from morphgen.benchmark.split import Split
-    from morphgen.rl.scores.reference_scores import References
+    from morphgen.rl.scores.leaderboard import References
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
 
@@ -83,7 +83,7 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.rl.scores.reference_scores import collect_references, reference_files
+        from morphgen.rl.scores.leaderboard import collect_references, reference_files
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
@@ -256,7 +256,7 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import SPLIT_FILE
     from morphgen.benchmark.verify import require_unchanged
-    from morphgen.rl.scores.reference_scores import References, read_references
+    from morphgen.rl.scores.leaderboard import References, read_references
     from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
 
     path = Path(name)

@@ -15,8 +15,7 @@ from morphgen.cli.command import Option, command, flag, number, option, path_opt
 from morphgen.cli.options import reject_idle
 from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
-from morphgen.rl.agents import AGENTS
-from morphgen.rl.runs.presets import PRESETS, preset_of
+from morphgen.rl.agents import AGENTS, PRESETS, preset_of
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
 from morphgen.tasks.registry import CHANNELS, DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
@@ -187,7 +186,7 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
 
 def robots_to_draw(args: argparse.Namespace) -> RobotSource:
     """Return the source that ``--robots`` describes; none of its robots is drawn yet."""
-    from morphgen.rl.runs.drawn_robots import drawn_source
+    from morphgen.rl.runs.robot_source import drawn_source
 
     choices = " or ".join(f"task={name}" for name in TASKS)
     words, task = " ".join(args.words), args.words[0].removeprefix("task=")
@@ -219,7 +218,7 @@ def draw_robots(
     """
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.tokens import default_max_links
-    from morphgen.rl.runs.drawn_robots import draw
+    from morphgen.rl.runs.robot_source import draw
 
     with training_progress():
         robots = draw(source, config, jobs=args.workers)

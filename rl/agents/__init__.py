@@ -1,18 +1,19 @@
-"""Registry of agents: an agent is one module with its networks, and one row of ``AGENTS``.
+"""Registry of agents, and presets of their training.
 
-The registry imports nothing heavy, so that the command line lists agents at once. A module of an
-agent has two names: ``Config``, a ``NetworkConfig`` with the sizes of its networks, and
-``Network``, an ``encoder.Network`` that is built for the actor and for the critic.
+An agent is one module with its networks, and one row of ``AGENTS``. The registry imports nothing
+heavy, so that the command line lists agents at once. A module of an agent has two names:
+``Config``, a ``NetworkConfig`` with the sizes of its networks, and ``Network``, an
+``encoder.Network`` that is built for the actor and for the critic.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any
 
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest
 from morphgen.tasks.registry import Registry
 
 MAX_WIDTH = 8192
@@ -31,16 +32,16 @@ class NetworkConfig:
         Raises:
             TaskError: If a size is out of its range.
         """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(field.default, int):
-                most = MAX_LAYERS if field.name.endswith("layers") else MAX_WIDTH
+        for size in fields(self):
+            value = getattr(self, size.name)
+            if isinstance(size.default, int):
+                most = MAX_LAYERS if size.name.endswith("layers") else MAX_WIDTH
                 if value < 1:
-                    raise TaskError(f"{field.name} {value}: expected 1 or more")
+                    raise TaskError(f"{size.name} {value}: expected 1 or more")
                 if value > most:
-                    raise TaskError(f"{field.name} {value}: expected at most {most}")
+                    raise TaskError(f"{size.name} {value}: expected at most {most}")
             elif not value > 0:
-                raise TaskError(f"{field.name} {value:g}: expected more than 0")
+                raise TaskError(f"{size.name} {value:g}: expected more than 0")
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Agent:
     proprioceptive_only: bool = False
     """Hide the robot's morphology from the networks; joint positions stay visible."""
     preset: str = "paper"
-    """Name of the preset that training begins with, in ``morphgen.rl.runs.presets.PRESETS``."""
+    """Name of the preset that training begins with, in ``PRESETS``."""
     any_size: bool = False
     """Whether no weight belongs to the number of a link, so that a policy acts on larger robots."""
     channels: tuple[str, ...] = ()
@@ -99,8 +100,60 @@ def network_fields() -> Iterator[tuple[str, float, tuple[str, ...]]]:
     defaults: dict[str, float] = {}
     owners: dict[str, list[str]] = {}
     for name in AGENTS:
-        for field in fields(AGENTS[name].config):
-            defaults.setdefault(field.name, field.default)  # type: ignore[arg-type]
-            owners.setdefault(field.name, []).append(name)
+        for size in fields(AGENTS[name].config):
+            defaults.setdefault(size.name, size.default)  # type: ignore[arg-type]
+            owners.setdefault(size.name, []).append(name)
     for field_name, agents in owners.items():
         yield field_name, defaults[field_name], tuple(agents)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Defaults of a training."""
+
+    summary: str
+    """Purpose, for the help."""
+    total_timesteps: int
+    """Control steps of all environments together."""
+    num_envs: int
+    """Number of environments."""
+    switches: Mapping[str, bool] = field(default_factory=dict)
+    """Switches of ``morphgen.rl.runs.agent_spec.SWITCHES``."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Numbers of ``PPOConfig`` and of the networks; those of other agents have no effect."""
+
+
+FAST = Preset(
+    "a policy within minutes on a CPU; constants tuned on reach with a UR5 and with ten arm3",
+    total_timesteps=500_000,
+    num_envs=64,
+    switches={
+        **dict.fromkeys(("lag", "joint", "jacobian", "dls", "normalize"), True),
+        **dict.fromkeys(("symlog", "slow-critic", "discrete"), False),
+    },
+    constants={
+        "num_steps": 32,
+        "epochs": 2,
+        "minibatches": 4,
+        "gamma": 0.99,
+        "learning_rate": 1e-3,
+        "graph_layers": 1,
+        "graph_hidden": 32,
+    },
+)
+PAPER = Preset(
+    "constants and switches of AnyBody; its budget is --steps 1.28e9 --envs 1280",
+    total_timesteps=2_000_000,
+    num_envs=128,
+)
+PRESETS: Mapping[str, Preset] = {"fast": FAST, "paper": PAPER}
+"""Presets by name."""
+
+
+def preset_of(name: str | None, agent: str) -> Preset:
+    """Return a preset by its name, or the one that an agent has by default."""
+    if name is None:
+        name = AGENTS[agent].preset
+    if name not in PRESETS:
+        raise TaskError(f"unknown preset {name!r}{nearest(name, PRESETS)}")
+    return PRESETS[name]

@@ -40,7 +40,7 @@ class Baseline:
 
 RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
 ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
-JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.jacobian:JacobianColumns", ("reach",))
+JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.simple:JacobianColumns", ("reach",))
 IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
 SCRIPTED = Baseline("scripted", "morphgen.rl.baselines.scripted_push:ScriptedPush", ("push",))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,33 +15,13 @@ from morphgen.rl.baselines.path_planner import (
     Tree,
     fractions_towards,
 )
+from morphgen.rl.baselines.simple import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
-
-
-@dataclass(frozen=True, eq=False)
-class ReachGoals:
-    """Goals of the n environments of a batch, in the root frames."""
-
-    positions: torch.Tensor
-    """Goal positions of the tools, shape (n, 3) [m]."""
-    rotations: torch.Tensor | None
-    """Goal rotations of the tools, shape (n, 3, 3); None for goals of positions."""
-    metres_per_radian: float
-    """See ``ReachConfig.metres_per_radian``."""
-
-
-def reach_goals(task: TaskBatch) -> ReachGoals:
-    """Return the goals of a batch whose environments reach."""
-    config = next(spec.config for spec in task.specs if isinstance(spec.config, ReachConfig))
-    rotations = task.groups.tool_targets(task.simulation.block_pose).rotations
-    return ReachGoals(task.field("goal")[:, :3], rotations, config.metres_per_radian)
-
 
 STARTS = 16
 """Number of start configurations of inverse kinematics per goal."""

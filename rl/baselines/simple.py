@@ -1,11 +1,20 @@
-"""Baselines that ignore the observation: zero and random actions."""
+"""Baselines without memory: ``zero``, ``random``, and ``jacobian`` of reach.
+
+``jacobian`` moves each joint along its own column of the tool's Jacobian. Joints do not know of
+each other; a policy that transfers to unseen robots must beat it.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
+from morphgen.model.kinematics_torch import frame_jacobian, pose_task
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import joint_to_link
+from morphgen.tasks.reach.config import ReachConfig
 
 
 class Zero:
@@ -33,3 +42,68 @@ class Random:
         else:
             actions = 2 * torch.rand(task.action_mask.shape, generator=self._generator) - 1
         return actions.to(task.action_mask.device)
+
+
+@dataclass(frozen=True, eq=False)
+class ReachGoals:
+    """Goals of the n environments of a batch, in the root frames."""
+
+    positions: torch.Tensor
+    """Goal positions of the tools, shape (n, 3) [m]."""
+    rotations: torch.Tensor | None
+    """Goal rotations of the tools, shape (n, 3, 3); None for goals of positions."""
+    metres_per_radian: float
+    """See ``ReachConfig.metres_per_radian``."""
+
+
+def reach_goals(task: TaskBatch) -> ReachGoals:
+    """Return the goals of a batch whose environments reach."""
+    config = next(spec.config for spec in task.specs if isinstance(spec.config, ReachConfig))
+    rotations = task.groups.tool_targets(task.simulation.block_pose).rotations
+    return ReachGoals(task.field("goal")[:, :3], rotations, config.metres_per_radian)
+
+
+GAIN = 0.3
+"""Fraction of the error that a joint would remove in one control step if it acted alone. All joints
+act at once and lag behind their targets, so that 1 overshoots; tuned on arm3 and Panda."""
+MIN_COLUMN = 1e-4
+"""Jacobian columns shorter than this do not move the tool [m per rad or m per m]."""
+
+
+class JacobianColumns:
+    """Moves each joint j by a_j = GAIN (J_j . e) / (|J_j|^2 s_j), clipped to [-1, 1].
+
+    J_j is the joint's column of the Jacobian, e the error from tool to goal, and s_j the joint's
+    largest step. Jacobian and error are those of the measured joint positions. They have 3 rows, or
+    6 for goals that are poses, where ``ReachConfig.metres_per_radian`` converts rotations.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        """Ignore the seed: nothing is random."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions, shape (n, L)."""
+        tables, robots = task.robot_tables, task.env_robot_index
+        T_root_tool, J_root_tool = frame_jacobian(tables.tool_chain, robots, task.q)
+        goals = reach_goals(task)
+        if goals.rotations is None:
+            J, error = J_root_tool[:, :3], goals.positions - T_root_tool[:, :3, 3]
+        else:
+            goal = goals.positions, goals.rotations, goals.metres_per_radian
+            J, error = pose_task(T_root_tool, J_root_tool, *goal)
+        steps = column_steps(J, error)
+        fractions = (GAIN * steps / tables.max_step[robots].clamp(min=1e-9)).clamp(-1, 1)
+        return encode_actions(joint_to_link(tables, robots, fractions), task.action_kind)
+
+
+def column_steps(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    """Return the change of each joint that alone reduces the error most, shape (n, J).
+
+    It is the projection of the error on the joint's column; 0 for columns below ``MIN_COLUMN``.
+
+    J: Jacobians, shape (n, m, J).
+    error: Task-space errors, shape (n, m).
+    """
+    squares = J.square().sum(dim=1)
+    steps = (J * error[..., None]).sum(dim=1) / squares.clamp(min=MIN_COLUMN**2)
+    return torch.where(squares < MIN_COLUMN**2, torch.zeros_like(steps), steps)

@@ -37,14 +37,17 @@ from morphgen.rl.runs.checkpoint import (
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.runs.drawn_robots import DrawnRobots, draw, num_drawn, write_drawn
 from morphgen.rl.runs.recorders import Recorder, recording, require_wandb
 from morphgen.rl.runs.robot_source import (
+    DrawnRobots,
     RobotSource,
+    draw,
     members,
+    num_drawn,
     require_links,
     single_members,
     specs_of,
+    write_drawn,
 )
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.device import batch_device, require_device

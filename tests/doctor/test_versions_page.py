@@ -7,7 +7,7 @@ from morphgen.benchmark import release_file, split, split_folder
 from morphgen.formats import bundle
 from morphgen.grammar.robot_set import SetConfig
 from morphgen.rl.runs import checkpoint as runs
-from morphgen.rl.runs import drawn_robots
+from morphgen.rl.runs import robot_source
 from morphgen.rl.scores import submission
 from morphgen.tasks.goals import split_goals
 from morphgen.viewer import episode
@@ -21,7 +21,7 @@ FORMATS = {
     "set.json": SetConfig(Path(), "", "", 0, (), False, False, ()).settings()["format"],
     runs.CONFIG: runs.FORMAT,
     runs.CHECKPOINT: runs.FORMAT,
-    drawn_robots.FILE: drawn_robots.FORMAT,
+    robot_source.FILE: robot_source.FORMAT,
     "episodes.csv.gz": "",
     "release.json": release_file.FORMAT,
     "eval --submission": submission.FORMAT,

@@ -8,7 +8,7 @@ from helpers.submissions import EXPECTED, SPLIT, data
 from morphgen.benchmark.difficulty import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.rl.scores.episode_table import EPISODES, append_submission
-from morphgen.rl.scores.reference_scores import References, study_results
+from morphgen.rl.scores.leaderboard import References, study_results
 from morphgen.rl.scores.submission import submission_from
 
 NAMES = [(each.side, each.member.name) for each in EXPECTED]

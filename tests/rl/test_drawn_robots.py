@@ -14,22 +14,20 @@ from morphgen.errors import GrammarError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robots
 from morphgen.progress import show_progress
-from morphgen.rl.runs import drawn_robots
-from morphgen.rl.runs.drawn_robots import (
+from morphgen.rl.runs import robot_source as drawn_robots
+from morphgen.rl.runs.robot_source import (
     FILE,
     draw,
     drawn_source,
     num_drawn,
-    read_drawn,
-    trained_on,
-    write_drawn,
-)
-from morphgen.rl.runs.robot_source import (
     other_side,
+    read_drawn,
     robot_source,
     specs_of,
     split_source,
     tasks_of,
+    trained_on,
+    write_drawn,
 )
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import GoalConfig

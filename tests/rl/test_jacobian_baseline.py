@@ -8,7 +8,7 @@ import torch
 from helpers.scenes import robot
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.rl.baselines import BASELINES, baselines_for
-from morphgen.rl.baselines.jacobian import GAIN, JacobianColumns, column_steps
+from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.reach.config import ReachConfig

@@ -5,11 +5,10 @@ from dataclasses import asdict
 import pytest
 
 from morphgen.errors import TaskError
-from morphgen.rl.agents import AGENTS, network_fields
+from morphgen.rl.agents import AGENTS, FAST, PAPER, PRESETS, network_fields, preset_of
 from morphgen.rl.config import NUMBERS, PPOConfig
 from morphgen.rl.ppo import normalized_advantages
 from morphgen.rl.runs.agent_spec import SWITCHES, configs_of, parse_agent
-from morphgen.rl.runs.presets import FAST, PAPER, PRESETS, preset_of
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

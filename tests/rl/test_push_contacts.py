@@ -6,7 +6,7 @@ import pytest
 from helpers.scenes import ball
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import Link
-from morphgen.rl.baselines.push_contacts import find_contacts, overhang
+from morphgen.rl.baselines.push_planner import find_contacts, overhang
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 

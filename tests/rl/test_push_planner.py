@@ -11,8 +11,7 @@ from helpers.scenes import robot
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import push_planner
-from morphgen.rl.baselines.push_contacts import find_contacts
-from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics
+from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics, find_contacts
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig

@@ -8,8 +8,8 @@ from helpers.submissions import PROTOCOL, SPLIT, VERSION, data
 from morphgen.errors import BenchmarkError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores import reference_scores
-from morphgen.rl.scores.reference_scores import collect_references, reference_files
+from morphgen.rl.scores import leaderboard as reference_scores
+from morphgen.rl.scores.leaderboard import collect_references, reference_files
 from morphgen.rl.scores.submission import Submission, require_same_random
 
 TEST = -1

@@ -14,17 +14,19 @@ from morphgen.benchmark.split import split_id
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores import reference_scores
+from morphgen.rl.scores import leaderboard as reference_scores
 from morphgen.rl.scores.episode_table import EPISODES, append_submission
 from morphgen.rl.scores.leaderboard import (
     Row,
     SideScore,
+    collect_references,
     random_scores,
     ranked,
     ranking_table,
+    read_references,
+    reference_files,
     score_submission,
 )
-from morphgen.rl.scores.reference_scores import collect_references, read_references, reference_files
 from morphgen.rl.scores.scores import stratified_mean_interval
 from morphgen.rl.scores.submission import (
     Submission,

@@ -16,9 +16,8 @@ from morphgen.errors import BenchmarkError, TaskError
 from morphgen.progress import show_progress
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.runs.drawn_robots import FILE, draw, drawn_source
 from morphgen.rl.runs.recorders import read_metrics
-from morphgen.rl.runs.robot_source import specs_of, split_source
+from morphgen.rl.runs.robot_source import FILE, draw, drawn_source, specs_of, split_source
 from morphgen.rl.runs.training import (
     TrainingBatches,
     default_slice_updates,
