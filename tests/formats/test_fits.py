@@ -69,32 +69,6 @@ def test_overlaps_are_stored_with_four_decimals(tmp_path):
     assert (fit.token_iou, fit.collision_iou) == (0.6667, 0.3333)
 
 
-def test_an_empty_set_of_fits_is_a_valid_file(tmp_path):
-    write(tmp_path, fits_text({}))
-    assert read_stored_fits([tmp_path]) == {}
-
-
-def test_each_link_has_one_line():
-    lines = fits_text({"one": ARM, "two": HAND}).splitlines()
-    assert len(lines) == 4
-    assert [name in line for line, name in zip(lines[1:3], ("one", "two"), strict=True)] == [
-        True
-    ] * 2
-    assert fits_text({"one": ARM, "two": HAND}) == fits_text({"one": ARM, "two": HAND})
-
-
-def test_plain_data_has_the_kind_and_the_pose():
-    pose = Pose((1.0, 2.0, 3.0))
-    assert shape_to_data(Shape(Box((0.1, 0.2, 0.3)), pose)) == {
-        "box": [0.1, 0.2, 0.3],
-        "xyz": [1.0, 2.0, 3.0],
-        "quaternion": [1.0, 0.0, 0.0, 0.0],
-    }
-    assert shape_to_data(CAN)["cylinder"] == [0.05, 0.3]
-    assert shape_to_data(Shape(Sphere(0.1)))["sphere"] == [0.1]
-    assert shape_to_data(Shape(Capsule(0.1, 0.2)))["capsule"] == [0.1, 0.2]
-
-
 def test_a_mesh_is_not_stored():
     with pytest.raises(ValueError, match=r"mesh m\.stl is not a primitive"):
         shape_to_data(Shape(Mesh(Path("m.stl"))))
@@ -109,14 +83,6 @@ def test_all_fit_files_of_all_folders_are_read_and_other_files_ignored(tmp_path)
     assert read_stored_fits([tmp_path / "b"]) == {"two": HAND}
     assert read_stored_fits([tmp_path / "nowhere"]) == {}
     assert read_stored_fits([]) == {}
-
-
-@pytest.mark.parametrize("version", [FITTER_VERSION - 1, FITTER_VERSION + 1, None, "1"])
-def test_fits_of_another_fitter_version_are_ignored(tmp_path, version):
-    data = json.loads(fits_text({"key": ARM}))
-    write(tmp_path, json.dumps(data | {"fitter": version}))
-    write(tmp_path, json.dumps({"fitter": version, "whatever": []}), "other")
-    assert read_stored_fits([tmp_path]) == {}
 
 
 MALFORMED = {
@@ -173,14 +139,6 @@ def test_a_malformed_file_is_a_one_line_error(tmp_path, fault):
     assert len(str(caught.value)) < len(str(path)) + 300
 
 
-def test_a_file_that_is_not_text_is_an_error(tmp_path):
-    path = tmp_path / f"robot{SUFFIX}"
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(FormatError, match="robot") as caught:
-        read_stored_fits([tmp_path])
-    assert str(path) in str(caught.value)
-
-
 def test_a_changed_file_is_reloaded(tmp_path):
     path = write(tmp_path, fits_text({"one": ARM}))
     assert read_stored_fits([tmp_path]) == {"one": ARM}
@@ -200,13 +158,6 @@ def mesh(tmp_path):
     path = tmp_path / "box.stl"
     trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
     return Mesh(path)
-
-
-def test_a_key_is_short_hexadecimal(mesh):
-    key = shapes_key([Shape(mesh)])
-    assert len(key) == 32
-    assert set(key) <= set("0123456789abcdef")
-    assert shapes_key([Shape(mesh)]) == key
 
 
 def test_the_same_content_under_another_name_has_the_same_key(mesh, tmp_path):

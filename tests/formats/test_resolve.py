@@ -39,22 +39,54 @@ def urdf(tmp_path: Path) -> Path:
     return touch(tmp_path / "ws" / "arm_description" / "urdf" / "arm.urdf")
 
 
-def test_a_package_is_found_above_the_file_by_its_folders_name(urdf: Path) -> None:
-    mesh = touch(urdf.parent.parent / "meshes" / "a.stl")
-    assert resolve_uri("package://arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
-    assert resolve_uri("package:///arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
-    assert resolve_uri("model://arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
+@pytest.mark.parametrize(
+    ("file", "uri"),
+    [
+        ("arm_description/meshes/a.stl", "package://arm_description/meshes/a.stl"),
+        ("arm_description/meshes/a.stl", "package:///arm_description/meshes/a.stl"),
+        ("arm_description/meshes/a.stl", "model://arm_description/meshes/a.stl"),
+        ("arm_description/a.stl", "package://other_name/a.stl"),  # by its package.xml
+        ("hand_description/a.stl", "package://hand_description/a.stl"),  # beside
+        ("arm_description/a.stl", "package://arm_support/a.stl"),  # a copy without ROS's suffix
+        ("root/one/a.stl", "package://one/a.stl"),
+        ("root/repository/src/a.stl", "package://two/a.stl"),  # two levels down
+        ("arm_description/urdf/my mesh.stl", "my%20mesh.stl"),
+        ("arm_description/urdf/100%20.stl", "100%20.stl"),
+        ("arm_description/urdf/my mesh.stl", r"..\urdf\my mesh.stl"),
+    ],
+)
+def test_files_are_found_by_package_and_spelling(file: str, uri: str, tmp_path: Path) -> None:
+    folder = "arm" if "arm_support" in uri else "arm_description"
+    urdf = touch(tmp_path / "ws" / folder / "urdf" / "arm.urdf")
+    mesh = touch(tmp_path / "ws" / file.replace("arm_description", folder))
+    manifests = {"other_name": urdf.parents[1], "two": tmp_path / "ws" / "root/repository/src"}
+    for name, path in manifests.items():
+        if name in uri:
+            text = f"<package format='3'>\n <name> {name} </name></package>"
+            touch(path / "package.xml", text)
+    assert resolve_uri(uri, urdf, PackageFinder((tmp_path / "ws" / "root",))) == mesh
 
 
-def test_a_package_is_found_by_the_name_in_its_package_xml(urdf: Path) -> None:
-    touch(urdf.parent.parent / "package.xml", "<package><name>other_name</name></package>")
-    mesh = touch(urdf.parent.parent / "a.stl")
-    assert resolve_uri("package://other_name/a.stl", urdf, NOWHERE) == mesh
-
-
-def test_a_package_is_found_beside_an_ancestor_of_the_file(urdf: Path) -> None:
-    mesh = touch(urdf.parents[2] / "hand_description" / "a.stl")
-    assert resolve_uri("package://hand_description/a.stl", urdf, NOWHERE) == mesh
+@pytest.mark.parametrize(
+    ("uri", "reason"),
+    [
+        ("package://lost/a.stl", "package 'lost' not found: looked "),
+        *((f"package://{name}/id", "not a package name") for name in (".ssh", "..", "a b", "%2e")),
+        ("package://etc/hostname", "not found"),  # the root of the file system is not searched
+        *((uri, repr(uri)) for uri in ("", " ", "http://host/a.stl", "package://", "C:/a.stl")),
+        ("../urdf", "does not exist"),
+        ("base.stl", "did you mean 'Base.STL'?"),
+        ("../../secret.stl", "leaves"),
+        ("%2e%2e/%2e%2e/secret.stl", "leaves"),
+        ("package://arm_description/../secret.stl", "leaves"),
+    ],
+)
+def test_other_references_are_refused(uri: str, reason: str, urdf: Path) -> None:
+    touch(urdf.parents[2] / "secret.stl")
+    touch(urdf.parent / "Base.STL")
+    message = failure(uri, urdf, PackageFinder((urdf.parents[2] / "root",)))
+    assert reason in message
+    assert message.startswith(f"{urdf}: ")
 
 
 def test_a_plain_folder_above_the_description_is_no_package(tmp_path: Path) -> None:
@@ -70,49 +102,11 @@ def test_a_plain_folder_above_the_description_is_no_package(tmp_path: Path) -> N
     assert resolve_uri("package://secret/part.stl", urdf, NOWHERE).is_file()
 
 
-def test_a_package_is_found_in_a_root_also_two_levels_down(tmp_path: Path, urdf: Path) -> None:
-    finder = PackageFinder((tmp_path / "root",))
-    direct = touch(tmp_path / "root" / "one" / "a.stl")
-    assert resolve_uri("package://one/a.stl", urdf, finder) == direct
-    deep = touch(tmp_path / "root" / "repository" / "src" / "a.stl")
-    touch(deep.parent / "package.xml", "<package format='3'>\n <name> two </name></package>")
-    assert resolve_uri("package://two/a.stl", urdf, finder) == deep
-
-
-def test_a_package_copied_into_a_folder_without_the_ros_suffix_is_found(tmp_path: Path) -> None:
-    urdf = touch(tmp_path / "kuka_kr6" / "urdf" / "kr6.urdf")
-    mesh = touch(tmp_path / "kuka_kr6" / "meshes" / "a.stl")
-    assert resolve_uri("package://kuka_kr6_support/meshes/a.stl", urdf, NOWHERE) == mesh
-
-
 def test_a_folder_given_for_a_package_takes_precedence(tmp_path: Path, urdf: Path) -> None:
     touch(urdf.parent.parent / "a.stl")
     mine = touch(tmp_path / "mine" / "a.stl")
     finder = default_finder(packages={"arm_description": tmp_path / "mine"})
     assert resolve_uri("package://arm_description/a.stl", urdf, finder) == mine
-
-
-def test_a_missing_package_error_lists_the_searched_folders(tmp_path: Path, urdf: Path) -> None:
-    message = failure("package://lost/a.stl", urdf, PackageFinder((tmp_path / "root",)))
-    assert "'lost'" in message
-    assert str(urdf) in message
-    assert str(tmp_path / "root") in message
-
-
-@pytest.mark.parametrize("package", [".ssh", "..", "a b", "%2e%2e"])
-def test_invalid_package_names_are_errors(package: str, urdf: Path) -> None:
-    assert "is not a package name" in failure(f"package://{package}/id", urdf)
-
-
-def test_the_file_system_root_is_not_searched_for_packages(urdf: Path) -> None:
-    assert "not found" in failure("package://etc/hostname", urdf)
-
-
-def test_names_are_case_sensitive_and_a_near_match_is_suggested(urdf: Path) -> None:
-    touch(urdf.parent / "Base.STL")
-    message = failure("base.stl", urdf)
-    assert str(urdf.parent / "base.stl") in message
-    assert "'Base.STL'" in message
 
 
 def test_relative_paths_start_at_the_folder_of_the_description(
@@ -127,33 +121,6 @@ def test_relative_paths_start_at_the_folder_of_the_description(
     assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
 
 
-def test_percent_escapes_and_backslashes_are_accepted(urdf: Path) -> None:
-    spaced = touch(urdf.parent / "my mesh.stl")
-    literal = touch(urdf.parent / "100%20.stl")
-    assert resolve_uri("my%20mesh.stl", urdf, NOWHERE) == spaced
-    assert resolve_uri("100%20.stl", urdf, NOWHERE) == literal
-    assert resolve_uri(r"..\urdf\my mesh.stl", urdf, NOWHERE) == spaced
-
-
-@pytest.mark.parametrize("uri", ["../../secret.stl", "%2e%2e/%2e%2e/secret.stl"])
-def test_a_relative_path_cannot_leave_its_package(uri: str, urdf: Path) -> None:
-    touch(urdf.parents[2] / "secret.stl")
-    assert "leaves" in failure(uri, urdf)
-
-
-def test_a_package_uri_cannot_leave_the_package(urdf: Path) -> None:
-    touch(urdf.parents[2] / "secret.stl")
-    assert "leaves" in failure("package://arm_description/../secret.stl", urdf)
-
-
-def test_without_a_package_a_path_may_leave_one_folder(tmp_path: Path) -> None:
-    urdf = touch(tmp_path / "robot" / "urdf" / "robot.urdf")
-    mesh = touch(tmp_path / "robot" / "meshes" / "a.stl")
-    touch(tmp_path / "a.stl")
-    assert resolve_uri("../meshes/a.stl", urdf, NOWHERE) == mesh
-    assert "leaves" in failure("../../a.stl", urdf)
-
-
 def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
     tmp_path: Path, urdf: Path
 ) -> None:
@@ -165,15 +132,6 @@ def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
     assert resolve_uri(packaged.as_uri(), urdf, NOWHERE) == packaged
     assert "leaves" in failure(private.as_uri(), urdf)
     assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
-
-
-@pytest.mark.parametrize("uri", ["", " ", "http://host/a.stl", "package://", "C:/a.stl"])
-def test_invalid_file_references_are_errors(uri: str, urdf: Path) -> None:
-    assert repr(uri) in failure(uri, urdf)
-
-
-def test_a_folder_instead_of_a_file_is_an_error(urdf: Path) -> None:
-    assert "does not exist" in failure("../urdf", urdf)
 
 
 def test_ros_environment_is_searched_after_given_roots(

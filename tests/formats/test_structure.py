@@ -12,7 +12,6 @@ from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.schema import structure_findings
 from morphgen.formats.xml import parse_xml
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Capsule
 
 SOUND = """<robot name="r">
 <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
@@ -256,11 +255,6 @@ def test_faults_that_ros_tolerates_are_read_with_a_warning(read, code, change, l
 def test_an_invalid_mimic_joint_becomes_independent(read):
     robot = read(changed(('mimic joint="j"', 'mimic joint="z"')))
     assert robot.dof == 2
-
-
-def test_a_capsule_is_read(read):
-    robot = read(changed(('<sphere radius="1"/>', '<capsule radius="1" length="3"/>')))
-    assert robot.link("b").collisions[1].geometry == Capsule(1.0, 3.0)
 
 
 @pytest.mark.parametrize("tag", ["link", "joint"])

@@ -40,12 +40,6 @@ def test_a_robot_round_trips_through_urdf(tmp_path):
     np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
 
 
-def test_written_text_round_trips(tmp_path):
-    first = written(arm(), tmp_path)
-    again = urdf_text(with_frames(read_urdf(first), ["tool"]), no_mesh)
-    assert again == first.read_text()
-
-
 def test_links_are_sorted_from_the_root(tmp_path):
     path = tmp_path / "shuffled.urdf"
     path.write_text(

@@ -59,13 +59,6 @@ def test_overlap_is_counted_once():
     np.testing.assert_allclose(body.matrix, whole.matrix, atol=1e-12)
 
 
-def test_a_shape_inside_another_adds_nothing():
-    outer = Shape(Sphere(0.2))
-    alone = inertial_from_density([outer], DENSITY)
-    both = inertial_from_density([outer, Shape(Box((0.1, 0.1, 0.1)))], DENSITY)
-    assert both.mass == pytest.approx(alone.mass, rel=1e-9)
-
-
 def test_separate_shapes_use_the_closed_forms():
     far = Pose((1.0, 0.0, 0.0))
     body = inertial_from_density([Shape(Sphere(0.1)), Shape(Sphere(0.1), far)], DENSITY)

@@ -42,13 +42,6 @@ def planar(lengths=(0.5, 0.3)):
     return Robot("planar", links, joints, (tool,), home=(0.0,) * len(lengths))
 
 
-def test_planar_arm_agrees_with_trigonometry():
-    q = np.array([0.3, -1.1])
-    x = 0.5 * math.cos(0.3) + 0.3 * math.cos(0.3 - 1.1)
-    y = 0.5 * math.sin(0.3) + 0.3 * math.sin(0.3 - 1.1)
-    np.testing.assert_allclose(frame_pose(planar(), q)[:3, 3], [x, y, 0.0], atol=1e-14)
-
-
 def test_batch_is_the_stack_of_its_rows():
     robot = arm()
     q = random_configurations(robot, 12, np.random.default_rng(3)).reshape(3, 4, robot.dof)
