@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,7 @@ from morphgen.formats.quiet import log_mujoco_warnings
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
+from morphgen.typing import Array
 
 SIZE = (640, 480)
 """Width and height of a picture [px]."""
@@ -29,16 +29,6 @@ _YAW, _PITCH = 50.0, -20.0
 """Direction of the camera [deg]."""
 _MARGIN = 0.92
 """Share of the picture that the robot may fill."""
-
-
-@dataclass(frozen=True)
-class View:
-    """A camera looking at a point from a distance."""
-
-    target: tuple[float, float, float]
-    """Point in the centre of the picture, in the root frame [m]."""
-    distance: float
-    """Distance of the camera from the target [m]."""
 
 
 class GlContext(Protocol):
@@ -63,7 +53,7 @@ def render(
 
     log_mujoco_warnings()
     q = np.asarray(robot.home if q is None else q, dtype=np.float64)
-    view = _framing(robot, q, size[0] / size[1])
+    target, distance = _framing(robot, q, size[0] / size[1])
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     data = mujoco.MjData(model)
     for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
@@ -73,8 +63,8 @@ def render(
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.7
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = view.target
-    camera.distance, camera.azimuth, camera.elevation = view.distance, 90 + _YAW, _PITCH
+    camera.lookat[:] = target
+    camera.distance, camera.azimuth, camera.elevation = distance, 90 + _YAW, _PITCH
     options = mujoco.MjvOption()
     options.geomgroup[3] = 0
     context = gl_context(*size)
@@ -99,12 +89,15 @@ def render(
 
 def framed_height(robot: Robot) -> float:
     """Return the height at the middle of a robot that its picture at home shows [m]."""
-    view = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
-    return 2 * view.distance * math.tan(math.radians(_FOV / 2))
+    _, distance = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
+    return 2 * distance * math.tan(math.radians(_FOV / 2))
 
 
-def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
-    """Return the closest view that shows the whole robot and its root's origin, centred."""
+def _framing(robot: Robot, q: Array, aspect: float) -> tuple[Array, float]:
+    """Return the closest view that shows the whole robot and its root's origin, centred.
+
+    It is the point (3,) in the root frame that the camera looks at, and its distance from it [m].
+    """
     T_root_link = forward_kinematics(robot, q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
@@ -119,8 +112,7 @@ def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
         np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
     )
     distance = max(float((distances - (ahead - middle[1])).max()), 0.05)
-    x, y, z = (axes @ middle).tolist()
-    return View((x, y, z), distance)
+    return axes @ middle, distance
 
 
 def gl_context(width: int, height: int) -> GlContext:

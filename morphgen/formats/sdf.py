@@ -9,7 +9,7 @@ from lxml import etree
 from morphgen.errors import FormatError
 from morphgen.formats.rounding import format_inertia, format_number, rounded_axis, rounded_pose
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS, MeshUri
-from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
+from morphgen.model.geometry import Box, Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 
 SDF_VERSION, SDF_MIMIC_VERSION = "1.10", "1.11"
@@ -76,9 +76,8 @@ def model_config_text(robot: Robot) -> str:
     etree.SubElement(root, "name").text = robot.name
     etree.SubElement(root, "version").text = "1.0"
     etree.SubElement(root, "sdf", version=_version(robot)).text = MODEL_SDF
-    etree.SubElement(
-        root, "description"
-    ).text = f"{robot.name}: {len(robot.links)} links, {robot.dof} independent joints"
+    about = f"{robot.name}: {len(robot.links)} links, {robot.dof} independent joints"
+    etree.SubElement(root, "description").text = about
     etree.indent(root)
     return etree.tostring(root, encoding="unicode") + "\n"
 
@@ -135,16 +134,12 @@ def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshU
     match geometry:
         case Box(size):
             _write_values(element, "box", size=_join(size))
-        case Sphere(radius):
-            _write_values(element, "sphere", radius=format_number(radius))
-        case Cylinder(radius, length):
-            values = {"radius": format_number(radius), "length": format_number(length)}
-            _write_values(element, "cylinder", **values)
-        case Capsule(radius, length):
-            values = {"radius": format_number(radius), "length": format_number(length)}
-            _write_values(element, "capsule", **values)
         case Mesh():
             _write_values(element, "mesh", uri=mesh_uri(geometry))
+        case _:
+            sizes = zip(("radius", "length"), dimensions(geometry), strict=False)
+            values = {name: format_number(size) for name, size in sizes}
+            _write_values(element, type(geometry).__name__.lower(), **values)
 
 
 def _write_joint(model: etree._Element, joint: Joint, names: dict[str, str]) -> None:
@@ -160,13 +155,11 @@ def _write_joint(model: etree._Element, joint: Joint, names: dict[str, str]) -> 
         etree.SubElement(mimic, "multiplier").text = format_number(joint.mimic.multiplier)
         etree.SubElement(mimic, "offset").text = format_number(joint.mimic.offset)
         etree.SubElement(mimic, "reference").text = "0"
-    limits = (
-        {} if joint.limits is None else dict(zip(("lower", "upper"), joint.limits, strict=True))
-    )
-    bounds = limits if kind != "continuous" else {}
-    bounds |= {"effort": joint.effort} if joint.effort else {}
-    bounds |= {"velocity": joint.velocity} if joint.velocity else {}
-    _write_values(axis, "limit", **{name: format_number(value) for name, value in bounds.items()})
+    lower, upper = (joint.limits if kind != "continuous" else None) or (None, None)
+    bounds = {"lower": lower, "upper": upper}
+    bounds |= {"effort": joint.effort or None, "velocity": joint.velocity or None}
+    texts = {name: format_number(value) for name, value in bounds.items() if value is not None}
+    _write_values(axis, "limit", **texts)
     if joint.damping or joint.friction:
         dynamics = {"damping": joint.damping, "friction": joint.friction}
         _write_values(axis, "dynamics", **{k: format_number(v) for k, v in dynamics.items()})

@@ -49,6 +49,13 @@ from morphgen.typing import Array
 WORLD = 0
 """Index of the world body."""
 _JOINT = mujoco.mjtJoint
+_REFUSED_JOINTS = {
+    _JOINT.mjJNT_BALL: ("type ball; expected hinge or slide, such as three hinges at one place"),
+    _JOINT.mjJNT_FREE: (
+        "type free, which only the root of a robot may have; name it by --root-link BODY of "
+        "morphgen import"
+    ),
+}
 FLOOR_GEOMS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """Types of geoms that are a floor where the world has them."""
 
@@ -82,7 +89,11 @@ def robot_bodies(
     """
     findings: tuple[Finding, ...] = ()
     if root_body is not None:
-        root = _named_body(model, root_body, document)
+        names = [model.body(body).name for body in range(model.nbody)]
+        if root_body not in names:
+            hint = nearest(root_body, names)
+            raise document.error(f"no body {root_body!r} for root link{hint}")
+        root = names.index(root_body)
     else:
         top = [body for body in range(1, model.nbody) if model.body_parentid[body] == WORLD]
         root, findings = _root(model, top, document)
@@ -93,18 +104,10 @@ def robot_bodies(
         for joint in range(model.njnt)
         if model.jnt_bodyid[joint] in kept and model.jnt_bodyid[joint] != root
     )
-    balls = [j for j in sorted(joints) if model.jnt_type[j] == _JOINT.mjJNT_BALL]
-    if balls:
-        raise document.error(
-            f"joint {listed(joint_label(model, j) for j in balls)}: type ball; expected hinge or "
-            "slide, such as three hinges at one place"
-        )
-    free = [j for j in sorted(joints) if model.jnt_type[j] == _JOINT.mjJNT_FREE]
-    if free:
-        raise document.error(
-            f"joint {listed(joint_label(model, j) for j in free)}: type free, which only the "
-            "root of a robot may have; name it by --root-link BODY of morphgen import"
-        )
+    for kind, why in _REFUSED_JOINTS.items():
+        if refused := [j for j in sorted(joints) if model.jnt_type[j] == kind]:
+            labels = listed(joint_label(model, joint) for joint in refused)
+            raise document.error(f"joint {labels}: {why}")
     return RobotBodies(bodies, joints, findings)
 
 
@@ -194,13 +197,6 @@ def _below(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
     return tuple(kept)
 
 
-def _named_body(model: mujoco.MjModel, name: str, document: MjcfDocument) -> int:
-    names = [model.body(body).name for body in range(model.nbody)]
-    if name not in names:
-        raise document.error(f"no body {name!r} for root link{nearest(name, names)}")
-    return names.index(name)
-
-
 _GEOM = mujoco.mjtGeom
 _LAST_DRAWN_GROUP = 2
 """Last geom group that MuJoCo's viewers show."""
@@ -243,15 +239,13 @@ def body_shapes(
     MuJoCo moves meshes to their centre of mass and principal axes; the shapes are again in the
     coordinates of the mesh files.
     """
-    first = model.body_geomadr[body]
-    geoms = range(first, first + model.body_geomnum[body])
     paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
     visuals: list[Shape] = []
     collisions: list[Shape] = []
     drawn: list[Shape] = []
     refused: dict[str, list[str]] = {}
     ellipsoids: list[str] = []
-    for geom in geoms:
+    for geom in _geoms(model, body):
         touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom]) or geom in paired
         rgba = _rgba(model, geom)
         is_drawn = model.geom_group[geom] <= _LAST_DRAWN_GROUP and (rgba is None or rgba[3] > 0)
@@ -472,7 +466,16 @@ def read_couplings(
         elif kind == _EQ.mjEQ_TENDON and _add_tendon_equality(scope, couplings, k, name):
             resolved_tendons.add(int(model.eq_obj1id[k]))
         elif _is_handle(scope, k, kind):
-            couplings.findings.append(_handle_finding(name, document))
+            couplings.findings.append(
+                Finding(
+                    "mocap-constraint",
+                    "warning",
+                    f"{document.path.name}: equality {name!r}",
+                    "it connects the robot to a mocap body, which is not of the robot",
+                    "remove it, if it is not needed",
+                    "a constraint to a mocap body was left out",
+                )
+            )
         else:
             word = kind.name.removeprefix("mjEQ_").lower()
             raise document.error(
@@ -488,18 +491,22 @@ def read_couplings(
 
 def _touches(scope: _Scope, equality: int, kind: mujoco.mjtEq) -> bool:
     """Return whether a constraint acts on a joint or body of the robot."""
-    model = scope.model
-    ends = [int(k) for k in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if k >= 0]
+    ends = _objects(scope.model, equality)
     if kind == _EQ.mjEQ_JOINT:
         return any(end in scope.joints for end in ends)
     if kind == _EQ.mjEQ_TENDON:
         return any(_tendon_touches(scope, end) for end in ends)
-    return any(body in scope.bodies for body in _connected_bodies(model, equality))
+    return any(body in scope.bodies for body in _connected_bodies(scope.model, equality))
+
+
+def _objects(model: mujoco.MjModel, equality: int) -> list[int]:
+    """Return the indices of the one or two objects at the ends of a constraint."""
+    return [int(k) for k in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if k >= 0]
 
 
 def _connected_bodies(model: mujoco.MjModel, equality: int) -> list[int]:
     """Return the bodies at the ends of a constraint other than of joints and tendons."""
-    ends = [int(k) for k in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if k >= 0]
+    ends = _objects(model, equality)
     if model.eq_objtype[equality] == _OBJ.mjOBJ_SITE:
         return [int(model.site_bodyid[end]) for end in ends]
     if model.eq_objtype[equality] == _OBJ.mjOBJ_GEOM:
@@ -515,25 +522,13 @@ def _is_handle(scope: _Scope, equality: int, kind: mujoco.mjtEq) -> bool:
     )
 
 
-def _handle_finding(name: str, document: MjcfDocument) -> Finding:
-    return Finding(
-        "mocap-constraint",
-        "warning",
-        f"{document.path.name}: equality {name!r}",
-        "it connects the robot to a mocap body, which is not of the robot",
-        "remove it, if it is not needed",
-        "a constraint to a mocap body was left out",
-    )
-
-
 def _ends(model: mujoco.MjModel, equality: int, kind: mujoco.mjtEq) -> str:
     """Return what a constraint without a name connects."""
     object_type = {_EQ.mjEQ_JOINT: _OBJ.mjOBJ_JOINT, _EQ.mjEQ_TENDON: _OBJ.mjOBJ_TENDON}.get(
         kind, model.eq_objtype[equality]
     )
-    ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
-    names = (mujoco.mj_id2name(model, int(object_type), int(end)) or "" for end in ends if end >= 0)
-    return " - ".join(names)
+    ends = _objects(model, equality)
+    return " - ".join(mujoco.mj_id2name(model, int(object_type), end) or "" for end in ends)
 
 
 def _add_joint_equality(scope: _Scope, couplings: Couplings, k: int, name: str) -> None:
@@ -546,9 +541,10 @@ def _add_joint_equality(scope: _Scope, couplings: Couplings, k: int, name: str) 
         couplings.locks[follower] = _ref(model, follower) + a0
         return
     if any(higher):
+        degree = max(power for power, value in enumerate(higher, start=2) if value)
         raise scope.document.error(
-            f"equality {name!r}: its polycoef has degree {_degree(higher)}; expected degree 1, as "
-            "of a mimic joint"
+            f"equality {name!r}: its polycoef has degree {degree}; expected degree 1, as of a "
+            "mimic joint"
         )
     _require_own_joints(scope, (follower, leader), name)
     _claim(scope, couplings, follower, name)
@@ -641,11 +637,6 @@ def _claim(scope: _Scope, couplings: Couplings, joint: int, name: str) -> None:
             f"equality {name!r}: another one couples joint {scope.model.joint(joint).name!r}, too; "
             "expected one"
         )
-
-
-def _degree(higher: Iterable[float]) -> int:
-    """Return the degree of a polynomial whose coefficients from the square on are given."""
-    return max(power for power, value in enumerate(higher, start=2) if value)
 
 
 def _ref(model: mujoco.MjModel, joint: int) -> float:

@@ -194,14 +194,10 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
             "friction": format_number(joint.friction),
         }
         etree.SubElement(element, "dynamics", values)
-    if joint.mimic is not None:
-        etree.SubElement(
-            element,
-            "mimic",
-            joint=joint.mimic.joint,
-            multiplier=format_number(joint.mimic.multiplier),
-            offset=format_number(joint.mimic.offset),
-        )
+    if (mimic := joint.mimic) is not None:
+        coupling = {"multiplier": format_number(mimic.multiplier)}
+        coupling["offset"] = format_number(mimic.offset)
+        etree.SubElement(element, "mimic", {"joint": mimic.joint} | coupling)
 
 
 def _join(values: Iterable[float]) -> str:

@@ -47,14 +47,9 @@ _UNTRACEABLE = (
 """Exceptions that tracing an untraceable template can raise."""
 
 
-def _recorded(sign: str, *, reflected: bool = False) -> Callable[[Traced, object], Traced]:
-    """Return a method that records an operation; if reflected, the symbol is the right operand."""
-
-    def operate(symbol: Traced, other: object) -> Traced:
-        left, right = (other, symbol) if reflected else (symbol, other)
-        return Traced(f"({_code(left)} {sign} {_code(right)})")
-
-    return operate
+def _recorded(form: str) -> Callable[[Traced, object], Traced]:
+    """Return a method that records an operation, such as ``{other} - {symbol}``."""
+    return lambda symbol, other: Traced(f"({form.format(symbol=symbol.code, other=_code(other))})")
 
 
 class Traced:
@@ -66,15 +61,11 @@ class Traced:
     def __str__(self) -> str:
         return f"{_OPEN}{self.code}{_CLOSE}"
 
-    __add__ = _recorded("+")
-    __radd__ = _recorded("+", reflected=True)
-    __sub__ = _recorded("-")
-    __rsub__ = _recorded("-", reflected=True)
-    __mul__ = _recorded("*")
-    __rmul__ = _recorded("*", reflected=True)
-    __truediv__ = _recorded("/")
-    __rtruediv__ = _recorded("/", reflected=True)
-    __pow__ = _recorded("**")
+    __add__, __radd__ = _recorded("{symbol} + {other}"), _recorded("{other} + {symbol}")
+    __sub__, __rsub__ = _recorded("{symbol} - {other}"), _recorded("{other} - {symbol}")
+    __mul__, __rmul__ = _recorded("{symbol} * {other}"), _recorded("{other} * {symbol}")
+    __truediv__, __rtruediv__ = _recorded("{symbol} / {other}"), _recorded("{other} / {symbol}")
+    __pow__ = _recorded("{symbol} ** {other}")
 
     def __neg__(self) -> Traced:
         return Traced(f"(-{self.code})")
