@@ -12,7 +12,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command
 
 if TYPE_CHECKING:
-    from morphgen.doctor.entry import Entry
+    from morphgen.doctor import Entry
 
 STATUS_WIDTH = 8
 """Width of the first column [characters]."""
@@ -23,13 +23,12 @@ STATUS_WIDTH = 8
     "print versions, simulators, GPU and caches, and test the installation",
     opt.JSON,
     details="A line per result: ok, absent (an optional package), warning, or error. The self-test "
-    "composes, checks, loads, steps and draws a robot, and compares its hash, its files and a "
-    "score with recorded ones. The exit code is 1 if there is an error.",
+    "composes, checks, loads, steps and draws a robot. The exit code is 1 if there is an error.",
     examples=("doctor", "doctor --json"),
 )
 def doctor(args: argparse.Namespace) -> int:
     """Print the results as they become known; return 1 if there is an error."""
-    from morphgen.doctor.diagnosis import diagnose
+    from morphgen.doctor import diagnose
 
     start, last = time.monotonic(), ""
     results: list[tuple[str, Entry]] = []

@@ -1,49 +1,155 @@
-"""The self-test: compose a robot, check it, load it, step it, draw it, and compute a score.
-
-Drawing is not needed for anything else, so its failures are warnings.
-"""
+"""Files that morphgen reads, and the self-test: a robot is composed, checked, loaded and drawn."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import split_id
+from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.checks import check
 from morphgen.checks.conformance import ConformanceRow, conformance
-from morphgen.doctor import reference
-from morphgen.doctor.entry import Entry, attempt, failure
+from morphgen.doctor import Entry, attempt, failure
+from morphgen.errors import MorphgenError, PartError
 from morphgen.formats.bundle import MJCF, write_bundle
+from morphgen.formats.files import file_sha256
 from morphgen.formats.picture import gl_context, render
-from morphgen.grammar.library import Library, default_library
+from morphgen.formats.resolve import REQUIREMENTS, distribution_file
+from morphgen.grammar.catalogue import source_digest, stored_facts
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import LIBRARY_VARIABLE, Library, default_library, shipped_folders
+from morphgen.grammar.manifest import PART_KINDS, PackageSource
+from morphgen.grammar.request import parse_words
 from morphgen.model.robot import Robot
+from morphgen.rl.shipped_policies import POLICIES
+from morphgen.tasks.goals.goal_sets import FOLDER, packaged_index
 from morphgen.tasks.registry import SIMULATORS
 
+ROBOT = "ur5-plane"
+"""Robot of the self-test: a real arm with meshes, and a template."""
 CONFIGURATIONS = 5
 """Number of random configurations in which loaders are compared."""
 PICTURE_SIZE = (160, 120)
 """Width and height of the picture [px]."""
 STEP = 0.1
 """Distance of the target of the simulators' step from the home position [rad]."""
+ROS_VARIABLES = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+"""Environment variables with folders in which meshes of imported robots are searched first."""
 
 
-def entries() -> Iterator[Entry]:
-    """Test an installation with one robot; stop if it cannot be composed."""
+def files() -> Iterator[Entry]:
+    """Examine the files."""
+    yield attempt("library", _library)
+    for package in REQUIREMENTS:
+        yield attempt(f"robots of {package}", partial(_robot_package, package))
+    for variable in ROS_VARIABLES:
+        if os.environ.get(variable):
+            text = f"{os.environ[variable]}; imported URDFs find packages there first"
+            yield Entry(variable, "ok", text)
+    yield attempt("splits", _splits)
+    yield attempt("goal sets", _goal_sets)
+    yield attempt("policies", _policies)
+
+
+def _library() -> Entry:
+    """Count the parts, and name the folders of the user's own."""
     library = default_library()
     try:
-        robot = reference.reference_robot(library)
+        library.paths  # noqa: B018 - which reads the folders
+    except PartError as error:
+        variable = f"{LIBRARY_VARIABLE}={os.environ.get(LIBRARY_VARIABLE, '')}"
+        return Entry("library", "error", f"{error}; change {variable}")
+    counts = {kind: len(library.names(kind)) for kind in PART_KINDS}
+    listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    text = f"{sum(counts.values())} parts: {listed}"
+    for folder in library.folders[len(shipped_folders()) :]:
+        text += f"; {len(Library([folder]).paths)} of them in {folder} ({LIBRARY_VARIABLE})"
+    data = {"parts": counts, "folders": [str(folder) for folder in library.folders]}
+    return Entry("library", "ok", text, data)
+
+
+def _robot_package(package: str) -> Entry:
+    """Find the files of all parts from a data package, and compare them with the tested ones."""
+    name = f"robots of {package}"
+    parts = [
+        (manifest, manifest.source.file)
+        for manifest in Library(shipped_folders()).manifests()
+        if isinstance(manifest.source, PackageSource) and manifest.source.package == package
+    ]
+    errors = []
+    for _, file in parts:
+        try:
+            distribution_file(package, file)
+        except MorphgenError as error:
+            errors.append(str(error))
+    if errors:
+        text = f"{len(errors)} of {len(parts)} parts lack their file: {errors[0]}"
+        return Entry(name, "error", text, {"errors": errors})
+    stored, number = stored_facts(), version(package)
+    changed = [
+        manifest.name
+        for manifest, _ in parts
+        if stored.get(manifest.name, {}).get("digest") != source_digest(manifest)
+    ]
+    data = {"version": number, "parts": len(parts), "changed": changed}
+    if changed:
+        text = (
+            f"{len(changed)} of {len(parts)} parts are not those that this morphgen was tested "
+            f"with: {package} {number} is another version, or their YAML files were changed"
+        )
+        return Entry(name, "warning", text, data)
+    return Entry(name, "ok", f"{number}, with the files of {len(parts)} parts", data)
+
+
+def _splits() -> Entry:
+    """Read the shipped splits, whose files have the hashes of their robots."""
+    ids = {name: split_id(read_split(name)) for name in split_names()}
+    return Entry("splits", "ok", f"{len(ids)} with the ids of their robots", ids)
+
+
+def _goal_sets() -> Entry:
+    """Compare the shipped goal sets with their index."""
+    records = list(packaged_index().values())
+    damaged = [
+        record["file"]
+        for record in records
+        if not (path := FOLDER / record["file"]).is_file() or file_sha256(path) != record["sha256"]
+    ]
+    if damaged:
+        text = f"{len(damaged)} damaged: {', '.join(damaged[:3])}; install morphgen again"
+        return Entry("goal sets", "error", text, {"damaged": damaged})
+    return Entry("goal sets", "ok", f"{len(records)} with the hashes of their index")
+
+
+def _policies() -> Entry:
+    """Read the shipped policies, whose files have a hash of their content."""
+    from morphgen.rl.runs.checkpoint import read_checkpoint
+
+    for name in POLICIES.builtin:
+        read_checkpoint(POLICIES[name].file)
+    return Entry("policies", "ok", f"{', '.join(POLICIES.builtin)}: their files are whole")
+
+
+def self_test() -> Iterator[Entry]:
+    """Compose a robot, check it, load it, step it and draw it; stop if it cannot be composed.
+
+    Drawing is not needed for anything else, so its failures are warnings.
+    """
+    try:
+        library = default_library()
+        robot = compose(parse_words([ROBOT], library)[0], library, ROBOT)
     except Exception as error:  # whatever a broken package raises
         yield failure("compose", error)
         return
-    yield attempt("compose", partial(_compose, robot))
-    yield attempt("sample", partial(_sample, library))
-    yield attempt("tokens", partial(_tokens, robot, library))
-    yield attempt("files", partial(_files, robot))
+    yield Entry("compose", "ok", f"{ROBOT} has hash {robot_hash(robot)}")
     yield attempt("check", partial(_check, robot))
     with TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / robot.name, (), picture=False)
@@ -51,48 +157,10 @@ def entries() -> Iterator[Entry]:
         for simulator in SIMULATORS:
             name = f"simulator {simulator}"
             yield attempt(name, partial(_simulator, name, simulator, robot))
-        yield attempt("score", _score)
         picture = attempt("picture", partial(_picture, robot, bundle))
         yield picture if picture.status == "ok" else replace(picture, status="warning")
         film = attempt("film", partial(_film, Path(folder)))
         yield replace(film, status="warning") if film.status == "error" else film
-
-
-def _compose(robot: Robot) -> Entry:
-    return _compared("compose", robot.name, robot_hash(robot))
-
-
-def _sample(library: Library) -> Entry:
-    robot = reference.sampled_robot(library)
-    return _compared("sample", robot.name, robot_hash(robot))
-
-
-def _tokens(robot: Robot, library: Library) -> Entry:
-    present = reference.token_hash(robot, library)
-    return _compared("tokens", f"tokens of {robot.name}", present)
-
-
-def _compared(name: str, key: str, present: str) -> Entry:
-    """Compare a hash with the recorded one."""
-    expected = reference.recorded()["robots"][key]
-    data = {"hash": present, "recorded": expected}
-    if present != expected:
-        text = f"{key}: hash {present}, not {expected} as recorded; splits refuse such robots"
-        return Entry(name, "error", text, data)
-    return Entry(name, "ok", f"{key} has its recorded hash {present}", data)
-
-
-def _files(robot: Robot) -> Entry:
-    """Compare the bytes of a bundle's files."""
-    key = f"files of {robot.name}"
-    present, expected = reference.file_hashes(robot), reference.recorded()["robots"][key]
-    names = present.keys() | expected.keys()
-    changed = sorted(name for name in names if present.get(name) != expected.get(name))
-    if changed:
-        text = f"other bytes than recorded: {', '.join(changed)}; the last digits of numbers differ"
-        return Entry("files", "warning", text, {"changed": changed})
-    text = f"{len(present)} files of {robot.name} have their recorded bytes"
-    return Entry("files", "ok", text, {"files": len(present)})
 
 
 def _check(robot: Robot) -> Entry:
@@ -143,17 +211,6 @@ def _simulator(name: str, simulator: str, robot: Robot) -> Entry:
         text = f"a step towards {STEP} rad moved the joints of {robot.name} by {moved:.3g} rad"
         return Entry(name, "error", text, {"moved": moved})
     return Entry(name, "ok", f"one control step of {robot.name}", {"moved": moved})
-
-
-def _score() -> Entry:
-    """Evaluate a baseline, whose score depends on robots, goal set, constants and formulas."""
-    present, expected = reference.score(), reference.recorded()["score"]
-    data = {"score": present, "recorded": expected}
-    what = f"{reference.BASELINE} on {reference.SCORED}"
-    if not abs(present - expected) <= reference.SCORE_TOLERANCE:
-        text = f"{what}: {present:.2f}, not {expected:.2f} as recorded; scores do not compare"
-        return Entry("score", "error", text, data)
-    return Entry("score", "ok", f"{what}: {present:.2f}, as recorded", data)
 
 
 def _picture(robot: Robot, bundle: Path) -> Entry:

@@ -1,21 +1,25 @@
-"""The machine: Python, processors, GPU and the user's cache."""
+"""The machine and its packages: Python, processors, GPU, the user's cache, versions."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import sys
-from collections.abc import Iterator
-from importlib.metadata import version
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from packaging.requirements import Requirement
 from platformdirs import user_cache_path
 
 import morphgen
-from morphgen.doctor.entry import Entry, attempt
+from morphgen.doctor import Entry, attempt
+
+NOT_FOR_USERS = frozenset(("all", "bench", "dev", "docs", "test"))
+"""Extras that the diagnosis leaves out: a sum of others, and those for work on morphgen itself."""
 
 
-def entries() -> Iterator[Entry]:
+def machine() -> Iterator[Entry]:
     """Describe the machine."""
     yield attempt("morphgen", _morphgen)
     yield attempt("python", _python)
@@ -26,7 +30,7 @@ def entries() -> Iterator[Entry]:
 
 def _morphgen() -> Entry:
     folder = str(Path(morphgen.__file__).parent)
-    number = version("morphgen")
+    number = importlib.metadata.version("morphgen")
     return Entry("morphgen", "ok", f"{number} in {folder}", {"version": number, "folder": folder})
 
 
@@ -72,3 +76,58 @@ def _cache() -> Entry:
         return Entry("cache", "warning", text, data)
     listed = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
     return Entry("cache", "ok", f"{folder}: {listed or 'empty'}; delete it to clear it", data)
+
+
+def packages() -> Iterator[Entry]:
+    """Compare the installed packages with the ranges that morphgen declares."""
+    distribution = importlib.metadata.distribution("morphgen")
+    declared = [Requirement(line) for line in distribution.requires or ()]
+    yield from _group("core", _requirements("", declared))
+    for extra in distribution.metadata.get_all("Provides-Extra") or ():
+        if extra not in NOT_FOR_USERS:
+            yield from _group(f"extra {extra}", _requirements(extra, declared))
+
+
+def _requirements(extra: str, declared: Sequence[Requirement]) -> list[Requirement]:
+    """Return the requirements of an extra, and of the extras that it includes."""
+    chosen: dict[str, Requirement] = {}
+    for requirement in declared:
+        marker = requirement.marker
+        if (marker is None) == bool(extra) or (marker and not marker.evaluate({"extra": extra})):
+            continue
+        if requirement.name == "morphgen":
+            for included in sorted(requirement.extras):
+                chosen |= {each.name: each for each in _requirements(included, declared)}
+        else:
+            chosen[requirement.name] = requirement
+    return list(chosen.values())
+
+
+def _group(name: str, requirements: Sequence[Requirement]) -> Iterator[Entry]:
+    """Yield a result for the core or an extra, and one for each package outside its range."""
+    versions = {each.name: _version(each.name) for each in requirements}
+    missing = [package for package, number in versions.items() if number is None]
+    for requirement in requirements:
+        number = versions[requirement.name]
+        if number and not requirement.specifier.contains(number, prereleases=True):
+            text = f"{number} is outside of the range {requirement.specifier} that morphgen needs"
+            yield Entry(f"package {requirement.name}", "warning", text)
+    kind, _, extra = name.partition(" ")
+    if not requirements:
+        yield Entry(name, "absent", "not available for this version of Python")
+    elif missing and kind == "core":
+        text = f"not installed: {', '.join(missing)}; install morphgen again"
+        yield Entry(name, "error", text, versions)
+    elif missing:
+        text = f"not installed: {', '.join(missing)}; pip install 'morphgen[{extra}]'"
+        yield Entry(name, "absent", text, versions)
+    else:
+        text = ", ".join(f"{package} {number}" for package, number in sorted(versions.items()))
+        yield Entry(name, "ok", text, versions)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -4,20 +4,18 @@ import importlib.metadata
 import json
 import os
 import shutil
-import sys
 from types import SimpleNamespace
 
 import pytest
 from packaging.requirements import Requirement
 
+import morphgen
+from morphgen import doctor
 from morphgen.cli import main
-from morphgen.doctor import diagnosis, files, packages, reference, self_test, system
-from morphgen.doctor.diagnosis import SECTIONS, diagnose
-from morphgen.doctor.entry import Entry, attempt
+from morphgen.doctor import SECTIONS, Entry, attempt, diagnose, self_test, system
 from morphgen.errors import MissingDependencyError, PartError
 from morphgen.grammar import catalogue
-from morphgen.grammar.library import LIBRARY_VARIABLE, default_library
-from morphgen.tasks.goals import goal_sets as packaged_sets
+from morphgen.grammar.library import LIBRARY_VARIABLE
 from morphgen.tasks.registry import SIMULATORS
 
 
@@ -27,9 +25,8 @@ def by_name(entries):
 
 def only(entries, monkeypatch):
     """Make a section with these results the whole diagnosis."""
-    module = SimpleNamespace(entries=entries)
-    monkeypatch.setitem(sys.modules, "section_of_a_test", module)
-    monkeypatch.setattr(diagnosis, "SECTIONS", {"part": "section_of_a_test"})
+    monkeypatch.setattr(system, "machine", entries)
+    monkeypatch.setattr(doctor, "SECTIONS", {"part": SECTIONS["system"]})
 
 
 def broken():
@@ -38,7 +35,7 @@ def broken():
 
 @pytest.fixture
 def ur5_plane():
-    return reference.reference_robot(default_library())
+    return morphgen.compose("ur5-plane")
 
 
 def test_this_installation_is_sound(capsys):
@@ -47,7 +44,7 @@ def test_this_installation_is_sound(capsys):
     assert [line for line in lines if not line.startswith(" ")][:-1] == list(SECTIONS)
     names = {line.split(": ")[0].split(maxsplit=1)[1] for line in lines if line.startswith(" ")}
     assert {f"simulator {name}" for name in SIMULATORS} < names
-    assert {"core", "extra fit", "cache", "gpu", "loader pinocchio", "score", "film"} < names
+    assert {"core", "extra fit", "cache", "gpu", "loader pinocchio", "film"} < names
     assert lines[-1].startswith("sound: ")
 
 
@@ -71,7 +68,8 @@ def test_an_error_makes_the_exit_code_1(monkeypatch, capsys):
 
 
 def test_a_section_that_cannot_be_imported_is_an_error(monkeypatch):
-    monkeypatch.setattr(diagnosis, "SECTIONS", {"a": "no_such_module", "b": SECTIONS["packages"]})
+    broken = {"a": ("no_such_module", ""), "b": SECTIONS["packages"]}
+    monkeypatch.setattr(doctor, "SECTIONS", broken)
     (section, entry), *others = diagnose()
     assert (section, entry.status) == ("a", "error")
     assert entry.text == "the package no_such_module is not installed; install morphgen again"
@@ -113,7 +111,7 @@ DECLARED = declared(
 
 def test_an_extra_has_the_packages_of_the_extras_that_it_includes():
     names = {
-        extra: [each.name for each in packages.requirements_of(extra, DECLARED)]
+        extra: [each.name for each in system._requirements(extra, DECLARED)]
         for extra in ("", "fit", "rl", "pybullet")
     }
     assert names == {"": ["numpy"], "fit": ["torch"], "rl": ["gymnasium", "torch"], "pybullet": []}
@@ -121,97 +119,71 @@ def test_an_extra_has_the_packages_of_the_extras_that_it_includes():
 
 def test_packages_outside_their_ranges_and_missing_ones_are_named():
     missing = "no-such-distribution"
-    old, absent = packages.group_entries("extra rl", declared("pytest<1", missing))
+    old, absent = system._group("extra rl", declared("pytest<1", missing))
     assert (old.name, old.status) == ("package pytest", "warning")
     assert "is outside of the range <1" in old.text
     assert (absent.status, absent.data[missing]) == ("absent", None)
     assert absent.text == f"not installed: {missing}; pip install 'morphgen[rl]'"
-    (core,) = packages.group_entries("core", declared(missing))
+    (core,) = system._group("core", declared(missing))
     assert (core.status, core.text) == (
         "error",
         f"not installed: {missing}; install morphgen again",
     )
-    (other,) = packages.group_entries("extra pybullet", ())
+    (other,) = system._group("extra pybullet", ())
     assert (other.status, other.text) == ("absent", "not available for this version of Python")
 
 
 def test_every_extra_for_users_is_listed():
     extras = set(importlib.metadata.distribution("morphgen").metadata.get_all("Provides-Extra"))
-    names = by_name(packages.entries())
-    assert {f"extra {each}" for each in extras - packages.NOT_FOR_USERS} == names.keys() - {"core"}
+    names = by_name(system.packages())
+    assert {f"extra {each}" for each in extras - system.NOT_FOR_USERS} == names.keys() - {"core"}
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
     (tmp_path / "goals-5").mkdir()
     (tmp_path / "goals-5" / "a.npz").write_bytes(bytes(250_000))
     monkeypatch.setattr(system, "user_cache_path", lambda _: tmp_path)
-    cache = by_name(system.entries())["cache"]
+    cache = by_name(system.machine())["cache"]
     assert (cache.status, cache.data["bytes"]) == ("ok", {"goals-5": 250_000})
     assert cache.text == f"{tmp_path}: goals-5 0.2 MB; delete it to clear it"
     monkeypatch.setattr(os, "access", lambda *_: False)
-    cache = by_name(system.entries())["cache"]
+    cache = by_name(system.machine())["cache"]
     assert (cache.status, "cannot be written" in cache.text) == ("warning", True)
 
 
 def test_folders_of_the_user_are_named(tmp_path, monkeypatch):
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
     monkeypatch.setenv("ROS_PACKAGE_PATH", "/opt/ros")
-    entries = by_name(files.entries())
+    entries = by_name(self_test.files())
     assert f"0 of them in {tmp_path} ({LIBRARY_VARIABLE})" in entries["library"].text
     assert entries["ROS_PACKAGE_PATH"].text.startswith("/opt/ros; ")
     assert {entry.status for entry in entries.values()} == {"ok"}
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none"))
-    library = by_name(files.entries())["library"]
+    library = by_name(self_test.files())["library"]
     assert library.status == "error"
     assert f"does not exist; change {LIBRARY_VARIABLE}=" in library.text
 
 
 def test_data_packages_of_another_version_and_missing_files_are_found(monkeypatch):
     monkeypatch.setattr(catalogue, "_version", lambda package: "9.9")
-    entry = by_name(files.entries())["robots of rtb-data"]
+    entry = by_name(self_test.files())["robots of rtb-data"]
     assert (entry.status, len(entry.data["changed"])) == ("warning", entry.data["parts"])
 
     def missing(package, file):
         raise PartError(f"{package} has no file {file}")
 
-    monkeypatch.setattr(files, "distribution_file", missing)
-    entry = by_name(files.entries())["robots of rtb-data"]
+    monkeypatch.setattr(self_test, "distribution_file", missing)
+    entry = by_name(self_test.files())["robots of rtb-data"]
     assert (entry.status, "parts lack their file: rtb-data has no" in entry.text) == ("error", True)
 
 
-def test_damaged_goal_sets_and_other_hashes_are_errors(tmp_path, monkeypatch):
-    folder = shutil.copytree(packaged_sets.FOLDER, tmp_path / "sets")
-    for module in (files, reference):
-        monkeypatch.setattr(module, "FOLDER", folder)
+def test_damaged_goal_sets_are_an_error(tmp_path, monkeypatch):
+    folder = shutil.copytree(self_test.FOLDER, tmp_path / "sets")
+    monkeypatch.setattr(self_test, "FOLDER", folder)
     damaged = next(folder.glob("*.xz"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    sets = by_name(files.entries())["goal sets"]
+    sets = by_name(self_test.files())["goal sets"]
     assert (sets.status, sets.data["damaged"]) == ("error", [damaged.name])
-    recorded = {**reference.recorded(), "splits": {}, "goal_sets": "0", "checkpoints": {}}
-    monkeypatch.setattr(reference, "recorded", lambda: recorded)
-    monkeypatch.setattr(files, "FOLDER", packaged_sets.FOLDER)
-    entries = by_name(files.entries())
-    for name in ("splits", "goal sets", "policies"):
-        assert entries[name].status == "error"
-        assert entries[name].text.startswith("not the recorded: ")
-
-
-def test_another_robot_is_an_error_and_other_bytes_are_a_warning(ur5_plane, monkeypatch):
-    robots = {
-        "ur5-plane": "0" * 32,
-        "files of ur5-plane": {"robot.urdf": "0"},
-    }
-    monkeypatch.setattr(reference, "recorded", lambda: {"robots": robots, "score": 0.0})
-    monkeypatch.setattr(reference, "score", lambda: 171.49)
-    composed = self_test._compose(ur5_plane)
-    assert (composed.status, "splits refuse such robots" in composed.text) == ("error", True)
-    changed = self_test._files(ur5_plane)
-    assert (changed.status, "robot.urdf" in changed.data["changed"]) == ("warning", True)
-    score = self_test._score()
-    assert (score.status, score.text) == (
-        "error",
-        "jacobian on interpolation/arm3/reach: 171.49, not 0.00 as recorded; scores do not compare",
-    )
 
 
 def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
@@ -232,8 +204,7 @@ def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
 def test_without_drawing_there_are_warnings_only(monkeypatch):
     monkeypatch.setattr(self_test, "render", lambda *_, **__: broken())
     monkeypatch.setattr(self_test, "gl_context", lambda *_: broken())
-    monkeypatch.setattr(self_test, "_score", lambda: Entry("score", "ok", ""))
-    entries = by_name(self_test.entries())
+    entries = by_name(self_test.self_test())
     assert {name for name, entry in entries.items() if entry.status == "warning"} == {
         "picture",
         "film",
@@ -242,8 +213,8 @@ def test_without_drawing_there_are_warnings_only(monkeypatch):
 
 
 def test_without_its_robot_the_self_test_stops(monkeypatch):
-    monkeypatch.setattr(reference, "reference_robot", lambda library: broken())
-    (entry,) = self_test.entries()
+    monkeypatch.setattr(self_test, "compose", lambda *_: broken())
+    (entry,) = self_test.self_test()
     assert (entry.name, entry.status) == ("compose", "error")
 
 
