@@ -1,6 +1,6 @@
 """Speed of physics and training on a GPU, beside MuJoCo Warp alone in the same run.
 
-    python benchmarks/gpu_speed.py physics [--splits A B] [--envs 1024 4096] [--geometry light]
+    python benchmarks/gpu_speed.py physics [--splits A B] [--envs 1024 4096] [--geometry convex]
     python benchmarks/gpu_speed.py training [--agents me-tf] [--epochs 2] [--envs 16384]
     python benchmarks/gpu_speed.py robots [--grammar serial] [--numbers 10 300] [--envs 16384]
     python benchmarks/gpu_speed.py copies [--split SPLIT] [--envs 1024]

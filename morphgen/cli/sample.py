@@ -192,7 +192,7 @@ def sample(args: argparse.Namespace) -> None:
 
 @command(
     "derive",
-    "print, replay or compare the derivation of a robot",
+    "print or replay the derivation of a robot",
     option(
         "words",
         nargs="+",
@@ -203,30 +203,21 @@ def sample(args: argparse.Namespace) -> None:
         "--replay",
         "build the URDF of a folder anew; the exit code is 1 unless every byte is the same",
     ),
-    option(
-        "--diff",
-        metavar="OTHER",
-        help="compare with another robot's; the exit code is 1 if they differ",
-    ),
     *opt.LIBRARY_JSON,
     details="The derivation lists the parts of a robot, its grammar's choices and all parameters.",
-    examples=("derive robots/chain/chain-000001 --replay", "derive ur5-plane --diff ur10-plane"),
+    examples=("derive robots/chain/chain-000001 --replay",),
 )
 def derive(args: argparse.Namespace) -> int:
-    """Print, replay or compare a derivation."""
+    """Print or replay a derivation."""
     from morphgen.formats.bundle import URDF
-    from morphgen.grammar.derivation import difference, outline
-    from morphgen.grammar.robot_source import find_robot, find_robots
+    from morphgen.grammar.derivation import outline
+    from morphgen.grammar.robot_source import find_robots
 
     library = opt.library_of(args)
     source, *others = find_robots(args.words, library)
     if others:
         raise FormatError(f"{source.label} and {others[0].label}: expected one robot")
     derivation = _derivation(source, library)
-    if args.diff is not None:
-        lines = difference(derivation, _derivation(find_robot(args.diff), library))
-        opt.print_result(args, lines, lambda: "\n".join(lines) or "the same")
-        return int(bool(lines))
     if not args.replay:
         opt.print_result(args, str(derivation), lambda: outline(derivation))
         return 0

@@ -299,9 +299,8 @@ TRAINING_OPTIONS = (
         "--geometry",
         choices=COLLISION_GEOMETRIES,
         default=COLLISION_GEOMETRIES[0],
-        help="collision shapes of the robots in training: all primitives, one for each link, "
-        "which is faster (light), or convex pieces of the meshes (convex); evaluations have all "
-        "primitives (default: primitive)",
+        help="collision shapes of the robots in training: primitives, or convex pieces of the "
+        "meshes; evaluations have primitives (default: primitive)",
     ),
     *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
 )

@@ -19,8 +19,6 @@ from morphgen.benchmark.tokens import default_max_links
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.convex_pieces import as_convex
-from morphgen.fitting.replace_collision import with_primitives
-from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
@@ -73,15 +71,8 @@ def with_geometry(
     robots: dict[int, Robot] = {}
     for scene in scenes:
         if id(scene.robot) not in robots:
-            change = _light if geometry == "light" else _convex
-            robots[id(scene.robot)] = change(scene.robot, folders)
+            robots[id(scene.robot)] = _convex(scene.robot, folders)
     return [replace(scene, robot=robots[id(scene.robot)]) for scene in scenes]
-
-
-def _light(robot: Robot, folders: Sequence[Path]) -> Robot:
-    """Return the robot with the primitive of each link's token."""
-    shapes = token_shapes(robot, folders)
-    return with_primitives(robot, {name: (shape,) for name, shape in shapes.items()})
 
 
 def _convex(robot: Robot, folders: Sequence[Path]) -> Robot:
@@ -93,7 +84,7 @@ def _convex(robot: Robot, folders: Sequence[Path]) -> Robot:
     if composed is None or as_written(composed).joints != robot.joints:
         raise TaskError(
             f"robot {robot.name!r}: collision geometry 'convex' needs its meshes, which only a "
-            "robot that morphgen composes finds again; expected 'primitive' or 'light'"
+            "robot that morphgen composes finds again; expected 'primitive'"
         )
     return as_written(as_convex(composed, folders))
 
@@ -238,8 +229,8 @@ def batch_from_specs(
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
 
-    geometry: Collision shapes of the simulated robots: all (``primitive``), one for each link
-        (``light``), or convex pieces of the meshes (``convex``). Observations and goals do not
+    geometry: Collision shapes of the simulated robots: all primitives (``primitive``), or
+        convex pieces of the meshes (``convex``). Observations and goals do not
         depend on it.
     """
     if observe is not None and not isinstance(observe, ObservationConfig):

@@ -20,10 +20,9 @@ SUBSTEPS = 4
 """Number of physics steps per control step."""
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
-CollisionGeometry = Literal["primitive", "light", "convex"]
-"""Collision shapes of simulated robots. ``primitive``: all primitives. ``light``: for each link the
-one that its token describes, which overlaps them most; fewer shapes take less time. ``convex``:
-convex pieces of the meshes, which are closest to them and take more time."""
+CollisionGeometry = Literal["primitive", "convex"]
+"""Collision shapes of simulated robots. ``primitive``: all primitives. ``convex``: convex pieces of
+the meshes, which are closer to them and take more time."""
 COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 
 HOST_DEVICES = ("cpu",)

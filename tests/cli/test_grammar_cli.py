@@ -263,11 +263,8 @@ def test_derive_prints_one_line_per_part(run, cubes):
     assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
 
 
-def test_derive_takes_words(run, cubes):
-    code, out, _ = run("derive", "arm=ur5", "ee=plane", "--diff", "ur10-plane")
-    assert (code, out) == (1, "- arm = ur5 on base:top\n+ arm = ur10 on base:top\n")
-    assert run("derive", "ur5-plane", "--diff", "arm=ur5 ee=plane")[:2] == (0, "the same\n")
-    assert run("derive", "cubes", "--diff", cubes / "cubes-000001")[0] == 1
+def test_derive_takes_words(run):
+    assert run("derive", "arm=ur5", "ee=plane")[:2] == run("derive", "ur5-plane")[:2]
 
 
 @pytest.mark.parametrize("geometry", ["primitive", "sphere"])
@@ -293,15 +290,6 @@ def test_derive_reproduces_the_same_bytes(run, light, category):
     assert run("derive", folder, "--replay") == (1, f"{folder}/robot.urdf: other bytes\n", "")
     code, out, _ = run("derive", folder, "--replay", "--json")
     assert (code, json.loads(out)) == (1, {"same": False})
-
-
-def test_derive_reports_differences(run, cubes):
-    a, b = cubes / "cubes-000000", cubes / "cubes-000001"
-    assert run("derive", a, "--diff", a) == (0, "the same\n", "")
-    code, out, _ = run("derive", a, "--diff", b)
-    assert code == 1
-    assert [line[:15] for line in out.splitlines()] == ["- cubes.size = ", "+ cubes.size = "]
-    assert json.loads(run("derive", a, "--diff", b, "--json")[1]) == out.splitlines()
 
 
 def test_mutate_writes_neighbours_and_prints_their_changes(run, cubes):
