@@ -6,9 +6,9 @@ import argparse
 import math
 import shutil
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
@@ -31,6 +31,25 @@ class Option:
     """Flags such as ``--seed``, or the name of a positional argument."""
     settings: Mapping[str, Any]
     """Keyword arguments of ``ArgumentParser.add_argument``."""
+    needs: str = ""
+    """Flag without which the option has no effect, and is refused."""
+    excludes: tuple[str, ...] = ()
+    """Flags with which the option has no effect, and is refused."""
+
+    def needing(self, flag: str) -> Option:
+        """Return the option for a command where it has an effect with another one only."""
+        return replace(self, needs=flag)
+
+    def without(self, *flags: str) -> Option:
+        """Return the option for a command where it has no effect with others."""
+        return replace(self, excludes=flags)
+
+    def fault(self, given: Collection[str]) -> str:
+        """Return why the option has no effect beside the flags that are given, if so."""
+        idle = next((flag for flag in self.excludes if flag in given), "")
+        if idle:
+            return f"only without {idle}"
+        return f"only with {self.needs}" if self.needs and self.needs not in given else ""
 
 
 def option(*names: str, help: str = "", **settings: object) -> Option:
@@ -135,7 +154,20 @@ class Command:
             group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
             for argument in alternatives:
                 group.add_argument(*argument.names, **argument.settings)
-        parser.set_defaults(run=self.run, parser=parser, extra=self.extra, **self.defaults)
+        parser.set_defaults(run=self._start, parser=parser, extra=self.extra, **self.defaults)
+
+    def _start(self, args: argparse.Namespace) -> int | None:
+        """Refuse options that have no effect, then run the command."""
+        groups = (each if isinstance(each, tuple) else (each,) for each in self.options)
+        options = [each for group in groups for each in group if each.names[0].startswith("-")]
+        given = {each.names[0]: each for each in options if _is_given(each, args)}
+        faults = {name: fault for name, each in given.items() if (fault := each.fault(given))}
+        if faults:
+            reason = next(iter(faults.values()))
+            names = " ".join(name for name, other in faults.items() if other == reason)
+            raise MorphgenError(f"{names}: {reason}")
+        assert self.run is not None
+        return self.run(args)
 
     def _texts(self) -> dict[str, Any]:
         width = max(shutil.get_terminal_size().columns - 2, _MIN_HELP_WIDTH)
@@ -146,6 +178,13 @@ class Command:
             "epilog": "\n".join(["examples:", *lines]) if lines else None,
             "formatter_class": argparse.RawDescriptionHelpFormatter,
         }
+
+
+def _is_given(option: Option, args: argparse.Namespace) -> bool:
+    """Return whether an option has another value than its default."""
+    name = option.settings.get("dest") or option.names[0].lstrip("-").replace("-", "_")
+    is_flag = option.settings.get("action") == "store_true"
+    return bool(getattr(args, name) != option.settings.get("default", False if is_flag else None))
 
 
 def command(

@@ -15,7 +15,6 @@ from morphgen.cli.progress import training_progress
 from morphgen.cli.train import (
     GOAL_SEED,
     SIDES,
-    require_split_for_options,
     robots_to_train,
     split_option,
 )
@@ -115,7 +114,7 @@ def plan_submission(
     ),
     split_option("robots of a baseline, or other robots than the checkpoint's"),
     option("--on", choices=SIDES, help="side of the split (default: both)"),
-    opt.OBSTACLES,
+    opt.OBSTACLES.needing("--split"),
     option(
         "--mode",
         choices=["deterministic", "stochastic"],
@@ -142,8 +141,11 @@ def plan_submission(
         "write the outcome of every episode, for morphgen split score; the default mode is then "
         "deterministic, and the default simulator that of the release, else mujoco",
     ),
-    option("--method", metavar="NAME", help="with --submission: name of the method in rankings"),
-    *opt.LIBRARY_JSON,
+    option(
+        "--method", metavar="NAME", help="with --submission: name of the method in rankings"
+    ).needing("--submission"),
+    opt.LIBRARY.needing("--split"),
+    opt.JSON,
     details="Scores have 95% bootstrap intervals over episodes, success rates 95% Wilson "
     "intervals. The score of reach is relative to the random policy; that of push is the success "
     "rate.",
@@ -167,8 +169,6 @@ def evaluate(args: argparse.Namespace) -> None:
 
     if args.out is not None:
         require_table(args.out)
-    if args.submission is None:
-        opt.reject_idle({"--method": args.method is not None}, "only with --submission")
     is_baseline = args.checkpoint in BASELINES
     if args.submission is not None and not is_baseline:
         args.mode = args.mode or "deterministic"
@@ -238,7 +238,6 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.scores.submission import Training
     from morphgen.tasks.device import require_device
 
-    require_split_for_options(args)
     require_device(args.device)
     path = checkpoint_path(args.checkpoint)
     files = list(checkpoint_files(path))

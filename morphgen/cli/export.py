@@ -284,7 +284,7 @@ _DEFAULT = "html"
         type=float,
         metavar="SHARE",
         help="with --spheres: share of each link's volume that they must cover, such as 0.995",
-    ),
+    ).needing("--spheres"),
     opt.ROOT,
     *opt.LIBRARY_JSON,
     details="In a bundle a file is robot.html, robot.glb and so on, elsewhere it has the name of "
@@ -339,8 +339,6 @@ def _settings(args: argparse.Namespace) -> ExportSettings:
                 f"--{name} has no effect on --format {args.format}; expected --format "
                 + formats_with(name)
             )
-    if args.spheres is None:
-        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
     return ExportSettings(**values, folders=tuple(opt.library_of(args).folders))
 
 

@@ -58,47 +58,54 @@ class Target:
     "fit primitives to meshes, and measure how good they are",
     option("words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {opt.ROBOTS_HELP}"),
     flag("--all", "fit every part with meshes, and store the fits in the library"),
-    flag("--missing", "with --all: only the parts without stored fits"),
+    flag("--missing", "with --all: only the parts without stored fits").needing("--all"),
     option(
         "--max-primitives",
         type=int,
         metavar="K",
         help="largest number of primitives per link (default: 1)",
-    ),
+    ).without("--all", "--spheres"),
     option(
         "--iou",
         type=float,
         help="with --max-primitives: use the fewest primitives that reach this intersection over "
         f"union (default: {DEFAULT_IOU})",
-    ),
+    )
+    .needing("--max-primitives")
+    .without("--all", "--spheres"),
     option(
         "--spheres",
         type=whole_number(1),
         metavar="N",
         help="fit N spheres to each link, and no other primitives, for planners",
-    ),
+    ).without("--all"),
     option(
         "--cover",
         type=float,
         metavar="SHARE",
         help="with --spheres: share of each link's volume that they must cover, such as 0.995 "
         "(default: the largest intersection over union)",
+    ).needing("--spheres"),
+    flag("--enclose", "enclose every point of the link, for conservative collision checks").without(
+        "--all", "--spheres"
     ),
-    flag("--enclose", "enclose every point of the link, for conservative collision checks"),
-    flag("--visual", "replace the visual shapes, too"),
+    flag("--visual", "replace the visual shapes, too").needing("--out").without("--all"),
     path_option(
         "--out", "DIR", "write the robot's bundle to DIR; several robots: a bundle each in DIR"
-    ),
-    opt.NO_PICTURE,
+    ).without("--all"),
+    opt.NO_PICTURE.needing("--out").without("--all"),
     number(
         "--configurations",
         "with --out: number of random configurations in which collisions are compared with "
         f"those of the meshes (default: {DEFAULT_CONFIGURATIONS})",
-    ),
+    )
+    .needing("--out")
+    .without("--all"),
     opt.JOBS,
-    opt.SEED,
-    *opt.ROOT_LIBRARY_JSON,
-    details="With --out, the robot is written with the primitives as its collision shapes.",
+    *(each.without("--all") for each in (opt.SEED, opt.ROOT, opt.JSON)),
+    opt.LIBRARY,
+    details="With --out, the robot is written with the primitives as its collision shapes. --all "
+    "stores one primitive and up to four for every part, always the same ones.",
     examples=(
         "fit panda",
         "fit robots/ur5-plane --max-primitives 4 --out robots/ur5-plane-prims",
@@ -114,7 +121,6 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
-    _reject_idle_options(args)
     options = FitOptions(
         1 if args.max_primitives is None else args.max_primitives,
         DEFAULT_IOU if args.iou is None else args.iou,
@@ -126,14 +132,6 @@ def fit(args: argparse.Namespace) -> None:
     if args.all:
         _fit_all_parts(args)
         return
-    opt.reject_idle({"--missing": args.missing}, "only with --all")
-    if not args.out:
-        with_out = {
-            "--visual": args.visual,
-            "--no-picture": args.no_picture,
-            "--configurations": args.configurations is not None,
-        }
-        opt.reject_idle(with_out, "only with --out")
     if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
         _fit_mesh(args, options)
         return
@@ -160,18 +158,6 @@ def _require_own_names(targets: Sequence[Target]) -> None:
                 f"{target.label} and {other} are both named {target.robot.name!r}; fit them one "
                 "at a time, into folders of their own"
             )
-
-
-def _reject_idle_options(args: argparse.Namespace) -> None:
-    """Refuse options that have no effect on the kind of fit."""
-    iou = {"--iou": args.iou is not None}
-    if args.spheres is None:
-        opt.reject_idle({"--cover": args.cover is not None}, "only with --spheres")
-    else:
-        primitives = {"--max-primitives": args.max_primitives is not None, **iou}
-        opt.reject_idle({**primitives, "--enclose": args.enclose}, "only without --spheres")
-    if args.max_primitives is None and not args.all:
-        opt.reject_idle(iou, "only with --max-primitives")
 
 
 def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:
@@ -206,7 +192,8 @@ def _targets(args: argparse.Namespace) -> list[Target]:
     library = opt.library_of(args)
     word = args.words[0]
     if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
-        opt.reject_idle({f"--root {args.root}": args.root}, "only with a bundle or a description")
+        if args.root is not None:
+            raise MorphgenError(f"--root {args.root}: only with a bundle or a description")
         return [Target(word, load_part(library.manifest(word)).fragment, None, is_part=True)]
     return [
         Target(source.label, robot, source.path, is_part=False)
@@ -262,24 +249,6 @@ def _fit_robot(
 def _fit_all_parts(args: argparse.Namespace) -> None:
     from morphgen.fitting.robot_fit import parts_with_meshes, store_parts
 
-    options_without_effect = {
-        "--out": args.out,
-        "--root": args.root,
-        "--enclose": args.enclose,
-        "--visual": args.visual,
-        "--no-picture": args.no_picture,
-        "--max-primitives": args.max_primitives is not None,
-        "--iou": args.iou is not None,
-        "--spheres": args.spheres is not None,
-        "--configurations": args.configurations is not None,
-        "--seed": args.seed,
-        "--json": args.json,
-    }
-    if idle := [name for name, is_given in options_without_effect.items() if is_given]:
-        raise MorphgenError(
-            "--all stores one primitive and up to four for every part, always the same ones: it "
-            f"takes no {' or '.join(idle)}"
-        )
     parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
     for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
         print_line(str(path))

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
@@ -223,9 +223,3 @@ def require_other_name(words: dict[str, str], split: str, word: str) -> None:
             f"{word}: split {split!r} is also in {words[split]}; expected splits of different names"
         )
     words[split] = word
-
-
-def reject_idle(options: dict[str, Any], reason: str) -> None:
-    """Raise if options are given that have no effect."""
-    if idle := [name for name, is_given in options.items() if is_given]:
-        raise MorphgenError(f"{' '.join(idle)}: {reason}")

@@ -256,10 +256,12 @@ _PARTS = Path("parts")
     option(
         "--part", choices=KINDS_OF_PARTS, help="also write a manifest: the robot becomes a part"
     ),
-    path_option("--parts", "DIR", f"with --part: folder of the manifests (default: {_PARTS})"),
+    path_option(
+        "--parts", "DIR", f"with --part: folder of the manifests (default: {_PARTS})"
+    ).needing("--part"),
     option(
         "--licence", metavar="TEXT", help="with --part: licence, if the robot's source has none"
-    ),
+    ).needing("--part"),
     opt.ROOT,
     *opt.BUNDLE_OUT,
     opt.JSON,
@@ -281,9 +283,6 @@ def import_robots(args: argparse.Namespace) -> int:
     from morphgen.formats.bundle import bundle_folder
     from morphgen.formats.description import find_description
 
-    if args.part is None:
-        given = {"--parts": args.parts is not None, "--licence": args.licence is not None}
-        opt.reject_idle(given, "only with --part")
     sources = list(dict.fromkeys(args.files))
     if len(sources) > 1:
         if args.name is not None:

@@ -304,7 +304,7 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
     flag("--light", "write the URDF and the derivation only"),
     flag("--picture", "draw preview.png of every robot"),
     flag("--goals", "ship the goal set of every robot"),
-    _goal_seed("with --goals: seed of the goal sets (default: 0)"),
+    _goal_seed("with --goals: seed of the goal sets (default: 0)").needing("--goals"),
     *opt.JOBS_LIBRARY_JSON,
     details="The same split gives the same bytes, with any number of jobs. Run the command again "
     "to continue an interrupted one.",
@@ -319,8 +319,6 @@ def build(args: argparse.Namespace) -> None:
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
     settings = BuildSettings(light=args.light, picture=args.picture)
-    if not args.goals:
-        opt.reject_idle({"--goal-seed": args.goal_seed is not None}, "only with --goals")
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     goals = make_goals(args, split, config) if args.goals else []
     with bar(args, "building"):

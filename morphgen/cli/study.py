@@ -59,7 +59,7 @@ PAPER = "paper"
         type=float,
         metavar="N",
         help="with --ray: GPUs per cell (default: 1 with --device cuda, else 0)",
-    ),
+    ).needing("--ray"),
     *TRAINING_OPTIONS,
     opt.LIBRARY,
     details="A cell is an agent with a seed on a split, or a baseline on a split. The command "
@@ -99,8 +99,6 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
     from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 
-    if args.gpus is not None and args.ray is None:
-        raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
     sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
-from morphgen.cli.options import reject_idle
 from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS, preset_of
@@ -103,7 +102,7 @@ SPLIT_HELP = (
 SIDES = ["train", "test"]
 GOAL_SEED = number(
     "--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0
-)
+).needing("--split")
 
 DRAWN_OPTIONS = (
     option(
@@ -112,17 +111,19 @@ DRAWN_OPTIONS = (
         help="train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
         "processes as --workers; the test robots of the splits of morphgen are never drawn",
     ),
-    number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0),
+    number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0).needing(
+        "--robots"
+    ),
     repeated(
         "--held-out",
         "with --robots: a further split whose test robots are never drawn",
         metavar="SPLIT",
-    ),
+    ).needing("--robots"),
     number(
         "--slice-updates",
         "with more --robots than --envs: number of updates after which the next robots take the "
         "environments (default: those of two episodes)",
-    ),
+    ).needing("--robots"),
 )
 """Options of robots that are drawn from grammars."""
 
@@ -137,13 +138,6 @@ def split_option(purpose: str) -> Option:
         default=[],
         help=f"{purpose}: {SPLIT_HELP}",
     )
-
-
-def require_split_for_options(args: argparse.Namespace) -> None:
-    """Require ``--split`` with options that describe other robots than the checkpoint's."""
-    for name in ("obstacles", "library", "goal_seed"):
-        if not args.words and getattr(args, name) not in (None, False, []):
-            raise TaskError(f"--{name.replace('_', '-')} goes with --split")
 
 
 def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
@@ -228,17 +222,6 @@ def draw_robots(
     held_out = (read_split(name).max_links for name in source.held_out)
     max_links = args.max_links or default_max_links([robots.most_links, *held_out])
     return replace(source, drawn_hash=robots.hash), max_links
-
-
-def require_robots_for_options(args: argparse.Namespace) -> None:
-    """Require ``--robots`` with the other options of drawn robots."""
-    if args.robots is None:
-        given = {
-            "--robot-seed": args.robot_seed is not None,
-            "--held-out": bool(args.held_out),
-            "--slice-updates": args.slice_updates is not None,
-        }
-        reject_idle(given, "only with --robots")
 
 
 NETWORK_SWITCHES = {
@@ -343,7 +326,6 @@ def train(args: argparse.Namespace) -> None:
         from morphgen.rl.runs.robot_source import other_side
         from morphgen.tasks.device import batch_device, require_simulator_device
 
-    require_robots_for_options(args)
     sim = args.sim or DEFAULT_SIMULATOR
     require_simulator_device(sim, batch_device(sim, args.device))
     with status(args, "reading the robots"):
@@ -533,7 +515,7 @@ def _folder_name(source: RobotSource) -> str:
     option("checkpoint", help=f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
     split_option("other robots than those of the checkpoint's split"),
     option("--on", choices=SIDES, default="test", help="side of the split"),
-    opt.OBSTACLES,
+    opt.OBSTACLES.needing("--split"),
     opt.SEED,
     opt.sim_option("that of the training"),
     GOAL_SEED,
@@ -554,7 +536,7 @@ def _folder_name(source: RobotSource) -> str:
     ),
     # 64 is NUM_ENVS of morphgen.rl.runs.training, whose import takes seconds.
     *learning_options(100_000, 64),
-    opt.LIBRARY,
+    opt.LIBRARY.needing("--split"),
     details="The run begins with the networks of the checkpoint, and with a new optimiser and "
     "schedule. The agent and most hyperparameters are the checkpoint's. The learning rate follows "
     "the change of the policy, so that little of what it can do is lost.",
@@ -565,7 +547,6 @@ def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""
     from morphgen.rl.runs.training import checkpoint_files
 
-    require_split_for_options(args)
     files = list(checkpoint_files(checkpoint_path(args.checkpoint)))
     if len(files) > 1:
         raise TaskError(
