@@ -10,13 +10,12 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.faulty_robots import valid_robot, with_joint
-from helpers.parts import PINCER, write_part
+from helpers.parts import PINCER
 from helpers.robots import arm
 from morphgen.cli import main
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar import catalogue
-from morphgen.grammar.library import LIBRARY_VARIABLE
 
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 
@@ -260,16 +259,6 @@ def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
     assert "lacks joints elbow" in out
 
 
-@pytest.mark.slow
-def test_conform_prints_json_and_nothing_else(tmp_path):
-    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
-    process = start("conform", folder, "--samples", "3", "--json")
-    out, err = process.communicate()
-    assert (process.returncode, err) == (0, "")
-    (report,) = json.loads(out)
-    assert (report["robot"], report["passed"], len(report["rows"])) == ("arm", True, 6)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(capsys, command):
     with pytest.raises(SystemExit) as stop:
@@ -294,19 +283,6 @@ def test_without_a_command_usage_is_printed_and_exit_code_is_2(run):
 
 def test_version(run):
     assert run("--version") == (0, f"morphgen {version('morphgen')}\n", "")
-
-
-def test_user_library_is_used(run, tmp_path, monkeypatch):
-    write_part(tmp_path / "own")
-    words = ("compose", "base=gantry", "ee=pincer", "ee.length=30cm", "--no-picture", "--out", "o")
-    assert run(*words, "--library", "own", "--name", "a")[0] == 0
-    monkeypatch.setenv(LIBRARY_VARIABLE, "own")
-    assert run(*words, "--name", "b")[0] == 0
-    assert run(*words, "--library", tmp_path / "own", "--name", "c")[0] == 0
-    a, b, c = ((tmp_path / "o" / name / "robot.urdf").read_text() for name in "abc")
-    assert a == b.replace('name="b"', 'name="a"') == c.replace('name="c"', 'name="a"')
-    tool = read_bundle(tmp_path / "o" / "a").frame("tool")
-    assert tool.T_link_frame.position == pytest.approx((0, 0, 0.35))
 
 
 @pytest.mark.slow

@@ -125,11 +125,3 @@ def test_mesh_fit_does_not_accept_out(refused, box):
     message = refused("fit", box, "--out", "made")
     assert "link.stl is a mesh" in message
     assert "--out" in message
-
-
-def test_errors_are_printed_as_json_with_the_json_option(run, tmp_path):
-    (tmp_path / "flat.obj").write_bytes(MESHES["flat.obj"])
-    code, out, err = run("fit", "flat.obj", "--json")
-    assert code == 2
-    assert "flat" in json.loads(out)["message"]
-    assert err == f"morphgen: {json.loads(out)['message']}\n"

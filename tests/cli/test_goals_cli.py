@@ -42,7 +42,7 @@ def test_table_has_one_row_per_goal_set(run, path, cache):
     code, out, err = run("goals", path)
     assert (code, err) == (0, "")
     head, _, *rows, last = out.splitlines()
-    assert [cell.strip() for cell in cells(head)] == [
+    assert head.split() == [
         "robot",
         "side",
         "task",
@@ -170,8 +170,6 @@ def files(folder):
         ("extrapolation/arms/raech", "no split of this name; did you mean"),
         ("arm=ur5 ee=plane", "arm=ur5 ee=plane: name one split, or say --task for a robot"),
         ("arm=ur5", "arm=ur5: no such file, and no split of this name"),
-        ("some.yaml --seed -1", "argument --seed: -1: expected a whole number, 0 or more"),
-        ("some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("some.yaml --obstacles", "--obstacles goes with --task"),
         (
             "interpolation/arm3/reach --task reach",

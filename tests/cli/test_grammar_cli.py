@@ -102,13 +102,6 @@ def test_sample_does_not_depend_on_the_number_of_jobs(run, cubes):
     assert tree(cubes) == tree(Path("two"))
 
 
-def test_all_where_conditions_hold(run):
-    words = ("--where", "mass > 0.1", "--where", "mass < 0.9")
-    assert run("sample", "cubes", "-n", 5, "--light", *words)[0] == 0
-    masses = [record["mass"] for record in records("robots/cubes")]
-    assert all(0.1 < mass < 0.9 for mass in masses)
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -217,12 +210,6 @@ def test_huge_number_of_structures_is_counted_quickly(run, mine):
     assert run("grammar", "count", mine)[1].splitlines() == [line]
     data = json.loads(run("grammar", "count", mine, "--json")[1])
     assert (data["structures"], data["finite"]) == (None, True)
-
-
-def test_negative_limit_is_rejected(run, mine):
-    code, _, err = run("grammar", "enumerate", mine, "--limit", -1)
-    assert code == 2
-    assert err.startswith("morphgen: argument --limit: -1: expected a whole number, 0 or more;")
 
 
 def test_grammar_count_of_a_recursion(run, mine):
