@@ -27,8 +27,6 @@ from morphgen.grammar.robot_source import (
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 
-__all__ = ["check", "check_source", "conform", "conform_source", "fix"]
-
 
 @checked_signature
 def check(
@@ -78,16 +76,10 @@ def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple
 def check_source(
     source: RobotSource, library: Library, root: Path | None = None, *, tool_required: bool = True
 ) -> tuple[Finding, ...]:
-    """Find faults of a robot and, if it is a bundle, of its files.
+    """Find faults of a robot, also those of an unsound file, and of a bundle's files.
 
-    Args:
-        source: The robot, as ``find_robots`` returns it.
-        library: Library of the parts.
-        root: A folder that meshes, includes and YAML may come from, besides the description's own.
-        tool_required: Whether a missing tool is a finding; never for a file without a card.
-
-    Raises:
-        MorphgenError: As ``read_source``, but the faults of an unsound file are findings.
+    root: A folder that meshes, includes and YAML may come from, besides the description's own.
+    tool_required: Whether a missing tool is a finding; never for a file without a card.
     """
     try:
         robot = read_source(source, library, root)
@@ -158,18 +150,7 @@ def conform_source(
     samples: int = 100,
     seed: int = 0,
 ) -> ConformanceReport:
-    """Compare loaders and simulators on a file, and on its bundle; see ``conform``.
-
-    Args:
-        source: The robot, as ``find_robots`` returns it.
-        library: Library of the parts.
-        root: A folder that meshes, includes and YAML may come from, besides the description's own.
-        samples: Number of random configurations within the joint limits.
-        seed: Seed of the configurations.
-
-    Raises:
-        MorphgenError: As ``read_source``.
-    """
+    """Compare loaders and simulators on a file, and on its bundle; see ``conform``."""
     if source.path is not None and (source.path / CARD).is_file():
         return _conform_bundle(source.path, samples, seed)
     report = _conform_robot(read_source(source, library, root), samples, seed)

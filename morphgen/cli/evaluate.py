@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
@@ -26,36 +26,13 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
-    from morphgen.rl.evaluation import EvalConfig
+    from morphgen.rl.evaluation import EvalConfig, Record
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import RobotSource
     from morphgen.rl.scores.scores import Score
-    from morphgen.rl.scores.submission import SubmissionRecorder, Training
+    from morphgen.rl.scores.submission import Training
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
     from morphgen.tasks.task import TaskConfig
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedSubmission:
-    """A submission whose episodes are still to be run."""
-
-    path: Path
-    method: str
-    mode: str
-    training_seed: int | None
-    evaluation: dict[str, Any]
-    training: Training | None
-    record: SubmissionRecorder
-    """Callback for the episodes of every robot."""
-
-    def write(self) -> None:
-        """Write the submission of the recorded episodes."""
-        from morphgen.rl.scores.submission import write_submission
-
-        submission = self.record.submission(
-            self.method, self.mode, self.training_seed, self.evaluation, self.training
-        )
-        write_submission(self.path, submission)
 
 
 def rules_of(words: Sequence[str]) -> EvalProtocol:
@@ -78,15 +55,19 @@ def plan_submission(
     mode: str = "",
     training_seed: int | None = None,
     training: Training | None = None,
-) -> PlannedSubmission | None:
-    """Return the submission that the arguments ask for, or None."""
+) -> tuple[Record, Callable[[], None]]:
+    """Return the callback for the episodes of robots, and the function that writes them at the end.
+
+    Without ``--submission`` both do nothing.
+    """
     from morphgen.formats.files import require_writable_file
+    from morphgen.rl.evaluation import no_record
     from morphgen.rl.runs.robot_source import split_of
-    from morphgen.rl.scores.submission import SubmissionRecorder, require_rules
+    from morphgen.rl.scores.submission import SubmissionRecorder, require_rules, write_submission
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
     if args.submission is None:
-        return None
+        return no_record, lambda: None
     if not source.split:
         raise TaskError(f"--submission: {source.name} is no split; name one with --split")
     if args.on == "train":
@@ -99,9 +80,14 @@ def plan_submission(
     require_rules(followed, rules.as_data(split), "--submission")
     name = method if args.method is None else args.method
     record = SubmissionRecorder(split)
+
+    def write() -> None:
+        submission = record.submission(name, mode, training_seed, followed, training)
+        write_submission(args.submission, submission)
+
     # Refuses an invalid name or seed now, not after hours of episodes.
     record.submission(name, mode, training_seed, followed)
-    return PlannedSubmission(args.submission, name, mode, training_seed, followed, training, record)
+    return record, write
 
 
 @command(
@@ -181,7 +167,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
-    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, no_record
+    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
     from morphgen.tasks.scenes.env_specs import default_configs
 
     name = args.checkpoint
@@ -197,22 +183,14 @@ def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         args.workers,
         _with_goal(default_configs(), sources, args),
     )
-    plan = plan_submission(args, sources[0], config, method=name)
+    record, write = plan_submission(args, sources[0], config, method=name)
     _prepare(sources, config)
-    record = plan.record if plan else no_record
     scores: list[Score] = []
     for source in sources:
         with stage(source.side):
             scores += evaluate_baseline(name, source, config, record=record)
-    if plan:
-        plan.write()
+    write()
     return {name: scores}
-
-
-def _sources_of(source: RobotSource, sides: Sequence[Side]) -> list[RobotSource]:
-    from morphgen.rl.runs.robot_source import other_side
-
-    return [other_side(source, side) for side in sides]
 
 
 def _prepare(sources: Sequence[RobotSource], config: EvalConfig) -> None:
@@ -229,11 +207,11 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         eval_config_of,
         evaluate_checkpoints,
         evaluate_run,
-        no_record,
         require_trained_tasks,
     )
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs.checkpoint import read_checkpoint, read_config
+    from morphgen.rl.runs.robot_source import other_side
     from morphgen.rl.runs.training import checkpoint_files
     from morphgen.rl.scores.submission import Training
     from morphgen.tasks.device import require_device
@@ -258,7 +236,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
     sides = _sides(args, has_test=bool(run.source.split))
-    plan = plan_submission(
+    record, write = plan_submission(
         args,
         sources[0],
         config,
@@ -268,8 +246,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         # A fine-tuned policy was trained before, by a run that its checkpoint does not describe.
         training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
-    record = plan.record if plan else no_record
-    _prepare(given or _sources_of(run.source, sides), config)
+    _prepare(given or [other_side(run.source, side) for side in sides], config)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
         _warn_of_drawn(files[0].parent, sources)
@@ -285,8 +262,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         for side in sides:
             with stage(f"{mode} on {side}"):
                 scores += evaluate_run(path, side, config, mode, device=args.device, record=record)
-    if plan:
-        plan.write()
+    write()
     return results
 
 

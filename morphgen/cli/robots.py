@@ -63,15 +63,6 @@ def compose(args: argparse.Namespace) -> int:
 
         with bar(args, "replacing collision meshes", "shape"):
             robot = with_geometry(robot, args.geometry, library.folders)
-    return write_and_report(robot, args)
-
-
-def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
-    """Write ``args.out / robot.name`` and print a summary.
-
-    Returns:
-        1 if the checks find an error in the robot, as ``morphgen check`` does, else 0.
-    """
     written = write_checked(robot, args)
     opt.print_result(args, written.data, lambda: written.text)
     return written.code
