@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
+from typing import TypeAlias
 
 from lxml import etree
 
@@ -222,11 +224,10 @@ def counted_elements(elements: Sequence[etree._Element], name: str, parent: str)
 def content_findings(element: etree._Element) -> Iterator[Finding]:
     """Check an element and everything that is read inside it."""
     tag = element.tag
-    yield from _text_findings(element)
-    for numbers in _NUMBERS.get(tag, ()):
-        yield from _number_findings(element, numbers)
-    yield from _missing_findings(element)
-    yield from _alternative_findings(element)
+    numbers = (_number_faults(element, numbers) for numbers in _NUMBERS.get(tag, ()))
+    checks = (_text_faults(element), *numbers, _missing_faults(element))
+    for fault in chain(*checks, _alternative_faults(element)):
+        yield _finding(element, *fault)
     if tag == "geometry":
         yield from _geometry_findings(element)
     for name in CHILDREN.get(tag, ()):
@@ -243,33 +244,30 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
             yield from content_findings(child)
 
 
-def _text_findings(element: etree._Element) -> Iterator[Finding]:
+_Fault: TypeAlias = tuple[str, ...]
+"""Code, reason and advice of a finding about an element, and its repair if there is one."""
+
+
+def _text_faults(element: etree._Element) -> Iterator[_Fault]:
     tag = element.tag
     for name in _REQUIRED_TEXT.get(tag, ()):
         value = element.get(name, "")
         if len(value) > MAX_TEXT or not value.isprintable():
-            yield _finding(
-                element,
+            yield (
                 "text-invalid",
                 f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
                 f"cannot be printed, or more than {MAX_TEXT} characters",
                 "write a shorter text of printable characters",
             )
         if not value.strip():
-            yield _finding(
-                element,
-                "attribute-missing",
-                f"<{tag}> has no {name}",
-                f'write <{tag} {name}="...">',
-            )
+            yield ("attribute-missing", f"<{tag}> has no {name}", f'write <{tag} {name}="...">')
 
 
-def _missing_findings(element: etree._Element) -> Iterator[Finding]:
+def _missing_faults(element: etree._Element) -> Iterator[_Fault]:
     tag = element.tag
     for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
         if element.find(name) is None:
-            yield _finding(
-                element,
+            yield (
                 "element-missing",
                 f"<{tag}> has no <{name}>",
                 f"add <{name}> or drop <{tag}>",
@@ -309,13 +307,12 @@ def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
         )
 
 
-def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Finding]:
+def _number_faults(element: etree._Element, numbers: Numbers) -> Iterator[_Fault]:
     name = numbers.attribute
     text = element.get(name)
     if text is None:
         if numbers.required:
-            yield _finding(
-                element,
+            yield (
                 "attribute-missing",
                 f"<{element.tag}> has no {name}{_others(element)}",
                 f'write <{element.tag} {name}="...">',
@@ -327,8 +324,7 @@ def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Find
     words = text.replace(",", " ").split() if vector else text.split()
     wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
-        yield _finding(
-            element,
+        yield (
             "number-malformed",
             f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number",
             "write decimal numbers with a point, separated by spaces",
@@ -336,8 +332,7 @@ def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Find
         return
     if len(words) not in numbers.counts:
         surplus = numbers.accepts_surplus and len(words) > max(numbers.counts)
-        yield _finding(
-            element,
+        yield (
             "number-count",
             f"{shown} holds {len(words)} numbers",
             f"write {counts}",
@@ -347,8 +342,7 @@ def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Find
             return
         words = words[: max(numbers.counts)]
     if "," in text:
-        yield _finding(
-            element,
+        yield (
             "number-commas",
             f"{shown} separates numbers by commas, which MuJoCo refuses",
             "separate them by spaces",
@@ -356,38 +350,30 @@ def _number_findings(element: etree._Element, numbers: Numbers) -> Iterator[Find
         )
     values = [float(word) for word in words]
     if max(map(abs, values)) > MAX_NUMBER or (numbers.positive and 0 < min(values) < MIN_LENGTH):
-        yield _finding(
-            element,
+        yield (
             "number-absurd",
             f"{shown} is out of range",
             f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units",
         )
     if numbers.positive and min(values) <= 0:
-        yield _finding(
-            element,
+        yield (
             "size-not-positive",
             f"{shown} is not positive",
             "write lengths above 0, in metres",
             f"the shape {shown} was left out" if min(values) == 0 else "",
         )
     if numbers.nonzero and 0.0 in values:
-        yield _finding(
-            element,
-            "mesh-scale-invalid",
-            f"{shown} flattens the mesh",
-            "write factors other than 0",
-        )
+        yield ("mesh-scale-invalid", f"{shown} flattens the mesh", "write factors other than 0")
 
 
-def _alternative_findings(element: etree._Element) -> Iterator[Finding]:
+def _alternative_faults(element: etree._Element) -> Iterator[_Fault]:
     """Check attributes of which an element has either one or the other."""
     quaternion = element.get("quat_xyzw", "1").split()
     if element.tag == "origin" and (
         (element.get("rpy") and element.get("quat_xyzw"))
         or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
     ):
-        yield _finding(
-            element,
+        yield (
             "rotation-invalid",
             "its quat_xyzw is zero, or beside rpy",
             "write one rotation, as a quaternion of length 1 or as rpy",
@@ -398,8 +384,7 @@ def _alternative_findings(element: etree._Element) -> Iterator[Finding]:
         and not element.get("length")
         and (not ends or ends[:3] == ends[3:])
     ):
-        yield _finding(
-            element,
+        yield (
             "attribute-missing",
             f"<capsule> has no length{_others(element)}, and no two end points as fromto",
             'write <capsule length="...">',
