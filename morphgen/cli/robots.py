@@ -213,7 +213,7 @@ def _facts(robot: Robot) -> dict[str, object]:
 
 
 KINDS_OF_PARTS = ("arm", "ee", "body")
-"""Keys of ``morphgen.grammar.part.PART_KINDS``."""
+"""Kinds of parts that a robot can become."""
 _PARTS = Path("parts")
 
 

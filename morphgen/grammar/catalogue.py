@@ -28,11 +28,9 @@ FACTS_FILE = Path(__file__).with_name("part_facts.json")
 
 
 def catalogue(library: Library, kind: str | None = None) -> list[dict[str, object]]:
-    """Return facts about every part, or about those of one kind, at default parameters.
+    """Return a row of facts about every part, or about those of one kind, at default parameters.
 
-    Returns:
-        Rows with name, kind, dof, reach (from the mount to the farthest port or tool, the largest
-        over all configurations) [m], mass [kg], source, licence, manufacturer and summary.
+    The reach [m] is the largest distance from the mount to a port or the tool; the mass is in kg.
     """
     stored = stored_facts()
     rows: list[dict[str, object]] = []
@@ -57,8 +55,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
 
 def stored_facts() -> dict[str, dict[str, Any]]:
     """Return the stored facts by part, with the digest of the files that they are of."""
-    facts: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
-    return facts
+    return cast(dict[str, dict[str, Any]], json.loads(FACTS_FILE.read_text(encoding="utf-8")))
 
 
 def compute_facts(manifest: Manifest) -> dict[str, Any]:

@@ -105,14 +105,13 @@ class _Assembly:
         )
         self.joints += (self._scoped_joint(joint, scoped) for joint in part.fragment.joints)
         self.home += part.fragment.home
-        taken: set[str] = set()
-        for port, child in node.children:
-            if port in taken:
+        ports = [port for port, _ in node.children]
+        for i, (port, child) in enumerate(node.children):
+            if port in ports[:i]:
                 raise CompositionError(
                     f"port {port!r} of {part.manifest.name!r} is already taken: it cannot hold "
                     f"{child.label!r}, too"
                 )
-            taken.add(port)
             if port not in part.ports:
                 raise CompositionError(
                     f"{part.manifest.name!r} has no port {port!r}{nearest(port, part.ports)}"
@@ -169,11 +168,7 @@ def require_root(part: Part) -> None:
 
 
 def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart]:
-    """Load every part of a derivation.
-
-    Returns:
-        The parts by label, parents before their children.
-    """
+    """Return every part of a derivation by its label, parents before their children."""
     parts: dict[str, ScopedPart] = {}
     for node in derivation.walk():
         if node.label in parts:
@@ -181,9 +176,8 @@ def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart
         part = load_part(library.manifest(node.part), part_values(node))
         values = dict(node.parameters)
         if MOUNT_YAW in values and not parts:
-            raise CompositionError(
-                f"{node.label!r} is not attached to a port: it has no {MOUNT_YAW}"
-            )
+            what = f"{node.label!r} is not attached to a port"
+            raise CompositionError(f"{what}: it has no {MOUNT_YAW}")
         yaw = values.get(MOUNT_YAW, 0.0)
         require_range(yaw, MOUNT_YAW_PARAMETER, f"{node.label}.{MOUNT_YAW}")
         parts[node.label] = ScopedPart(node.label, part, yaw)
@@ -224,10 +218,8 @@ def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> C
     Parts that penetrate each other at home by more than ``MAX_HOME_OVERLAP`` are not ignored:
     ``check`` reports such a faulty composition.
     """
-    owner: dict[str, str] = {}
-    """Label of the part of each link."""
-    tested: set[str] = set()
-    """Links whose contacts within their own part are not known."""
+    owner: dict[str, str] = {}  # label of the part of each link
+    tested: set[str] = set()  # links whose contacts within their own part are not known
     known: list[Pair] = []
     for scoped in load_parts(derivation, library).values():
         manifest = scoped.part.manifest
@@ -243,13 +235,13 @@ def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> C
     survey = survey_collisions(
         robot, known_pairs=known, should_test=lambda a, b: owner[a] != owner[b] or a in tested
     )
-    faulty = {
+    depths = survey.home_penetrations
+    ignored = (
         (a, b)
-        for (a, b), depth in survey.home_penetrations.items()
-        if owner[a] != owner[b] and depth > MAX_HOME_OVERLAP
-    }
-    ignored = tuple(pair for pair in survey.ignore_pairs if pair not in faulty)
-    return CollisionSurvey(ignored, survey.home_penetrations)
+        for a, b in survey.ignore_pairs
+        if owner[a] == owner[b] or depths.get((a, b), 0.0) <= MAX_HOME_OVERLAP
+    )
+    return CollisionSurvey(tuple(ignored), depths)
 
 
 @lru_cache(maxsize=256)

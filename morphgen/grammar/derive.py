@@ -87,15 +87,15 @@ class RecordedChooser:
 
     def alternative(self, key: str, weights: list[float]) -> int:
         """Return the recorded index if it exists."""
-        index = self.recorded.get(key)
-        if index is None or index not in range(len(weights)):
+        index = self.recorded.get(key, -1)
+        if index not in range(len(weights)):
             index = self.fallback.alternative(key, weights)
         return int(self._record(key, index))
 
     def count(self, key: str, low: int, high: int) -> int:
         """Return the recorded count if it is in range."""
-        count = self.recorded.get(key)
-        if count is None or count not in range(low, high + 1):
+        count = self.recorded.get(key, -1)
+        if count not in range(low, high + 1):
             count = self.fallback.count(key, low, high)
         return int(self._record(key, count))
 
@@ -190,12 +190,7 @@ class _Run:
 
     def root(self) -> _Node:
         start = self._grammar.production(self._grammar.start)
-        if start is None:
-            symbols = [production.symbol for production in self._grammar.productions]
-            raise GrammarError(
-                f"grammar {self._grammar.name!r} has no symbol {self._grammar.start!r}"
-                + nearest(self._grammar.start, symbols)
-            )
+        assert start  # the symbol of a production
         first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
         if MOUNT_YAW in first.values:
             raise GrammarError(
@@ -280,16 +275,11 @@ class _Run:
             )
 
     def _weights(self, production: Production, key: str) -> list[float]:
-        weights = []
-        for alternative in production.alternatives:
-            weight = 1.0
-            if alternative.weight is not None:
-                scope = Scope(self._names, typical_value, key)
-                weight, _ = evaluate(alternative.weight, scope)
-                if weight < 0:
-                    raise GrammarError(
-                        f"{alternative.weight.location}: a weight is negative: {weight:g}"
-                    )
+        scope, weights = Scope(self._names, typical_value, key), []
+        for expression in (alternative.weight for alternative in production.alternatives):
+            weight = 1.0 if expression is None else evaluate(expression, scope)[0]
+            if expression is not None and weight < 0:
+                raise GrammarError(f"{expression.location}: a weight is negative: {weight:g}")
             weights.append(weight)
         total, symbol = sum(weights), repr(production.symbol)
         if not math.isfinite(total):
@@ -378,22 +368,19 @@ def _with_unique_keys(scope: Scope) -> Scope:
 
 
 def _attach(trunk: _Node, node: _Node, item: Item) -> None:
-    port = item.port or _default_port(trunk, item)
+    port, where = item.port or _default_port(trunk, item), item.location
     if port not in trunk.ports:
-        raise GrammarError(
-            f"{item.location}: {trunk.part!r} has no port {port!r}{nearest(port, trunk.ports)}"
-        )
-    if any(port == taken for taken, _ in trunk.children):
-        raise GrammarError(f"{item.location}: port {port!r} of {trunk.part!r} is already taken")
+        valid = nearest(port, trunk.ports)
+        raise GrammarError(f"{where}: {trunk.part!r} has no port {port!r}{valid}")
+    if port in dict(trunk.children):
+        raise GrammarError(f"{where}: port {port!r} of {trunk.part!r} is already taken")
     trunk.children.append((port, node))
 
 
 def _default_port(trunk: _Node, item: Item) -> str:
-    for port in DEFAULT_PORTS:
-        if port in trunk.ports:
-            return port
-    if len(trunk.ports) == 1:
-        return trunk.ports[0]
+    ports = [port for port in DEFAULT_PORTS if port in trunk.ports]
+    if ports or len(trunk.ports) == 1:
+        return (*ports, *trunk.ports)[0]
     if not trunk.ports:
         raise GrammarError(
             f"{item.location}: nothing can be attached to {trunk.part!r}: it has no port"

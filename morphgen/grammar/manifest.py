@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from msgspec import field
 from msgspec.structs import fields, replace
@@ -248,7 +248,11 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
 
 def read_manifest(path: Path) -> Manifest:
     """Read a part's YAML. A key without a value is the same as no key."""
-    text, data = _load_yaml(path)
+    try:
+        text = read_bytes(path)
+        data = parse_yaml(text, str(path)) or {}
+    except FormatError as error:
+        raise PartError(str(error)) from error
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if value is not None}
         keys = {entry.encode_name for entry in fields(Manifest)} - {"path"} | {"reference"}
@@ -266,12 +270,3 @@ def read_manifest(path: Path) -> Manifest:
     return replace(
         manifest, path=path, citation=manifest.citation.strip(), notes=manifest.notes.strip()
     )
-
-
-def _load_yaml(path: Path) -> tuple[bytes, Any]:
-    """Return the text and the content of a YAML file."""
-    try:
-        text = read_bytes(path)
-        return text, parse_yaml(text, str(path)) or {}
-    except FormatError as error:
-        raise PartError(str(error)) from error

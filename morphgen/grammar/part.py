@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from weakref import WeakSet
@@ -66,33 +66,31 @@ class Part:
 
 
 def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> Part:
-    """Load a part; the same manifest and values give the same object."""
-    complete = resolve_values(values or {}, manifest.parameters, manifest.name)
-    return _load(_CacheKey(manifest, complete))
+    """Load a part; the same manifest and values give the same object.
 
-
-class _CacheKey:
-    """A manifest and values, equal as long as the manifest and the part's source do not change.
-
-    Files that the source includes, and meshes, are not looked at.
+    A part is read again when its manifest or source changes. Files that the source includes, and
+    meshes, are not looked at.
     """
+    complete = resolve_values(values or {}, manifest.parameters, manifest.name)
+    source = manifest.path if isinstance(manifest.source, PackageSource) else manifest.source
+    stamps = (file_stamp(manifest.path), file_stamp(source))
+    return _load(_Request(manifest.path, stamps, tuple(complete.items()), manifest))
 
-    def __init__(self, manifest: Manifest, values: Mapping[str, float]) -> None:
-        self.manifest, self.values = manifest, values
-        source = manifest.path if isinstance(manifest.source, PackageSource) else manifest.source
-        stamps = (file_stamp(manifest.path), file_stamp(source))
-        self._key = (manifest.path, stamps, tuple(values.items()))
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+@dataclass(frozen=True)
+class _Request:
+    """A part with the values of its parameters."""
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _CacheKey) and self._key == other._key
+    path: Path
+    stamps: tuple[tuple[int, int], ...]
+    """States of the manifest's file and of the source's."""
+    values: tuple[tuple[str, float], ...]
+    manifest: Manifest = field(compare=False)
 
 
 @lru_cache(maxsize=256)
-def _load(key: _CacheKey) -> Part:
-    return _Loader(key.manifest, key.values).load()
+def _load(request: _Request) -> Part:
+    return _Loader(request.manifest, dict(request.values)).load()
 
 
 class _Loader:
@@ -142,6 +140,7 @@ class _Loader:
             is_integer = self._manifest.parameters[name].integer
             (constants if is_integer else numbers)[name] = format_number(value)
         finder = PackageFinder()
+        # Sampling expands the same template thousands of times.
         compiled = compile_xacro(path, constants, numbers, finder)
         if compiled is None:
             return robot_from_xml(expand(path, {**constants, **numbers}, finder), path, finder)
@@ -153,8 +152,7 @@ class _Loader:
     def _correct_joints(self, fragment: Robot) -> Robot:
         """Apply the manifest's home, efforts and velocities; continuous joints have no limits."""
         manifest = self._manifest
-        for key in ("home", "effort", "velocity"):
-            self._require_known(key, getattr(manifest, key), "joint", fragment.joint_index)
+        self._require_known(("home", "effort", "velocity"), "joint", fragment.joint_index)
         independent = [fragment.joints[k].name for k in fragment.independent_joints]
         for name in manifest.home:
             if name not in independent:
@@ -179,9 +177,8 @@ class _Loader:
 
     def _correct_links(self, fragment: Robot) -> Robot:
         """Apply the manifest's shapes, masses and density."""
-        for key in ("mass", "drop", "collision_from_visual"):
-            names = getattr(self._manifest, key)
-            self._require_known(key, names, "link", fragment.link_index)
+        keys = ("mass", "drop", "collision_from_visual", "scaling")
+        self._require_known(keys, "link", fragment.link_index)
         return replace(fragment, links=tuple(map(self._correct_link, fragment.links)))
 
     def _correct_link(self, link: Link) -> Link:
@@ -204,11 +201,12 @@ class _Loader:
         return link
 
     def _scale(self, fragment: Robot) -> Robot:
-        scaling = self._manifest.scaling
-        self._require_known("scaling", scaling, "link", fragment.link_index)
-        by_link = {link: entry.parameter for link, entry in scaling.items() if entry.parameter}
-        self._require_known("scaling", by_link.values(), "parameter", self._values)
-        factors = {link: self._values[parameter] for link, parameter in by_link.items()}
+        scaling, factors = self._manifest.scaling, {}
+        for link, entry in scaling.items():
+            if (name := entry.parameter) and name not in self._values:
+                raise self._error(f"scaling: no parameter {name!r}{nearest(name, self._values)}")
+            if name:
+                factors[link] = self._values[name]
         return scale_links(fragment, factors, {link: e.face for link, e in scaling.items()})
 
     def _mount(self, fragment: Robot) -> Pose:
@@ -218,16 +216,13 @@ class _Loader:
             return IDENTITY
         T_link_mount = self._pose(spec, fragment)
         T_root_link = IDENTITY
-        link = spec.link
-        while link != root:
-            joint = fragment.joints[fragment.link_index[link] - 1]
+        for joint in [fragment.joints[k] for k in reversed(fragment.joint_chain(spec.link))]:
             if joint.is_movable:
                 raise self._error(
                     f"mount is on {spec.link!r}, which moves ({joint.name!r}) against the root "
                     f"{root!r}"
                 )
             T_root_link = joint.T_parent_joint @ T_root_link
-            link = joint.parent
         return T_root_link @ T_link_mount
 
     def _pose(self, spec: FrameSpec, fragment: Robot) -> Pose:
@@ -248,13 +243,12 @@ class _Loader:
         except MorphgenError as error:
             raise self._error(f"{entry}: {error}") from error
 
-    def _require_known(
-        self, key: str, names: Iterable[str], what: str, valid: Collection[str]
-    ) -> None:
-        """Require that the names under a key of the manifest exist in the part."""
-        for name in names:
-            if name not in valid:
-                raise self._error(f"{key}: no {what} {name!r}{nearest(name, valid)}")
+    def _require_known(self, keys: Iterable[str], what: str, valid: Collection[str]) -> None:
+        """Require that the names under some keys of the manifest exist in the part."""
+        for key in keys:
+            for name in getattr(self._manifest, key):
+                if name not in valid:
+                    raise self._error(f"{key}: no {what} {name!r}{nearest(name, valid)}")
 
     def _error(self, text: str) -> PartError:
         return PartError(f"{self._manifest.path}: {text}")
@@ -268,20 +262,6 @@ def _without_meshes(shapes: tuple[Shape, ...], names: Collection[str]) -> tuple[
     )
 
 
-def _arm_frames(frame: Mapping[str, object]) -> dict[str, object]:
-    return {"ports": {"flange": frame}}
-
-
-def _tool_frames(frame: Mapping[str, object]) -> dict[str, object]:
-    return {"tool": frame}
-
-
-PART_KINDS: dict[str, Callable[[Mapping[str, object]], dict[str, object]]] = {
-    "arm": _arm_frames,
-    "ee": _tool_frames,
-    "body": _tool_frames,
-}
-"""Kinds of parts that a robot can become, with the keys of a manifest that hold its tool frame."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Names that derivations and grammars can hold."""
 
@@ -314,6 +294,7 @@ def part_manifest(
     # Adding zero turns -0.0 into 0.0.
     xyz, rpy = ([value + 0.0 for value in values] for values in (pose.position, pose.rpy))
     frame = {"link": tool.link, "xyz": xyz, "rpy": rpy}
+    frames = {"ports": {"flange": frame}} if kind == "arm" else {"tool": frame}
     joints = [robot.joints[k].name for k in robot.independent_joints]
     content = {
         "name": robot.name,
@@ -322,7 +303,7 @@ def part_manifest(
         "file": Path(os.path.relpath(description, folder)).as_posix(),
         "root": robot.root.name,
         "without": [frame.name for frame in robot.frames],  # links of the URDF, not of the robot
-        **PART_KINDS[kind](frame),
+        **frames,
         "home": dict(zip(joints, robot.home, strict=True)),
         "licence": licence,
     }

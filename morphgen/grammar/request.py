@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from morphgen.errors import CompositionError, GrammarError, nearest
@@ -14,7 +14,6 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, PartKind, parse_value, resolve_values
 from morphgen.grammar.syntax import (
     MAX_WORD,
-    Alternative,
     Expression,
     Item,
     Production,
@@ -64,12 +63,14 @@ def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: 
         other_arguments = tuple(entry for entry in item.arguments if entry[0] != name)
         return replace(item, arguments=(*other_arguments, (name, number)))
 
-    def with_items(alternative: Alternative) -> Alternative:
-        return replace(alternative, items=tuple(map(pinned, alternative.items)))
+    def with_pinned(production: Production) -> Production:
+        alternatives = (
+            replace(alternative, items=tuple(map(pinned, alternative.items)))
+            for alternative in production.alternatives
+        )
+        return replace(production, alternatives=tuple(alternatives))
 
-    return _with_productions(
-        grammar, lambda p: replace(p, alternatives=tuple(map(with_items, p.alternatives)))
-    )
+    return replace(grammar, productions=tuple(map(with_pinned, grammar.productions)))
 
 
 def _pin_let(grammar: Grammar, name: str, value: str) -> Grammar:
@@ -97,7 +98,8 @@ def _pin_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
                 valid.append("a whole number of repetitions")
             raise GrammarError(f"{symbol}={value}: no such alternative{nearest(value, valid)}")
         pinned = replace(production, alternatives=alternatives)
-    return _with_productions(grammar, lambda p: pinned if p.symbol == symbol else p)
+    productions = (pinned if p.symbol == symbol else p for p in grammar.productions)
+    return replace(grammar, productions=tuple(productions))
 
 
 def _with_count(production: Production, count: int) -> Production:
@@ -119,11 +121,6 @@ def _with_count(production: Production, count: int) -> Production:
     fixed = replace(repeated, repetition=(count, count))
     items = tuple(fixed if item is repeated else item for item in alternative.items)
     return replace(production, alternatives=(replace(alternative, items=items),))
-
-
-def _with_productions(grammar: Grammar, change: Callable[[Production], Production]) -> Grammar:
-    """Return the grammar with every production changed."""
-    return replace(grammar, productions=tuple(map(change, grammar.productions)))
 
 
 SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
@@ -218,9 +215,8 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     base_manifest = library.manifest(base.part, "base")
     for port, limb in limbs:
         _require_port(base_manifest, port, limb.label)
-    ports = list(base_manifest.ports)
-    limbs.sort(key=lambda limb: ports.index(limb[0]))
-    return _node(base, base_manifest, tuple(limbs))
+    order = list(base_manifest.ports).index
+    return _node(base, base_manifest, tuple(sorted(limbs, key=lambda limb: order(limb[0]))))
 
 
 def default_name(derivation: Derivation, library: Library) -> str:
@@ -230,8 +226,7 @@ def default_name(derivation: Derivation, library: Library) -> str:
     labels = {node.label for node in derivation.walk()}
     for node in derivation.walk():
         parameters = library.manifest(node.part).parameters
-        defaults = {name: parameter.default for name, parameter in parameters.items()}
-        is_changed |= dict(node.parameters) != defaults
+        is_changed |= dict(node.parameters) != {name: p.default for name, p in parameters.items()}
         if node.part in ("fixed", "none"):
             continue
         limb, _, kind = node.label.rpartition("_")
@@ -299,15 +294,11 @@ def _limbs(
         arm = manifests[key]
         children: list[tuple[str, Derivation]] = []
         for port in arm.ports:
-            if port == MAIN_PORTS["arm"]:
-                ee_key = f"{slot.port}.ee" if slot.port else "ee"
+            empty = _Slot("ee", slot.port if port == MAIN_PORTS["arm"] else port, "none")
+            if empty.key in slots:
+                attached.add(empty.key)
+                children.append((port, _node(slots[empty.key], manifests[empty.key])))
             else:
-                ee_key = f"{port}.ee"
-            if ee_key in slots:
-                attached.add(ee_key)
-                children.append((port, _node(slots[ee_key], manifests[ee_key])))
-            else:
-                empty = _Slot("ee", ee_key.rpartition(".")[0], "none")
                 children.append((port, _node(empty, library.manifest("none", "ee"))))
         limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, arm, tuple(children))))
     for key, slot in slots.items():

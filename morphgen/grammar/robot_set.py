@@ -12,7 +12,6 @@ a run, the records of finished robots are in ``.journal.jsonl``.
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,8 @@ from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import msgspec
 
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import URDF, write_bundle
@@ -33,6 +34,7 @@ from morphgen.formats.files import (
     replacing_folder,
     write_atomic,
 )
+from morphgen.formats.records import FiniteNumber
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf.write import urdf_text
@@ -54,8 +56,6 @@ Record = dict[str, Any]
 """A line of the index."""
 SetWorker = Callable[["SetConfig", Sequence[int]], Iterator[Record]]
 """Makes the robots of the given indices, in any order."""
-
-_INDEX_TYPES = {"index": int, "name": str, "hash": str, "rejected": dict, "choices": dict}
 
 
 @dataclass(frozen=True)
@@ -183,19 +183,24 @@ def read_settings(folder: Path) -> Record:
 def _parse_record(line: bytes) -> Record | None:
     """Return the record of a line; None if the line is cut short or invalid."""
     try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(record, dict) or any(
-        not isinstance(record.get(key), kind) for key, kind in _INDEX_TYPES.items()
-    ):
-        return None
-    numbers = (*record["rejected"].values(), *record["choices"].values())
-    if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
+        checked = msgspec.json.decode(line, type=_IndexLine)
+    except (msgspec.MsgspecError, RecursionError):
         return None
     # The name is a folder in the set's folder; it must not lead out of it.
-    leads_out = record["name"] in ("", ".", "..") or set(record["name"]) & {"/", "\0"}
-    return None if leads_out else record
+    if checked.name in ("", ".", "..") or set(checked.name) & {"/", "\0"}:
+        return None
+    record: Record = json.loads(line)
+    return record
+
+
+class _IndexLine(msgspec.Struct):
+    """The keys of a line that are read; there are more."""
+
+    index: int
+    name: str
+    hash: str
+    rejected: dict[str, FiniteNumber]
+    choices: dict[str, FiniteNumber]
 
 
 def _record(sample: Sample) -> Record:

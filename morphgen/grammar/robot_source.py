@@ -55,34 +55,28 @@ def find_robots(
     ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
     spaces is a request of its own. Each robot is returned once.
     """
+    if not words:
+        raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
     sources: list[RobotSource] = []
-    request: list[str] = []
+    is_open = False  # whether key=value words belong to the last source
     for word in words:
-        is_file = is_robot_file(word)
-        is_single = len(word.split()) == 1
-        is_setting = is_single and "=" in word and not is_file
-        if request and not is_setting:
-            sources.append(_request_source(request))
-            request = []
-        if is_setting or (
-            is_single
-            and not is_file
-            and (word.endswith(GRAMMAR_SUFFIX) or word in known_grammars(library))
-        ):
-            request.append(word)
-        elif is_file:
+        if is_robot_file(word):
+            is_open = False
             try:
                 sources += _file_sources(Path(word))
             except FormatError as error:
                 if refuse is None:
                     raise
                 refuse(word, error)
-        else:
-            sources.append(_request_source(word.split()))
-    if request:
-        sources.append(_request_source(request))
-    if not words:
-        raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
+            continue
+        is_single = len(word.split()) == 1
+        if is_open and is_single and "=" in word:
+            sources[-1] = _request_source((*sources[-1].words, word))
+            continue
+        sources.append(_request_source(word.split()))
+        is_open = is_single and (
+            "=" in word or word.endswith(GRAMMAR_SUFFIX) or word in known_grammars(library)
+        )
     return list(dict.fromkeys(sources))
 
 
@@ -92,10 +86,9 @@ def find_robot(text: str | PathLike[str]) -> RobotSource:
         raise CompositionError(
             f"{text!r} is no robot; expected a Robot, a path, or a name such as ur5-plane"
         )
-    if not isinstance(text, str) or is_robot_file(text):
-        sources = _file_sources(Path(text))
-    else:
-        sources = [_request_source(text.split())]
+    if isinstance(text, str) and not is_robot_file(text):
+        return _request_source(text.split())
+    sources = _file_sources(Path(text))
     if len(sources) > 1:
         raise CompositionError(
             f"{text} holds {len(sources)} robots; name one, such as {sources[0].label}"

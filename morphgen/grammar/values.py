@@ -137,8 +137,13 @@ def distribution_of(expression: Expression, scope: Scope) -> tuple[Distribution,
 def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
     """Return the value, which may be infinite or NaN, and the unit of an expression."""
     match expression.operator:
+        case "number" if not expression.text:
+            return expression.value, ""
         case "number":
-            return _quantity(expression)
+            if expression.text not in UNITS:
+                raise unknown("unit", expression.text, expression.location, UNITS)
+            unit, scale = UNITS[expression.text]
+            return expression.value * scale, unit
         case "name":
             if expression.text not in scope.names:
                 raise unknown("value", expression.text, expression.location, scope.names)
@@ -154,16 +159,6 @@ def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
             return _arithmetic(expression, left, right)
         case _:
             raise _error(expression, "is a condition, not a value")
-
-
-def _quantity(expression: Expression) -> tuple[float, str]:
-    """Return a number with a unit in SI units."""
-    if not expression.text:
-        return expression.value, ""
-    if expression.text not in UNITS:
-        raise unknown("unit", expression.text, expression.location, UNITS)
-    unit, scale = UNITS[expression.text]
-    return expression.value * scale, unit
 
 
 _VALID_UNITS = "values are lengths, angles, masses or pure numbers"
@@ -231,36 +226,24 @@ _COMPARATORS: Mapping[str, Callable[[float, float], bool]] = {
 
 
 class RobotProperties:
-    """Properties of a robot, each computed when first used."""
+    """Properties of a robot; those that take time are computed when first used."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self.mass = robot.mass
+        """Total mass [kg]."""
+        self.dof = robot.dof
+        """Number of independent joints."""
+        self.links = len(robot.links)
+        """Number of links, including the root."""
+        self.movable = len(robot.movable_joints)
+        """Number of movable joints, including mimic joints."""
 
     @cached_property
     def reach(self) -> float:
         """Largest distance of the tool from the root's origin [m]; 0 without a tool."""
         robot = self._robot
         return reach(robot) if any(frame.name == TOOL for frame in robot.frames) else 0.0
-
-    @cached_property
-    def mass(self) -> float:
-        """Total mass [kg]."""
-        return self._robot.mass
-
-    @cached_property
-    def dof(self) -> float:
-        """Number of independent joints."""
-        return self._robot.dof
-
-    @cached_property
-    def links(self) -> float:
-        """Number of links, including the root."""
-        return len(self._robot.links)
-
-    @cached_property
-    def movable(self) -> float:
-        """Number of movable joints, including mimic joints."""
-        return len(self._robot.movable_joints)
 
     @cached_property
     def movable_to_tool(self) -> float:
@@ -333,21 +316,14 @@ def require_condition(expression: Expression) -> None:
             require_condition(operand)
         return
     if expression.operator not in _COMPARATORS:
-        raise GrammarError(
-            f"{expression.location}: {expression} is a value; a condition compares, such as "
-            "mass < 40"
-        )
-    units = set()
-    for operand in expression.operands:
-        for name in _names(operand):
-            if name.text not in PROPERTIES:
-                raise unknown("property", name.text, name.location, PROPERTIES)
-        sample = {name: (1.0, unit) for name, unit in PROPERTIES.items()}
-        units.add(evaluate(operand, Scope(sample, typical_value, ""))[1])
+        raise _error(expression, "is a value; a condition compares, such as mass < 40")
+    for name in _names(expression):
+        if name.text not in PROPERTIES:
+            raise unknown("property", name.text, name.location, PROPERTIES)
+    sample = Scope({name: (1.0, unit) for name, unit in PROPERTIES.items()}, typical_value, "")
+    units = {evaluate(operand, sample)[1] for operand in expression.operands}
     if len(units - {""}) > 1:
-        raise GrammarError(
-            f"{expression.location}: {expression} compares {' with '.join(sorted(units))}"
-        )
+        raise _error(expression, f"compares {' with '.join(sorted(units))}")
 
 
 def _value(expression: Expression, properties: RobotProperties) -> float:
