@@ -29,14 +29,10 @@ _ROUGH_TOLERANCE = 30.0
 
 
 def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) -> Array | None:
-    """Return the rigid motion or mirroring that maps one mesh to another.
+    """Return ``T_b_a`` (4, 4), the rigid motion or mirroring that maps mesh a to b; None if none.
 
-    Both must have the same numbers of vertices and faces. The transform of a rotated body of very
-    high symmetry, such as a sphere, may not be found.
-
-    Returns:
-        ``T_b_a``, shape (4, 4), which maps coordinates of ``a`` to ``b``: the identity for equal
-        arrays, a motion rather than a mirroring if both fit; None if there is none.
+    Both must have the same numbers of vertices and faces. A motion is preferred to a mirroring. The
+    transform of a rotated body of very high symmetry, such as a sphere, may not be found.
     """
     if a.vertices.shape != b.vertices.shape or a.faces.shape != b.faces.shape:
         return None
@@ -49,10 +45,8 @@ def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) 
     if np.abs(np.sort(radii) - np.sort(other_radii)).max() > 2 * error:
         return None
     for R in _candidate_rotations(centred_a, centred_b, 2 * error):
-        sample = centred_a[:: max(len(centred_a) // _NUM_SAMPLES, 1)] @ R.T + b.vertices.mean(
-            axis=0
-        )
-        if b.kdtree.query(sample)[0].max() > _ROUGH_TOLERANCE * error:
+        sample = centred_a[:: max(len(centred_a) // _NUM_SAMPLES, 1)] @ R.T
+        if b.kdtree.query(sample + b.vertices.mean(axis=0))[0].max() > _ROUGH_TOLERANCE * error:
             continue
         for T_b_a in (_transform(a, b, R), _refine(a, b, R)):
             if _maps(a, b, T_b_a, error):
@@ -61,12 +55,9 @@ def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) 
 
 
 def moved(shape: Shape, T_b_a: Array) -> Shape:
-    """Return a primitive after a rigid motion or a mirroring.
+    """Return a primitive of frame a in frame b, after a rigid motion or a mirroring (4, 4).
 
     Every primitive is its own mirror image, so mirroring only changes its pose.
-
-    shape: A primitive in frame a.
-    T_b_a: Transform with an orthogonal upper left part, shape (4, 4).
     """
     if isinstance(shape.geometry, Mesh):
         raise ValueError(f"{shape.geometry} is not a primitive")
@@ -79,15 +70,13 @@ def moved(shape: Shape, T_b_a: Array) -> Shape:
 
 
 def representatives(meshes: Sequence[trimesh.Trimesh]) -> list[tuple[int, Array]]:
-    """Return for each mesh the congruent mesh whose fit it can share.
+    """Return for each mesh the index of the first congruent one, and the transform (4, 4) from it.
 
-    Returns:
-        For each mesh the index of the first mesh that is congruent to it (its own if no earlier one
-        is) and the transform from that mesh to it, shape (4, 4).
+    It is its own index and the identity if no earlier mesh is congruent to it.
     """
     shared: list[tuple[int, Array]] = []
     for index, mesh in enumerate(meshes):
-        firsts = [first for first in range(index) if shared[first][0] == first]
+        firsts = (first for first in range(index) if shared[first][0] == first)
         matches = ((first, congruence(meshes[first], mesh)) for first in firsts)
         match = next(((first, T) for first, T in matches if T is not None), None)
         shared.append(match or (index, np.eye(4)))
@@ -163,12 +152,9 @@ def _refine(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
 
 def _maps(a: trimesh.Trimesh, b: trimesh.Trimesh, T_b_a: Array, error: float) -> bool:
     """Test that vertices map to vertices, both ways, and triangle centres to triangles."""
-    moved_vertices = trimesh.transform_points(a.vertices, T_b_a)
-    if b.kdtree.query(moved_vertices)[0].max() > error:
-        return False
-    moved_back = trimesh.transform_points(b.vertices, np.linalg.inv(T_b_a))
-    if a.kdtree.query(moved_back)[0].max() > error:
-        return False
+    for mesh, other, T in ((a, b, T_b_a), (b, a, np.linalg.inv(T_b_a))):
+        if other.kdtree.query(trimesh.transform_points(mesh.vertices, T))[0].max() > error:
+            return False
     centres = trimesh.transform_points(a.triangles_center, T_b_a)
     squared, _, _ = igl.point_mesh_squared_distance(
         centres, np.asarray(b.vertices, np.float64), np.asarray(b.faces, np.int64)

@@ -116,24 +116,20 @@ def as_convex(robot: Robot, folders: Sequence[Path] = ()) -> Robot:
 
 
 def decompose(mesh: Mesh) -> list[trimesh.Trimesh]:
-    """Decompose a mesh into closed convex meshes that cover it approximately.
+    """Return 1 to ``MAX_PIECES`` closed convex meshes that cover a mesh approximately.
 
     The result depends on the mesh, ``SETTINGS`` and the version of CoACD alone: CoACD runs in one
     thread and with a seed.
-
-    Returns:
-        1 to ``MAX_PIECES`` pieces, in the frame of the mesh and with its scale.
     """
     importlib.import_module("coacd")
     triangles, hull = load_mesh(mesh), convex_hull(mesh)
     # CoACD's own test whether a mesh needs a remesh ("auto") aborts on some meshes.
     modes = ("on",) if len(triangles.faces) > MAX_DIRECT_FACES else ("auto", "on")
-    points = failure = None
     for mode in modes:
         points, failure = _run_coacd(mesh, {**SETTINGS, "preprocess_mode": mode})
         if points is not None:
             break
-    if points is None:
+    else:
         raise FitError(
             f"{mesh.path}: CoACD fails on this mesh: {failure}; repair it, or use primitives"
         )

@@ -37,15 +37,6 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        self._check_spheres()
-        if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
-            raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
-        if not 0 < self.iou <= 1:
-            raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
-        if self.seed < 0:
-            raise FitError(f"seed {self.seed}: expected 0 or more")
-
-    def _check_spheres(self) -> None:
         if self.spheres is not None:
             if not 1 <= self.spheres <= MAX_PRIMITIVES:
                 raise FitError(f"{self.spheres} spheres: expected 1 to {MAX_PRIMITIVES} per link")
@@ -56,6 +47,12 @@ class FitOptions:
                 raise FitError(f"cover {self.cover:g}: expected a number of spheres, too")
             if not 0 < self.cover <= MAX_COVER:
                 raise FitError(f"cover {self.cover:g}: expected more than 0, at most {MAX_COVER}")
+        if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
+            raise FitError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
+        if not 0 < self.iou <= 1:
+            raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
+        if self.seed < 0:
+            raise FitError(f"seed {self.seed}: expected 0 or more")
 
 
 @dataclass(frozen=True)
@@ -96,10 +93,9 @@ def fit_shapes(
     """
     start = time.perf_counter()
     solid = solid or solid_of(shapes)
+    is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
     if options.spheres is not None:
         is_kept = all(isinstance(shape.geometry, Sphere) for shape in shapes)
-    else:
-        is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
     if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None
@@ -137,7 +133,6 @@ def _measure(
     start: float,
     method: str | None = None,
 ) -> LinkFit:
-    seconds = time.perf_counter() - start
-    measured = quality(solid, primitives)
-    method = method or solid.method
+    seconds = time.perf_counter() - start  # of the fit, without the measurement
+    measured, method = quality(solid, primitives), method or solid.method
     return LinkFit(primitives, single, method, measured, seconds, solid.decimated_from)

@@ -110,15 +110,10 @@ def quality(
 
 
 def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
-    """Return the signed distances of points to a union of primitives, negative inside.
+    """Return the signed distances (n,) of points (n, 3) to a union of primitives [m].
 
-    They are exact outside, and inside of one primitive; inside of several overlapping primitives
-    the surface may be farther away.
-
-    points: Points in the link frame [m], shape (n, 3).
-
-    Returns:
-        Distances [m], shape (n,).
+    They are negative inside, and exact outside and inside of one primitive; inside of several
+    overlapping primitives the surface may be farther away.
     """
     if not primitives:
         raise ValueError("there are no primitives")
@@ -168,7 +163,7 @@ def _bounding_box(primitives: Sequence[Shape], points: Array) -> tuple[Array, Ar
 
 def _half_extents(shape: Shape, R: Array) -> Array:
     """Return the half extents of a primitive along the columns of a rotation, shape (3,)."""
-    axes = abs(R.T @ shape.T_link_shape.matrix[:3, :3])
+    axes = abs(R.T @ shape.T_link_shape.matrix[:3, :3])  # cosines
     match _solid_primitive(shape):
         case Box(size):
             return np.asarray(axes @ size / 2)
@@ -224,12 +219,11 @@ def _patches(geometry: SolidPrimitive) -> list[Patch]:
         case Box((a, b, c)):
             sides = itertools.product(enumerate((b * c, c * a, a * b)), (-1, 1))
             return [(area, partial(_on_face, geometry, axis, sign)) for (axis, area), sign in sides]
-        case Cylinder(radius, length):
+        case Cylinder(radius):
             ends = (math.tau * radius**2, partial(_on_caps, geometry))
-            return [(math.tau * radius * length, partial(_on_tube, geometry)), ends]
-        case Capsule(radius, length):
+        case Capsule(radius):
             ends = (4 * math.pi * radius**2, partial(_on_ball, geometry))
-            return [(math.tau * radius * length, partial(_on_tube, geometry)), ends]
+    return [(math.tau * radius * geometry.length, partial(_on_tube, geometry)), ends]
 
 
 def _on_face(box: Box, axis: int, sign: int, unit: Array) -> SurfacePoints:

@@ -237,20 +237,14 @@ class Cavities:
         self._rays = RayMeshIntersector(mesh)
 
     def openness(self, points: Array) -> Array:
-        """Return the share of directions in which a ray hits no triangle.
+        """Return the shares of directions in which rays from points (n, 3) hit no triangle (n,).
 
         It is at least one half for a point outside of the convex hull.
-
-        points: Points in the frame of the mesh, shape (n, 3).
-
-        Returns:
-            Shares, shape (n,), in steps of ``1 / NUM_RAYS``.
         """
         if not len(points):
             return np.zeros(0)
-        directions = _directions()
         hits = self._rays.intersects_any(
-            np.repeat(points, NUM_RAYS, axis=0), np.tile(directions, (len(points), 1))
+            np.repeat(points, NUM_RAYS, axis=0), np.tile(_directions(), (len(points), 1))
         )
         return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
 

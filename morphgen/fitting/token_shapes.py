@@ -37,6 +37,7 @@ from morphgen.model.geometry import (
     Primitive,
     Shape,
     Sphere,
+    map_dimensions,
     scale_shape,
     volume,
 )
@@ -111,15 +112,11 @@ class _Candidate:
 
 
 def fit_composite(shapes: Sequence[Shape]) -> Shape | None:
-    """Return the box, cylinder or sphere of largest IoU with a union of primitives.
+    """Return the box, cylinder or sphere of largest IoU with a union of boxes, cylinders, spheres.
 
     Its axes are those of the link or of one of the primitives. If the axes of the primitives
-    differ, tilted axes are tried, too.
-
-    shapes: Boxes, cylinders and spheres in the link frame.
-
-    Returns:
-        The primitive in its canonical pose, lengths rounded to 1 um; None if there is no volume.
+    differ, tilted axes are tried, too. Its pose is canonical, its lengths are rounded to 1 um. None
+    if there is no volume.
     """
     primitives = [shape for shape in shapes if volume(_primitive(shape)) > 0]
     if not primitives:
@@ -172,6 +169,7 @@ def _tilt(best: _Candidate) -> _Candidate:
         angle = sign * math.radians(degrees)
         tilt = np.eye(3)
         i, j = (axis + 1) % 3, (axis + 2) % 3
+        # math's functions, not scipy's rotations: the same bits on every machine.
         tilt[i, i] = tilt[j, j] = math.cos(angle)
         tilt[j, i], tilt[i, j] = math.sin(angle), -math.sin(angle)
         R = _rotate(best.frame.R_link_frame, tilt)
@@ -244,21 +242,20 @@ def _values(frame: _Frame, kind: Kind) -> list[list[float]]:
     fractions = np.arange(1, _GRID) / _GRID
     low, high = frame.extents[-1].T
     grid = low[:, None] + (high - low)[:, None] * fractions
-    sides = [
-        [*sorted({*frame.extents[:, axis].ravel().tolist()}), *grid[axis].tolist()]
-        for axis in range(3)
-    ]
+    sides = [_then(frame.extents[:, axis], grid[axis]) for axis in range(3)]
     if kind == "box":
         return [sides[axis] for axis in (0, 0, 1, 1, 2, 2)]
-    centres = [
-        [*sorted({*frame.extents[:, axis].mean(axis=1).tolist()}), *grid[axis].tolist()]
-        for axis in range(3)
-    ]
+    centres = [_then(frame.extents[:, axis].mean(axis=1), grid[axis]) for axis in range(3)]
     halves = np.ptp(frame.extents, axis=2) / 2
-    radii = [*sorted({*halves.ravel().tolist()}), *(halves[-1].max() * fractions).tolist()]
+    radii = _then(halves, halves[-1].max() * fractions)
     if kind == "cylinder":
         return [centres[0], centres[1], radii, sides[2], sides[2]]
     return [*centres, radii]
+
+
+def _then(values: Array, grid: Array) -> list[float]:
+    """Return each of some values once, in order, and then those of a grid."""
+    return [*sorted({*values.ravel().tolist()}), *grid.tolist()]
 
 
 def _iou(frame: _Frame, kind: Kind, parameters: Parameters) -> float:
@@ -274,9 +271,8 @@ def _iou(frame: _Frame, kind: Kind, parameters: Parameters) -> float:
 def _geometry(kind: Kind, parameters: Parameters) -> tuple[Primitive, tuple[float, ...]]:
     """Return a primitive and its centre in its frame."""
     if kind == "box":
-        lower, upper = parameters[::2], parameters[1::2]
-        x, y, z = (high - low for low, high in zip(lower, upper, strict=True))
-        return Box((x, y, z)), tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
+        x, x2, y, y2, z, z2 = parameters
+        return Box((x2 - x, y2 - y, z2 - z)), ((x + x2) / 2, (y + y2) / 2, (z + z2) / 2)
     if kind == "cylinder":
         x, y, radius, low, high = parameters
         return Cylinder(radius, high - low), (x, y, (low + high) / 2)
@@ -287,18 +283,12 @@ def _shape(candidate: _Candidate) -> Shape:
     """Return a candidate in the link frame, lengths rounded."""
     geometry, centre = _geometry(candidate.kind, candidate.parameters)
     R_link_frame = candidate.frame.R_link_frame
-    n = _LENGTH_DECIMALS
-    match geometry:
-        case Box((x, y, z)):
-            geometry = Box((round(x, n), round(y, n), round(z, n)))
-        case Cylinder(radius, length):
-            geometry = Cylinder(round(radius, n), round(length, n))
-        case Sphere(radius):
-            geometry = Sphere(round(radius, n))
     T = np.eye(4)
     T[:3, :3] = R_link_frame
-    T[:3, 3] = _rotate(R_link_frame, np.array(centre)[:, None])[:, 0].round(n) + 0.0
-    return Shape(geometry, Pose.from_matrix(T))
+    position = _rotate(R_link_frame, np.array(centre)[:, None])[:, 0]
+    T[:3, 3] = position.round(_LENGTH_DECIMALS) + 0.0
+    rounded_geometry = map_dimensions(lambda length: round(length, _LENGTH_DECIMALS), geometry)
+    return Shape(rounded_geometry, Pose.from_matrix(T))
 
 
 def _primitive(shape: Shape) -> Box | Cylinder | Sphere:
