@@ -24,9 +24,7 @@ _TOLERANCE = 1e-6
 def decode_actions(
     actions: torch.Tensor, kind: ActionKind, shape: tuple[int, int], device: torch.device
 ) -> torch.Tensor:
-    """Return actions as fractions of the largest joint steps, in [-1, 1], shape (n, L).
-
-    shape: Expected shape, (n, L).
+    """Return actions as fractions of the largest joint steps, in [-1, 1], of a ``shape`` (n, L).
 
     On a GPU, which is not read here, actions that are not finite or out of range become nan: their
     environments diverge.
@@ -76,22 +74,15 @@ class JointTargets:
     def __init__(
         self, tables: RobotTables, env_robot_index: torch.Tensor, action_mask: torch.Tensor
     ) -> None:
-        """Gather the tables of every environment.
-
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        action_mask: Links whose joint obeys actions, shape (n, L), bool.
-        """
+        """Gather the tables of the robots (n,); the mask (n, L) has the joints that obey."""
         self._link = tables.link_of_joint[env_robot_index]
         self._max_step = tables.max_step[env_robot_index] * torch.gather(action_mask, 1, self._link)
         self._lower, self._upper = tables.lower[env_robot_index], tables.upper[env_robot_index]
 
     def __call__(self, targets: torch.Tensor, normalized: torch.Tensor) -> torch.Tensor:
-        """Return the next targets, shape (n, J), within the joint limits.
+        """Return the targets (n, J) after normalized actions (n, L), within the joint limits.
 
-        They start from the previous targets, not from the measured positions.
-
-        targets: Previous targets of the independent joints, shape (n, J) [rad or m].
-        normalized: Normalized actions, shape (n, L).
+        They start from the previous targets, not from the measured positions: lag adds nothing.
         """
         change = torch.gather(normalized, 1, self._link) * self._max_step
         return torch.clamp(targets + change, self._lower, self._upper)

@@ -368,13 +368,8 @@ class TaskBatch:
         """Restore what ``state_dict`` returned; ``reset`` must follow.
 
         Raises:
-            TaskError: If the state has another number of environments, or is of morphgen 0.2.
+            TaskError: If the state has another number of environments.
         """
-        if "next_episode" not in state:
-            raise TaskError(
-                "the state is of morphgen 0.2, whose random numbers were others: its episodes "
-                "cannot go on; load the weights alone, as finetune does"
-            )
         next_episode = state["next_episode"]
         if len(next_episode) != self.num_envs:
             raise TaskError(
@@ -469,10 +464,7 @@ class StepGraph:
         self._record()
 
     def __call__(self, actions: torch.Tensor) -> Step:
-        """Act for one control step; see ``TaskBatch.step``. The next call overwrites the result.
-
-        actions: Shape (n, L).
-        """
+        """Act for one control step; see ``TaskBatch.step``. The next call overwrites the result."""
         if self._seed != self._batch.seed:
             self._record()
         self._actions.copy_(actions)

@@ -49,10 +49,7 @@ class EpisodeLayouts:
         side: LayoutSide,
         observe: ObservationConfig,
     ) -> None:
-        """Begin with the first layout of every environment.
-
-        env_robot_index: Index of each environment's specification, shape (n,), int64.
-        """
+        """Begin with the first layout of every environment."""
         device = env_robot_index.device
         self._specs = [specs[i] for i in env_robot_index.tolist()]
         self._index = env_robot_index
@@ -78,10 +75,7 @@ class EpisodeLayouts:
         return self.poses.shape[1] > 0
 
     def draw(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
-        """Draw the layouts of new episodes.
-
-        mask: Environments whose episodes begin, shape (n,), bool.
-        """
+        """Draw the layouts of new episodes."""
         if self.any:
             layout = self._first + random.integers(Stream.LAYOUT, self._count)
             self.current.copy_(torch.where(mask & self._has_obstacles, layout, self.current))
@@ -162,11 +156,7 @@ class PointClouds:
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, obstacle_poses: torch.Tensor
     ) -> None:
-        """Draw the points of new episodes.
-
-        mask: Environments whose episodes begin, shape (n,), bool.
-        obstacle_poses: Poses of the obstacles in the world, shape (n, O, 7).
-        """
+        """Draw the points of new episodes among obstacles at poses in the world, (n, O, 7)."""
         n, P = self._on_block.shape
         numbers = random.uniform(Stream.POINTS, P * _NUMBERS).view(n, P, _NUMBERS)
         face = torch.searchsorted(self._area, numbers[..., 0].contiguous(), right=True)
@@ -186,10 +176,7 @@ class PointClouds:
         self._on_block.copy_(torch.where(mask[:, None], on_block & self.mask, self._on_block))
 
     def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
-        """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes.
-
-        block_pose: Poses of the blocks, shape (n, 7).
-        """
+        """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes."""
         R = matrix_from_quaternion(block_pose[:, 3:])
         moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
         return torch.where(self._on_block[..., None], moved, self._local)
@@ -216,19 +203,12 @@ class StraightPaths:
     """
 
     def __init__(self, layouts: EpisodeLayouts, env_robot_index: torch.Tensor) -> None:
-        """Prepare tests in all environments; a robot's scene is compiled when it is first used.
-
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        """
+        """Prepare tests in all environments; a robot's scene is compiled when it is first used."""
         self._layouts, self._robots = layouts, env_robot_index.tolist()
         self._spaces: dict[int, FreeSpace] = {}
 
     def __call__(self, env: int, start: Array, ends: Array) -> int | None:
-        """Return the index of the first end with a free path, or None.
-
-        start: Configuration, shape (J,) [rad or m], with padding.
-        ends: Configurations in the order of preference, shape (k, J).
-        """
+        """Return the index of the first of some ends (k, J) with a free path from (J,), or None."""
         space = self.space(env)
         dof = space.scene.robot.dof
         tested: list[Array] = []
@@ -287,11 +267,7 @@ class BatchObservation:
         config: ObservationConfig,
         paths: StraightPaths,
     ) -> None:
-        """Gather the tables of all environments.
-
-        env_robot_index: Index of each environment's robot and specification, (n,), int64.
-        action_mask: Links whose joint obeys actions, shape (n, L), bool.
-        """
+        """Gather the tables of all environments."""
         self._tables, self._index, self._config = robot_tables, env_robot_index, config
         self._groups, self._layouts = groups, layouts
         index, device = env_robot_index, env_robot_index.device
@@ -320,10 +296,7 @@ class BatchObservation:
             self._constant_entries["point_mask"] = self._points.mask
 
     def begin(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
-        """Begin episodes, whose layouts are drawn.
-
-        mask: Environments whose episodes begin, shape (n,), bool.
-        """
+        """Begin episodes, whose layouts are drawn."""
         if self._points is not None:
             self._points.begin(mask, random, self._layouts.poses)
         if self._kinematics is not None:
@@ -332,11 +305,7 @@ class BatchObservation:
     def __call__(
         self, state: PhysicsState, targets: torch.Tensor, previous_action: torch.Tensor
     ) -> Observation:
-        """Return the observation in a state, in tensors that the caller owns.
-
-        targets: Targets of the independent joints, shape (n, J) [rad or m].
-        previous_action: Normalized actions of the last step, shape (n, L).
-        """
+        """Return the observation in a state, in tensors that the caller owns."""
         return {
             "tokens": self._tokens(state.q),
             **self._groups.fields(state.block_pose),

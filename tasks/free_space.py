@@ -58,11 +58,7 @@ class JointPlane:
 
 
 def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
-    """Find the joint planes in which a robot's free configurations form several components.
-
-    Returns:
-        A plane for each set of joints; none for most robots.
-    """
+    """Find the joint planes in which free configurations form several components, mostly none."""
     checker = SelfCollisionChecker(robot, untested_pairs(robot))
     q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
     counts = Counter(pair for contacts in checker.penetrations(q) for pair in contacts)
@@ -80,13 +76,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
 
 
 def in_other_component(planes: Sequence[JointPlane], q: Array) -> NDArray[np.bool_]:
-    """Return in which planes a free configuration is outside of the largest component.
-
-    q: Joint positions, shape (dof,) [rad or m].
-
-    Returns:
-        Shape (number of planes,).
-    """
+    """Return in which planes a free configuration (dof,) is outside of the largest component."""
     return np.array([_is_outside(plane, q) for plane in planes], dtype=np.bool_)
 
 
@@ -187,28 +177,18 @@ class FreeSpace:
         )
 
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
-        """Return which configurations are free.
+        """Return which configurations (n, dof) [rad or m] are free, shape (n,).
 
-        q: Independent joint positions, shape (n, dof) [rad or m].
-        blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7); where
-            it penetrates an obstacle or the root link, no configuration is free.
-
-        Returns:
-            Shape (n,).
+        Where a block, at poses (n, 7) in the world, penetrates an obstacle or the root link, no
+        configuration is free.
         """
         return self._checker.free(self._positions(q, blocks))
 
     def free_fraction(self, start: Array, end: Array, block: Array | None = None) -> float:
-        """Return the free fraction of a straight path of the joints, from its start on.
+        """Return the fraction of a straight path between configurations that is free, from 0 to 1.
 
-        The path is tested at points that no joint moves more than ``RESOLUTION`` between.
-
-        start: Configuration, shape (dof,) [rad or m].
-        end: Configuration, shape (dof,) [rad or m].
-        block: Pose of the block, shape (7,); None to leave it out.
-
-        Returns:
-            1 if the whole path is free, else the fraction before the last free point.
+        The path is tested at points that no joint moves more than ``RESOLUTION`` between, with the
+        block at a pose (7,) if there is one.
         """
         count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
@@ -224,13 +204,7 @@ class FreeSpace:
             self._checker.place(name, pose)
 
     def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
-        """Return at which poses the block penetrates neither an obstacle nor the robot's base.
-
-        blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
-
-        Returns:
-            Shape (n,).
-        """
+        """Return at which poses (n, 7) the block penetrates neither an obstacle nor the base."""
         robot, poses = self.scene.robot, np.asarray(blocks, dtype=np.float64)
         fixed_names = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
         self._require_blocks(poses, len(poses))
@@ -243,13 +217,7 @@ class FreeSpace:
         return clear
 
     def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Return which obstacles the robot penetrates, whatever else collides.
-
-        q: Independent joint positions, shape (n, dof) [rad or m].
-
-        Returns:
-            Shape (n, number of obstacles).
-        """
+        """Return which obstacles the robot penetrates, whatever else collides, (n, obstacles)."""
         rows = [{name for pair in contacts for name in pair} for contacts in self._penetrations(q)]
         hits = [[name in row for name in self._obstacles] for row in rows]
         return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
@@ -260,14 +228,10 @@ class FreeSpace:
         rng: np.random.Generator,
         accept: Callable[[Array], bool] = lambda q: True,
     ) -> tuple[Array, int]:
-        """Sample free configurations, uniformly within the joint limits.
+        """Sample free configurations (n, dof), uniformly; return also the number of tested ones.
 
-        A smaller sample is the beginning of a larger one. ``rng`` advances by whole chunks.
-
-        accept: Further condition on a free configuration, shape (dof,).
-
-        Returns:
-            The accepted configurations, shape (n, dof), and the number of tested ones.
+        ``accept`` is a further condition on each. A smaller sample is the beginning of a larger
+        one. ``rng`` advances by whole chunks.
         """
         accepted: list[Array] = []
         collisions: Counter[Pair] = Counter()
@@ -341,11 +305,7 @@ class FreeSpace:
 
 
 def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
-    """Find joints outside of their limits in configurations (n, dof).
-
-    Yields:
-        The row of the configuration, and a description of the fault.
-    """
+    """Yield the row of each of the configurations (n, dof) outside of joint limits, and why."""
     names = [robot.joints[k].name for k in robot.independent_joints]
     low, high = joint_limits(robot).T
     outside = (q < low) | (q > high) | ~np.isfinite(q)
@@ -354,13 +314,7 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
 
 
 def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
-    """Return where the block's sphere meets a box around the robot's base or an obstacle.
-
-    blocks: Poses of the block in the world, shape (n, 7).
-
-    Returns:
-        Shape (n,); False only where the block touches neither.
-    """
+    """Return where the block's sphere meets a box around the robot's base or an obstacle, (n,)."""
     assert scene.block is not None
     radius = float(np.linalg.norm(scene.block.size)) / 2
     T_world_root, robot = scene.T_world_root.matrix, scene.robot
@@ -407,10 +361,8 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
         new_joints.append(Joint(joint_name("ground"), "fixed", world.name, ground.name))
     for name, obstacle in zip(obstacles, scene.obstacles, strict=True):
         static_links.append(Link(name, collisions=(Shape(Box(obstacle.size)),)))
-        slide = Joint(
-            joint_name(name), "prismatic", world.name, name, obstacle.pose, limits=(0.0, 0.0)
-        )
-        new_joints.append(slide)
+        at = (world.name, name, obstacle.pose)
+        new_joints.append(Joint(joint_name(name), "prismatic", *at, limits=(0.0, 0.0)))
     ignored = [*untested_pairs(robot), *combinations([link.name for link in static_links], 2)]
     block_links: list[Link] = []
     if scene.block is not None:

@@ -78,10 +78,7 @@ class IkSolutions:
     def __init__(
         self, tables: RobotTables, env_robot_index: torch.Tensor, first_free: FirstFree
     ) -> None:
-        """Gather the tables of every environment.
-
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        """
+        """Gather the tables of every environment."""
         index, self._first_free = env_robot_index, first_free
         self._tables, self._index = tables, index
         self._lower, self._upper = tables.lower[index], tables.upper[index]
@@ -100,18 +97,11 @@ class IkSolutions:
         self._solved_for = torch.full((n, 3), math.inf, device=device)
 
     def forget(self, mask: torch.Tensor) -> None:
-        """Forget the solutions of environments whose episode begins.
-
-        mask: The environments, shape (n,), bool.
-        """
+        """Forget the solutions of environments whose episode begins."""
         self._solved_for.masked_fill_(mask[:, None], math.inf)
 
     def update(self, targets: torch.Tensor, goals: ToolTargets, metres_per_radian: float) -> None:
-        """Solve where an episode has begun or the tool's target has moved.
-
-        targets: Targets of the independent joints, shape (n, J) [rad or m].
-        metres_per_radian: Length by which errors of orientation are multiplied [m/rad].
-        """
+        """Solve where an episode has begun or the tool's target has moved, from targets (n, J)."""
         points = goals.points[:, 0]
         moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
         exists = goals.exists[:, 0]
@@ -265,11 +255,7 @@ class KinematicChannels:
         has_block: torch.Tensor,
         first_free: FirstFree,
     ) -> None:
-        """Gather the tables of every environment.
-
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        has_block: Environments with a block, shape (n,), bool.
-        """
+        """Gather the tables of every environment."""
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
         self._has_block = has_block if bool(has_block.any()) else None
@@ -303,12 +289,7 @@ class KinematicChannels:
     def __call__(
         self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """Return the channels by name.
-
-        q: Positions of the independent joints, shape (n, J) [rad or m].
-        targets: Their targets, shape (n, J) [rad or m].
-        block_pose: Poses of the blocks, shape (n, 7).
-        """
+        """Return the channels by name, at joint positions (n, J) and block poses (n, 7)."""
         index, tree = self._index, self._tree
         state = _State(
             chain=self._tables.tool_chain,
@@ -426,13 +407,10 @@ class KinematicChannels:
         return torch.stack([torch.tanh(gain * step) for gain in GAINS], dim=1)
 
     def _products(self, J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-        """Return products of Jacobian columns and an error, shape (n, 5, J).
+        """Return products of Jacobian columns (n, 3, J) and an error (n, 3), shape (n, 5, J).
 
         They are the steps that would reduce the error by each joint alone, at the gains; the cosine
         of the angle between column and error; and the logarithm of the error's length.
-
-        J: Jacobians of three coordinates, shape (n, 3, J).
-        error: Errors in these coordinates, shape (n, 3).
         """
         along = (J * error[..., None]).sum(dim=1)
         squares = J.square().sum(dim=1)
@@ -444,13 +422,10 @@ class KinematicChannels:
         return torch.stack([*steps, cosine, log_length], dim=1)
 
     def _nearest_point(self, state: _State) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the robot's point that is nearest to the block, and its Jacobian.
+        """Return the robot's points (n, 3) nearest to the block, and their Jacobians (n, 3, J).
 
         Links are bounded by the boxes around their collision shapes' primitives. Mimic joints do
         not count as parts of their leaders.
-
-        Returns:
-            Points, shape (n, 3) [m], and their Jacobians at the independent joints, (n, 3, J).
         """
         T_root_link, tree = state.T_root_link, self._tree
         assert T_root_link is not None
@@ -498,10 +473,7 @@ def _rotation_error(goals: ToolTargets, T_root_tool: torch.Tensor) -> torch.Tens
 
 
 def _half_extents(geometry: torch.Tensor) -> torch.Tensor:
-    """Return half the edges of the boxes around primitives, shape (..., 3) [m].
-
-    geometry: Columns ``GEOMETRY`` of tokens, shape (..., 6).
-    """
+    """Return half the edges (..., 3) of boxes around primitives, by tokens' ``GEOMETRY`` [m]."""
     sphere, cylinder, box, a, b, c = geometry.unbind(-1)
     half = torch.stack([a, b, c * sphere + c / 2 * (cylinder + box)], dim=-1)
     half[..., :2] *= (1 - box / 2)[..., None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -81,27 +81,23 @@ class ObservationConfig:
 
 def observation_config(names: Collection[str], *, obstacles: int = 0) -> ObservationConfig:
     """Return the config of observations with some entries of ``CHANNELS``."""
-    config = ObservationConfig(obstacles=obstacles)
+    entries: dict[str, Any] = {"obstacles": obstacles}
+    special: dict[str, dict[str, Any]] = {
+        "points": {"points": NUM_POINTS},
+        "no_state": {"state": False},
+    }
     for name in names:
         if name not in CHANNELS:
             raise TaskError(f"unknown observation channel {name!r}{nearest(name, CHANNELS)}")
-        change: dict[str, Any] = {name: True}
-        if name == "points":
-            change = {"points": NUM_POINTS}
-        elif name == "no_state":
-            continue  # below, once points are known
-        config = replace(config, **change)
-    return replace(config, state=False) if "no_state" in names else config
+        entries |= special.get(name, {name: True})
+    return ObservationConfig(**entries)
 
 
 class LinkTokens:
     """Tokens of the links of a batch's environments; only codes of joint positions change."""
 
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
-        """Gather the tables of every environment.
-
-        env_robot_index: Robot of each environment, shape (n,), int64.
-        """
+        """Gather the tables of every environment."""
         device = env_robot_index.device
         movable = tables.movable_links[env_robot_index]
         max_movable = int(movable.sum(dim=1).max())
@@ -169,17 +165,13 @@ def tree_entries(
     action_mask: torch.Tensor,
     least_joints: int = 0,
 ) -> Observation:
-    """Return how the joints that actions move are connected, for K joints with padding.
+    """Return how the K joints that actions move are connected, with padding; all int64.
 
-    env_robot_index: Robot of each environment, shape (n,), int64.
-    action_mask: Links whose joint obeys actions, shape (n, L), bool.
-
-    Returns:
-        ``joints`` (n, K): the link of each joint, root first, -1 for padding. ``joint_parents``
-        (n, K): the place in ``joints`` of the joint above, -1 without one. ``joint_relations``
-        (n, K, K): a number below ``TREE_RELATIONS`` for each pair, its distance in joints up to
-        ``MAX_TREE_DISTANCE``, plus a multiple of ``MAX_TREE_DISTANCE + 1`` that says whether the
-        second joint is the first one, above it, below it, or on another branch. All int64.
+    ``joints`` (n, K): the link of each joint, root first, -1 for padding. ``joint_parents`` (n, K):
+    the place in ``joints`` of the joint above, -1 without one. ``joint_relations`` (n, K, K): a
+    number below ``TREE_RELATIONS`` for each pair, its distance in joints up to
+    ``MAX_TREE_DISTANCE``, plus a multiple of ``MAX_TREE_DISTANCE + 1`` that says whether the second
+    joint is the first one, above it, below it, or on another branch.
     """
     K = max(int(action_mask.sum(dim=1).max()), least_joints)
     order = (~action_mask).int().argsort(dim=1, stable=True)[:, :K]

@@ -151,14 +151,7 @@ class EpisodeSequence:
         self.next_episode.copy_(next_episode)
 
     def begin(self, mask: torch.Tensor) -> EpisodeRandom:
-        """Begin episodes in some environments.
-
-        mask: The environments, shape (n,), bool.
-
-        Returns:
-            Random numbers of the next episode of every environment, of those outside of the mask,
-            too.
-        """
+        """Begin episodes in some environments (n,); return the numbers of all next episodes."""
         if not is_host(mask.device):  # in place and without counting, as a CUDA graph has to
             random = EpisodeRandom(self._key, self.env_number, self.next_episode.clone())
             self.next_episode += mask
@@ -173,10 +166,7 @@ class EpisodeSequence:
         return random
 
     def _look_ahead(self) -> None:
-        """Compute words for the next episodes.
-
-        They are enough for ``AHEAD`` calls of ``begin``, which begin one episode at most.
-        """
+        """Compute words for ``AHEAD`` calls of ``begin``, which begin one episode each at most."""
         n, device = len(self.env_number), self.env_number.device
         self._first_ahead, self._uses_left = self.next_episode, AHEAD
         counter = self.env_number.new_zeros(4, n, AHEAD, STREAMS_AHEAD)
@@ -194,13 +184,9 @@ def require_seed(seed: int) -> None:
 
 
 def philox(counter: torch.Tensor, seed: int | torch.Tensor) -> torch.Tensor:
-    """Return the random words of counters by Philox4x32-10.
+    """Return the random words (4, m) of m counters (4, m) by Philox4x32-10, lowest words first.
 
-    counter: Words of m counters, the lowest first, shape (4, m), int64.
-    seed: The key, 0 to ``MAX_SEED``, or low and high words of each counter's key, shape (m, 2).
-
-    Returns:
-        Random words, shape (4, m), int64.
+    The seed is the key, 0 to ``MAX_SEED``, or low and high words of each counter's key, (m, 2).
     """
     # A round multiplies the third and the first word, in this order, and mixes in the others.
     factors, others = counter[::2].flip(0), counter[1::2]

@@ -28,10 +28,7 @@ class EpisodePlacer:
     def __init__(
         self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, spaces: StraightPaths
     ) -> None:
-        """Keep what describes the environments.
-
-        env_robot_index: Index of each environment's specification, shape (n,), int64.
-        """
+        """Keep what describes the environments."""
         self._specs = [specs[i] for i in env_robot_index.tolist()]
         self._spaces = spaces
 
@@ -42,11 +39,7 @@ class EpisodePlacer:
         q: torch.Tensor,
         block_pose: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return where episodes begin that were drawn, after the options.
-
-        q: Drawn joint positions, shape (n, J) [rad or m].
-        block_pose: Drawn poses of the blocks, shape (n, 7).
-        """
+        """Return q (n, J) and block poses (n, 7) of episodes that were drawn, after the options."""
         rows = self._rows(options, groups)
         q, block_pose = q.clone(), block_pose.clone()
         for env, (spec, wanted) in enumerate(zip(self._specs, rows, strict=True)):

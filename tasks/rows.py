@@ -70,10 +70,7 @@ class GoalChoices:
     """Indices of the possible goals of every specification and layout."""
 
     def __init__(self, sets: Sequence[GoalSet], fewest: int, env_spec_index: torch.Tensor) -> None:
-        """Gather the tables.
-
-        env_spec_index: Index in ``sets`` of each environment, shape (k,), int64.
-        """
+        """Gather the tables; ``env_spec_index`` has the set of each environment, (k,), int64."""
         # Row 0 of a set is for environments without obstacles; row l + 1 is for layout l.
         usable = [
             np.vstack([np.ones((1, len(goals.q)), bool), goals.usable.reshape(-1, len(goals.q))])
@@ -94,21 +91,11 @@ class GoalChoices:
         self._first_row = env_spec_index * num_rows
 
     def count(self, layout: torch.Tensor | None) -> torch.Tensor:
-        """Return the number of possible goals, shape (k,), int64.
-
-        layout: Layout of the obstacles in each environment, shape (k,), -1 without obstacles;
-            None if no environment has any.
-        """
+        """Return the number of possible goals, shape (k,); ``layout`` is as of ``begin``."""
         return self._count[self._row(layout)]
 
     def goals(self, layout: torch.Tensor | None, numbers: torch.Tensor) -> torch.Tensor:
-        """Return goals by their numbers among the possible ones.
-
-        numbers: Numbers below the count, shape (k, m), int64.
-
-        Returns:
-            Indices of goals, shape (k, m), int64.
-        """
+        """Return goals (k, m) by their numbers among the possible ones, below the count."""
         return self._index[self._row(layout)[:, None], numbers].long()
 
     def _row(self, layout: torch.Tensor | None) -> torch.Tensor:

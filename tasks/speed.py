@@ -56,11 +56,8 @@ def measure_speed(
 
     The measurement covers whole episodes: the cost of contacts depends on the time since they
     began, and a faster simulator would otherwise get further into them. The seed gives all
-    simulators the same episodes, since some cost a tenth more than others.
-
-    seconds: Least duration of the measurement [s].
-    clock: Function that returns the time [s]; by default one that first waits for the device
-        of the batch, which otherwise runs behind the calls.
+    simulators the same episodes, since some cost a tenth more than others. The clock [s] by default
+    waits for the batch's device first, which otherwise runs behind the calls.
     """
     if clock is None:
         clock = time.perf_counter if is_host(batch.device) else _time_on_gpu

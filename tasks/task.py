@@ -12,7 +12,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -493,7 +492,7 @@ def require_task_config(config: TaskConfig) -> None:
         if isinstance(value, str) and isinstance(field.default, str):
             continue
         numbers = value if isinstance(value, tuple) else (value,)
-        if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
+        if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
             raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
     # The largest are far above all uses: a file from elsewhere shall not fill the memory.
     for field_name, minimum, maximum in (

@@ -19,31 +19,24 @@ from morphgen.tasks.task import STANDARD_FIELDS, EnvSpec, StepResult, Task, Task
 from morphgen.typing import Array
 
 
-def require_envs(task: Task[Any, Any], envs: object) -> None:
-    """Require what ``Task.make_envs`` returns."""
-    if not isinstance(envs, TaskEnvs):
-        raise TaskError(
-            f"task {task.name!r}: make_envs returned {type(envs).__name__}; expected TaskEnvs"
-        )
+def _wrong_type(task: str, method: str, result: object, expected: str) -> TaskError:
+    returned = type(result).__name__
+    return TaskError(f"task {task!r}: {method} returned {returned}; expected {expected}")
 
 
-def require_start(task: str, start: object, k: int, num_joints: int) -> None:
+def _require_start(task: str, start: object, k: int, num_joints: int) -> None:
     """Require what ``TaskEnvs.begin`` returns."""
     if not isinstance(start, tuple) or len(start) != 2:
-        raise TaskError(
-            f"task {task!r}: begin returned {type(start).__name__}; expected two tensors: joint "
-            "positions and poses of the block"
-        )
+        expected = "two tensors: joint positions and poses of the block"
+        raise _wrong_type(task, "begin", start, expected)
     _require_shape(task, "begin: the joint positions", start[0], (k, num_joints))
     _require_shape(task, "begin: the poses of the block", start[1], (k, 7))
 
 
-def require_result(task: str, result: object, k: int) -> None:
+def _require_result(task: str, result: object, k: int) -> None:
     """Require what ``TaskEnvs.evaluate`` returns."""
     if not isinstance(result, StepResult):
-        raise TaskError(
-            f"task {task!r}: evaluate returned {type(result).__name__}; expected a StepResult"
-        )
+        raise _wrong_type(task, "evaluate", result, "a StepResult")
     if not result.terms:
         raise TaskError(f"task {task!r}: evaluate: no reward terms; expected one or more")
     for name in ("success", "terminated", "distance", "score"):
@@ -59,7 +52,7 @@ def require_result(task: str, result: object, k: int) -> None:
         _require_shape(task, f"evaluate: the reward term {name!r}", value, (k,))
 
 
-def require_fields(task: Task[Any, Any], values: Mapping[str, torch.Tensor], k: int) -> None:
+def _require_fields(task: Task[Any, Any], values: Mapping[str, torch.Tensor], k: int) -> None:
     """Require what ``TaskEnvs.observe`` returns: every field that the task declares."""
     declared = {field.name: field for field in task.fields}
     for name in declared.keys() ^ values.keys():
@@ -111,10 +104,7 @@ class TaskGroups:
     def __init__(
         self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, num_joints: int
     ) -> None:
-        """Group environments.
-
-        env_robot_index: Index of each environment's specification, shape (n,), int64.
-        """
+        """Group environments by the tasks of their specifications."""
         n, device = len(env_robot_index), env_robot_index.device
         env_specs = [specs[i] for i in env_robot_index.tolist()]
         self._num_joints = num_joints
@@ -134,7 +124,8 @@ class TaskGroups:
             rows = torch.nonzero(is_at_task)[:, 0]
             member_index = row_of_spec.to(device)[env_robot_index[rows]]
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
-            require_envs(task, envs)
+            if not isinstance(envs, TaskEnvs):
+                raise _wrong_type(name, "make_envs", envs, "TaskEnvs")
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps
@@ -189,7 +180,7 @@ class TaskGroups:
         layout: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         start = group.envs.begin(mask, random, layout)
-        require_start(group.task.name, start, len(group.rows), self._num_joints)
+        _require_start(group.task.name, start, len(group.rows), self._num_joints)
         return start
 
     @property
@@ -213,39 +204,34 @@ class TaskGroups:
         results = []
         for group in self._groups.values():
             result = group.envs.evaluate(self._group_state(group, state))
-            require_result(group.task.name, result, len(group.rows))
+            _require_result(group.task.name, result, len(group.rows))
             results.append((group.rows, result))
         rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for _, result in results]
         if len(results) == 1:
             return BatchResult(**vars(results[0][1]), reward=rewards[0])
         rows = [rows for rows, _ in results]
-        group_results = [result for _, result in results]
-        names = dict.fromkeys(name for result in group_results for name in result.terms)
-        zeros = [torch.zeros_like(result.distance) for result in group_results]
-        return BatchResult(
-            success=self._scatter(rows, [result.success for result in group_results]),
-            terminated=self._scatter(rows, [result.terminated for result in group_results]),
-            distance=self._scatter(rows, [result.distance for result in group_results]),
-            score=self._scatter(rows, [result.score for result in group_results]),
-            terms={
-                name: self._scatter(
-                    rows,
-                    [
-                        result.terms.get(name, zero)
-                        for result, zero in zip(group_results, zeros, strict=True)
-                    ],
-                )
-                for name in names
-            },
-            reward=self._scatter(rows, rewards),
-            angle=self._scatter_angles(rows, [result.angle for result in group_results]),
-        )
+        parts = [result for _, result in results]
+        names = dict.fromkeys(name for part in parts for name in part.terms)
+        values: dict[str, Any] = {
+            name: self._scatter(rows, [getattr(part, name) for part in parts])
+            for name in ("success", "terminated", "distance", "score")
+        }
+        values["terms"] = {
+            name: self._scatter(
+                rows, [part.terms.get(name, torch.zeros_like(part.distance)) for part in parts]
+            )
+            for name in names
+        }
+        if any(part.angle is not None for part in parts):
+            nothing = [torch.full_like(part.distance, torch.nan) for part in parts]
+            angles = [part.angle for part in parts]
+            values["angle"] = self._scatter(
+                rows, [a if b is None else b for a, b in zip(nothing, angles, strict=True)]
+            )
+        return BatchResult(**values, reward=self._scatter(rows, rewards))
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the observation fields of all tasks, shape (n, size) each, as copies.
-
-        block_pose: Pose of the block, shape (n, 7); zeros if there is none.
-        """
+        """Return the observation fields of all tasks, shape (n, size) each, as copies."""
         n = len(self._row)
         values = {
             field.name: torch.zeros(n, field.size, device=self._row.device)
@@ -254,7 +240,7 @@ class TaskGroups:
         for group in self._groups.values():
             alone = len(self._groups) == 1
             task_values = group.envs.observe(block_pose if alone else block_pose[group.rows])
-            require_fields(group.task, task_values, len(group.rows))
+            _require_fields(group.task, task_values, len(group.rows))
             for name, value in task_values.items():
                 if alone:
                     values[name] = value.clone()
@@ -263,10 +249,7 @@ class TaskGroups:
         return values
 
     def tool_targets(self, block_pose: torch.Tensor) -> ToolTargets:
-        """Return the points and orientations that the tasks want the tool at.
-
-        block_pose: Pose of the block, shape (n, 7); zeros if there is none.
-        """
+        """Return the points and orientations that the tasks want the tool at."""
         n, device = len(self._row), self._row.device
         groups = list(self._groups.values())
         task_points = [group.envs.target_points(block_pose[group.rows]) for group in groups]
@@ -324,18 +307,6 @@ class TaskGroups:
         for name, value in values.items():
             values[name] = None if value is None else value[group.rows]
         return TaskState(**values)
-
-    def _scatter_angles(
-        self, rows: Sequence[torch.Tensor], angles: Sequence[torch.Tensor | None]
-    ) -> torch.Tensor | None:
-        """Return angles of the batch, nan where a task has none; None if no task has any."""
-        if all(angle is None for angle in angles):
-            return None
-        batch_angles = torch.full(self._row.shape, torch.nan, device=self._row.device)
-        for group_rows, angle in zip(rows, angles, strict=True):
-            if angle is not None:
-                batch_angles[group_rows] = angle
-        return batch_angles
 
     def _scatter(
         self, rows: Sequence[torch.Tensor], values: Sequence[torch.Tensor]

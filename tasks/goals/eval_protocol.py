@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from morphgen.benchmark.split import SIDES, Member, Side, Split
@@ -114,36 +113,25 @@ def expected_robots(
     jobs: int = 1,
 ) -> list[ExpectedRobot]:
     """Return what a submission must hold for every member, train robots first."""
-    expect = _Expect(library.folders, protocol.goals)
     members = [(side, member) for side in SIDES for member in split.side(side)]
-    return list(parallel_map(expect, members, jobs))
+    return list(parallel_map(partial(_expect, library, protocol.goals), members, jobs))
 
 
-@dataclass(frozen=True, eq=False)
-class _Expect:
-    """Compute the key of a member's goal set without sampling it; sent to worker processes."""
-
-    folders: tuple[Path, ...]
-    goals: GoalConfig
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
-
-    def __call__(self, sided: tuple[Side, Member]) -> ExpectedRobot:
-        side, member = sided
-        if not TASKS.is_installed(member.task):
-            raise TaskError(f"robot {member.name!r}: unknown task {member.task!r}")
-        robot = member_with_primitives(member, self.library)
-        key = goal_set_key(
-            robot,
-            TASKS[member.task],
-            self.goals.task_config(member.task),
-            obstacles=member.obstacles,
-            seed=self.goals.seed,
-            ground=ground_under(robot),
-        )
-        return ExpectedRobot(side, member, key, reach(robot))
+def _expect(library: Library, goals: GoalConfig, sided: tuple[Side, Member]) -> ExpectedRobot:
+    """Compute the key of a member's goal set without sampling it, in a worker process."""
+    side, member = sided
+    if not TASKS.is_installed(member.task):
+        raise TaskError(f"robot {member.name!r}: unknown task {member.task!r}")
+    robot = member_with_primitives(member, library)
+    key = goal_set_key(
+        robot,
+        TASKS[member.task],
+        goals.task_config(member.task),
+        obstacles=member.obstacles,
+        seed=goals.seed,
+        ground=ground_under(robot),
+    )
+    return ExpectedRobot(side, member, key, reach(robot))
 
 
 def _plain(constants: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -104,8 +104,7 @@ def audit_goals(
     set).
     """
     members = sided_members(split)
-    examiner = _MemberExaminer(library.folders, goals)
-    examined = list(parallel_map(examiner, members, jobs))
+    examined = list(parallel_map(partial(_examine, library, goals), members, jobs))
     return (
         *_set_findings(split, goals, members, examined),
         *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),
@@ -119,29 +118,21 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
     A task that is unknown here is found, too: error ``task-unknown``.
     """
     codes = CODES if findings is None else {finding.code for finding in findings}
-    unknown = [
-        _finding(
-            "task-unknown",
-            side,
-            member.name,
-            f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}",
-        )
-        for side, member in sided_members(split)
-        if member.task not in TASKS
-    ]
+    more: list[Finding] = []
+    for side, member in sided_members(split):
+        if member.task not in TASKS:
+            reason = f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}"
+            more.append(_finding("task-unknown", side, member.name, reason))
+    more += findings or ()
     used_acceptances = {f"accepted {code}" for code in codes}
     remaining = [
         finding
         for finding in audit.findings
         if not (finding.code == "accepted-unused" and finding.where in used_acceptances)
     ]
-    accepted = list(audit.accepted)
-    for finding in (*unknown, *(findings or ())):
-        if finding.code in split.accepted:
-            accepted.append((finding, split.accepted[finding.code]))
-        else:
-            remaining.append(finding)
-    return replace(audit, findings=tuple(remaining), accepted=tuple(accepted))
+    remaining += [finding for finding in more if finding.code not in split.accepted]
+    accepted = [(each, split.accepted[each.code]) for each in more if each.code in split.accepted]
+    return replace(audit, findings=tuple(remaining), accepted=(*audit.accepted, *accepted))
 
 
 @dataclass(frozen=True)
@@ -159,34 +150,23 @@ class _Examination:
     certificate_errors: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _MemberExaminer:
-    """Samples and compares the goal set of a member in a worker process."""
-
-    folders: tuple[Path, ...]
-    goals: SplitGoals
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
-
-    def __call__(self, sided_member: tuple[Side, Member]) -> _Examination:
-        side, member = sided_member
-        result = self.goals.sets.get((side, member.name))
-        try:
-            robot = member_with_primitives(member, self.library)
-            digest = robot_hash(robot, visuals=False)
-            spec = env_spec(
-                robot, member.task, self.goals.config, obstacles=member.obstacles, anew=True
-            )
-            key = spec.goals.key
-            if result is None or result.goals is None:
-                return _Examination(key, digest)
-            errors = certify_goal_set(result.goals, spec) if result.robot_hash == digest else ()
-            is_same = _are_equal(result.goals, spec.goals)
-            return _Examination(key, digest, "", is_same, errors)
-        except MorphgenError as error:
-            return _Examination(error=str(error))
+def _examine(
+    library: Library, goals: SplitGoals, sided_member: tuple[Side, Member]
+) -> _Examination:
+    """Sample the goal set of a member anew and compare, in a worker process."""
+    side, member = sided_member
+    stored = goals.sets.get((side, member.name))
+    try:
+        robot = member_with_primitives(member, library)
+        digest = robot_hash(robot, visuals=False)
+        spec = env_spec(robot, member.task, goals.config, obstacles=member.obstacles, anew=True)
+        key = spec.goals.key
+        if stored is None or stored.goals is None:
+            return _Examination(key, digest)
+        errors = certify_goal_set(stored.goals, spec) if stored.robot_hash == digest else ()
+        return _Examination(key, digest, "", _are_equal(stored.goals, spec.goals), errors)
+    except MorphgenError as error:
+        return _Examination(error=str(error))
 
 
 def _are_equal(a: GoalSet, b: GoalSet) -> bool:

@@ -80,8 +80,7 @@ def goal_set(
     """Return a robot's goal set: the shipped one, the packaged one, the cached one, or a new one.
 
     A set depends on what ``goal_set_key`` says. A smaller set is the beginning of a larger one.
-
-    ground: Height of the ground in the root frame [m].
+    The ground is a height in the root frame [m].
     """
     if seed < 0 or config.num_goals < 1:
         raise BenchmarkError(
@@ -132,8 +131,7 @@ def goal_set_key(
 ) -> str:
     """Return the hash of everything that a goal set depends on: 64 hexadecimal digits.
 
-    These are robot, ignored pairs of links, seed, ground, constants and obstacles, not the robot's
-    name. For the arguments see ``goal_set``.
+    These are robot, ignored pairs of links, seed, ground, constants and obstacles, not its name.
     """
     index = robot.link_index
     ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)

@@ -15,8 +15,7 @@ import json
 import lzma
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 
 from morphgen.benchmark.split import Member
@@ -53,10 +52,10 @@ def _members(name: str) -> Iterator[Member]:
 def write_sets(folder: Path = FOLDER, jobs: int = 1) -> None:
     """Sample and certify the sets of all shipped splits, and write them with their index."""
     members = list(shipped_members().values())
-    sampler = _Sampler(default_library(()).folders)
+    sample = partial(_sample, default_library(()))
     records: dict[str, dict[str, object]] = {}
     for member, (key, content) in zip(
-        members, parallel_map(sampler, members, jobs, chunk=1), strict=True
+        members, parallel_map(sample, members, jobs, chunk=1), strict=True
     ):
         file = f"{key[:16]}.npz.xz"
         compressed = lzma.compress(content, preset=9)
@@ -84,24 +83,14 @@ def _has(path: Path, content: bytes) -> bool:
     return path.is_file() and lzma.decompress(path.read_bytes()) == content
 
 
-@dataclass(frozen=True, eq=False)
-class _Sampler:
-    """Samples the set of a member in a worker process."""
-
-    folders: tuple[Path, ...]
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
-
-    def __call__(self, member: Member) -> tuple[str, bytes]:
-        """Return the key and the content of a member's set."""
-        robot = member_with_primitives(member, self.library)
-        spec = env_spec(robot, member.task, GoalConfig(), obstacles=member.obstacles, anew=True)
-        faults = certify_goal_set(spec.goals, spec)
-        if faults:
-            raise BenchmarkError(f"robot {member.name!r} at {member.task}: {faults[0]}")
-        return spec.goals.key, set_npz(spec.goals)
+def _sample(library: Library, member: Member) -> tuple[str, bytes]:
+    """Return the key and the content of a member's set, in a worker process."""
+    robot = member_with_primitives(member, library)
+    spec = env_spec(robot, member.task, GoalConfig(), obstacles=member.obstacles, anew=True)
+    faults = certify_goal_set(spec.goals, spec)
+    if faults:
+        raise BenchmarkError(f"robot {member.name!r} at {member.task}: {faults[0]}")
+    return spec.goals.key, set_npz(spec.goals)
 
 
 def sizes_text() -> str:

@@ -15,14 +15,14 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.split import Member, Side, Split, require_side, sided_members
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
 from morphgen.grammar.library import Library
@@ -128,10 +128,7 @@ def sample_robot_goals(
     certified: bool = False,
     cache: Path | None = None,
 ) -> GoalResult:
-    """Sample a robot's goal set, or take it from the cache; a failure becomes ``error``.
-
-    robot: The robot with its final collision shapes.
-    """
+    """Sample a robot's goal set, or take it from the cache; a failure becomes ``error``."""
     result = GoalResult(robot.name, None, task, obstacles)
     try:
         spec = env_spec(robot, task, config, obstacles=obstacles, cache=cache)
@@ -159,47 +156,34 @@ def sample_split_goals(
     A robot without a goal set does not stop the others. An interrupted run continues from the sets
     in the cache.
     """
-    sampler = _MemberSampler(library.folders, config or GoalConfig(), certified, cache)
-    return list(parallel_map(sampler, sided_members(split), jobs, chunk=1))
+    sample = partial(_sample_member, library, config, certified, cache)
+    return list(parallel_map(sample, sided_members(split), jobs, chunk=1))
 
 
-@dataclass(frozen=True, eq=False)
-class _MemberSampler:
-    """Samples the goal set of a member in a worker process."""
-
-    folders: tuple[Path, ...]
-    config: GoalConfig
-    certified: bool
-    cache: Path | None
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
-
-    def __call__(self, sided_member: tuple[Side, Member]) -> GoalResult:
-        side, member = sided_member
-        try:
-            robot = member_with_primitives(member, self.library)
-        except MorphgenError as error:
-            return GoalResult(member.name, side, member.task, member.obstacles, error=str(error))
-        result = sample_robot_goals(
-            robot,
-            member.task,
-            self.config,
-            obstacles=member.obstacles,
-            certified=self.certified,
-            cache=self.cache,
-        )
-        return replace(result, side=side)
+def _sample_member(
+    library: Library,
+    config: GoalConfig | None,
+    certified: bool,
+    cache: Path | None,
+    sided_member: tuple[Side, Member],
+) -> GoalResult:
+    """Sample the goal set of a member, in a worker process."""
+    side, member = sided_member
+    task, obstacles = member.task, member.obstacles
+    try:
+        robot = member_with_primitives(member, library)
+    except MorphgenError as error:
+        return GoalResult(member.name, side, task, obstacles, error=str(error))
+    result = sample_robot_goals(
+        robot, task, config, obstacles=obstacles, certified=certified, cache=cache
+    )
+    return replace(result, side=side)
 
 
 def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
-    """Write the goal sets of a split into the folder where it is built, and their checksums.
+    """Write the goal sets of a split into the folder where it is built; return their folder.
 
-    The same sets give the same bytes. Earlier sets are replaced.
-
-    Returns:
-        The folder of the sets.
+    The checksums of the split are updated, and earlier sets replaced.
     """
     require_goal_sets(results)
     folder = home / GOALS
@@ -215,11 +199,9 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
                 for name, content in files.items():
                     (partial / name).parent.mkdir(exist_ok=True)
                     (partial / name).write_bytes(content)
-            other_sums = {
-                name: value for name, value in sums.items() if not name.startswith(f"{GOALS}/")
-            }
-            goal_sums = {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
-            write_atomic(home / SUMS_FILE, sums_text(other_sums | goal_sums))
+            sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
+            sums |= {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
+            write_atomic(home / SUMS_FILE, sums_text(sums))
     except OSError as error:
         path = error.filename or home
         raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
@@ -274,8 +256,6 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
         raise BenchmarkError(f"{path}: no such file; morphgen split build --goals makes goal sets")
     try:
         return _parse_index(read_json(path), folder)
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchmarkError(f"{path}: not an index of goal sets: {error!r}") from error
 
@@ -309,8 +289,7 @@ def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[
     """Yield the files of goal sets: paths in their folder, and contents."""
     records = []
     for result in results:
-        if result.goals is None:
-            raise ValueError(f"{result.robot} has no goals")
+        assert result.goals is not None
         name = f"{result.side}/{result.robot}.npz"
         content = set_npz(result.goals)
         records.append(goal_record(result) | {"file": name, "sha256": _sha256(content)})
@@ -327,12 +306,8 @@ def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[
 
 def goal_record(result: GoalResult) -> dict[str, object]:
     """Return a result as JSON data, without the goals themselves."""
-    record: dict[str, object] = {
-        "robot": result.robot,
-        "side": result.side,
-        "task": result.task,
-        "obstacles": result.obstacles,
-    }
+    keys = ("robot", "side", "task", "obstacles")
+    record: dict[str, object] = {key: getattr(result, key) for key in keys}
     if result.goals is None:
         return record
     return record | {

@@ -30,7 +30,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.actions import BINS, ActionKind, decode_actions
-from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
     RENDER_MODES,
@@ -52,7 +52,7 @@ from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
-from morphgen.tasks.task import STANDARD_FIELDS, NumpyRow, TaskConfig, TaskState
+from morphgen.tasks.task import STANDARD_FIELDS, NumpyRow, StepResult, TaskConfig, TaskState
 
 Float32 = NDArray[np.float32]
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -65,10 +65,8 @@ def numpy_stepper(
 ) -> NumpyStepper | None:
     """Return the stepper of a batch of one environment.
 
-    Returns:
-        None if the batch is not on the CPU, or if its task has no formulas in NumPy: its
-        ``TaskEnvs`` has no ``numpy_row``, or is of a class that changes ``evaluate`` or ``observe``
-        without it.
+    There is none if the batch is not on the CPU, or if its task has no formulas in NumPy: its
+    ``TaskEnvs`` has no ``numpy_row``, or a class that changes ``evaluate`` or ``observe`` without.
     """
     envs = batch.groups[batch.specs[0].task]
     depth = {
@@ -151,20 +149,9 @@ class NumpyStepper:
         for name, values in self._constant.items():
             observation[name] = values.copy()
         observation |= self._requested()
-        terms = {name: float(term) for name, term in result.terms.items()}
-        terminated = bool(result.terminated)
-        info = {
-            "success": bool(result.success),
-            "is_success": bool(result.success),
-            "distance": float(result.distance),
-            "score": float(result.score),
-            "diverged": diverged,
-            "terms": terms,
-        }
-        if result.angle is not None:
-            info["angle"] = float(result.angle)
+        info, terminated = _info(result, diverged), bool(result.terminated)
         truncated = (steps >= self._max_episode_steps or diverged) and not terminated
-        return observation, sum(terms.values()), terminated, truncated, info
+        return observation, sum(info["terms"].values()), terminated, truncated, info
 
     def _normalized(self, action: NDArray[Any]) -> Float32:
         """Return an action as fractions of the joints' largest steps; see ``decode_actions``."""
@@ -216,6 +203,21 @@ class NumpyStepper:
             np.bool_(diverged),
         ]
         return TaskState(*values)
+
+
+def _info(result: StepResult | Step, diverged: bool) -> dict[str, Any]:
+    """Return the info of a step of one environment, whose result has numbers or one row."""
+    info: dict[str, Any] = {
+        "success": bool(result.success),
+        "is_success": bool(result.success),
+        "distance": float(result.distance),
+        "score": float(result.score),
+        "diverged": diverged,
+        "terms": {name: float(term) for name, term in result.terms.items()},
+    }
+    if result.angle is not None:
+        info["angle"] = float(result.angle)
+    return info
 
 
 class _Tokens:
@@ -311,27 +313,23 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     ) -> None:
         """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
-        robot: A robot, or a name that ``load_robot`` accepts: ``ur5-plane``, words of
-            ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
-            fitted primitives.
-        size: Width and height of rendered pictures [pixels].
+        The arguments are those of ``make_batch``; pictures have a width and a height [pixels].
         """
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         sim = sim or DEFAULT_SIMULATOR
         task_kind = TASKS[task]
         observe = from_mapping("observe", ObservationConfig, observe)
         contacts = from_mapping("contacts", Contacts, contacts)
-        config = from_mapping("config", partial(task_config, task), config)
         self._self_collision = (contacts or Contacts()).self_collision
         self._self_collision &= SIMULATORS[sim].simulates_contacts
         config_type = task_kind.config_type
-        if config is not None and not isinstance(config, config_type):
+        config = from_mapping("config", partial(task_config, task), config) or config_type()
+        if not isinstance(config, config_type):
             raise TaskError(
                 f"{type(config).__name__} is not the config of {task}: expected "
                 f"{config_type.__name__}"
             )
-        limit = (config or config_type()).max_episode_steps
-        require_limit(_limit_for_make(), limit)
+        require_limit(_limit_for_make(), config.max_episode_steps)
         if goal_env and not task_kind.goal_field:
             raise TaskError(
                 f"goal_env: task {task} has no goals for hindsight replay; see Task.goal_field"
@@ -349,7 +347,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             obstacles=obstacles,
             layouts=layouts,
             goal_seed=goal_seed,
-            configs=() if config is None else (config,),
+            configs=(config,),
             cache=cache,
             library=library,
             sim=sim,
@@ -422,14 +420,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     def _reward_of_goals(
         self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: object
     ) -> NDArray[np.float32]:
-        """Return the reward of achieving a goal while another is desired, with ``goal_env=True``.
-
-        achieved_goal: Goals, shape (g,) or (..., g).
-        desired_goal: Goals of the same shape.
-
-        Returns:
-            Rewards, shape () or (...), such as those of ``step``.
-        """
+        """Return rewards (...) as of ``step`` for goals (..., g), with ``goal_env=True``."""
         achieved, desired = (
             np.ascontiguousarray(goals, np.float32) for goals in (achieved_goal, desired_goal)
         )
@@ -505,18 +496,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             self._final_physics = step.q, step.block_pose
             if before is not None:
                 self._final_state = final_state(before, step)
-        info = {
-            "success": bool(step.success[0]),
-            "is_success": bool(step.success[0]),
-            "distance": float(step.distance[0]),
-            "score": float(step.score[0]),
-            "diverged": bool(step.diverged[0]),
-            "terms": {name: float(term[0]) for name, term in step.terms.items()},
-        }
-        if step.angle is not None:
-            info["angle"] = float(step.angle[0])
-        observation, ended = self._without_padding(step.final_observation), step.terminated
-        return observation, float(step.reward[0]), bool(ended[0]), bool(step.truncated[0]), info
+        observation, ended = self._without_padding(step.final_observation), bool(step.terminated)
+        info = _info(step, bool(step.diverged))
+        return observation, float(step.reward), ended, bool(step.truncated), info
 
     def _in_goal_form(self, observation: NumpyObservation) -> NumpyObservation:
         """Return an observation of the current state as ``goal_env`` asks for it."""

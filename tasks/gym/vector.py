@@ -197,10 +197,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
-        """Wrap a batch; ``reset`` begins new episodes.
-
-        size: Width and height of rendered pictures [pixels].
-        """
+        """Wrap a batch; pictures have a width and a height [pixels]."""
         self.batch, self.num_envs = batch, batch.num_envs
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}

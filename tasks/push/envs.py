@@ -130,10 +130,7 @@ class PushEnvs(TaskEnvs):
 
 
 def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> StepResult:
-    """Compare blocks with their lines.
-
-    line: y that each block must cross, shape (k,) [m].
-    """
+    """Compare blocks with the lines, y (k,) [m], that they must cross."""
     y = state.block_pose[..., 1]
     to_go = positive_part(line - y)
     success = (y > line) & ~state.diverged
@@ -154,12 +151,9 @@ def push_terms(
     limit_violation: torch.Tensor,
     success: torch.Tensor,
 ) -> dict[str, torch.Tensor]:
-    """Return the reward terms of push (paper, tables of reward terms).
+    """Return the reward terms of push (paper, tables of reward terms), shape (k,) each.
 
-    to_go: Distance of the block from the line, 0 beyond it, shape (k,) [m].
-    approach: Distance between tool and block, shape (k,) [m].
-    limit_violation: See ``TaskState``, shape (k,).
-    success: Whether the block is across, shape (k,), bool.
+    They depend on the distances of the block from the line and from the tool [m].
     """
     return {
         "joint_limits": -config.joint_limit_weight * limit_violation,

@@ -25,7 +25,7 @@ from morphgen.model.kinematics import (
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.scenes.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
+from morphgen.tasks.scenes.obstacles import draw_obstacles, layout_faults, no_obstacles
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 
@@ -72,8 +72,6 @@ def push_region(
     reach is the effective reach, or for robots that slide half of the range of y of the tool; for
     slides along one direction only it is divided by the square root of 2, since the tool has to
     swing around the block.
-
-    ground: Height of the ground in the root frame [m].
     """
     shoulder, arm_reach = tool_reach(robot)  # refuses a robot whose tool does not move
     tool_positions = _tool_positions(robot)
@@ -102,13 +100,7 @@ def push_region(
 
 
 def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator) -> Array:
-    """Draw poses of blocks that stand on the ground, uniform in the region and turned at random.
-
-    ground: Height of the ground [m].
-
-    Returns:
-        Shape (n, 7).
-    """
+    """Draw poses (n, 7) of blocks on the ground, uniform in the region and turned at random."""
     x, y, yaw = rng.random((n, 3)).T
     blocks = np.empty((n, 7))
     blocks[:, 0] = region.x[0] + x * (region.x[1] - region.x[0])
@@ -129,13 +121,8 @@ def effective_reach(reach: float, height: float, size: float) -> float:
     """Return the largest horizontal distance from the shoulder to a block's centre in reach [m].
 
     The block's edge is ``size`` times this effective reach e, so its centre is size e / 2 above the
-    ground, and by Pythagoras e^2 + (height - size e / 2)^2 = reach^2; e is the larger root.
-
-    reach: Largest distance of the tool from the shoulder [m].
-    height: Height of the shoulder above the ground [m].
-
-    Returns:
-        The effective reach; 0 if the tool cannot get down to the block.
+    ground, and by Pythagoras e^2 + (height - size e / 2)^2 = reach^2; e is the larger root, or 0
+    if the tool cannot get down to the block. The height is that of the shoulder [m].
     """
     a, b = 1 + size**2 / 4, height * size / 2
     root = b**2 - a * (height**2 - reach**2)
@@ -226,10 +213,7 @@ class FeasibilityTest:
         self._bank_q, self._bank_tools = sample_tools_in_box(space, low, high, rng)
 
     def __call__(self, blocks: Array) -> Feasibility:
-        """Find certificates for blocks.
-
-        blocks: Poses of blocks that stand on the ground, shape (n, 7).
-        """
+        """Find certificates for blocks that stand on the ground at poses (n, 7)."""
         n, edge = len(blocks), self._region.edge
         clear = path_is_clear(self._space, self._region.line, blocks)
         behind, across = (np.full((n, self._robot.dof), np.nan) for _ in range(2))
@@ -273,13 +257,8 @@ class FeasibilityTest:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Solve inverse kinematics for goals (m, 2) from k configurations of the bank each.
 
-        start: Indices of configurations, shape (m, k).
-        tool_xy: Positions of the tool on the ground plane, shape (m, 2) [m].
-        blocks: Poses of the block, shape (m, 7), or None.
-
-        Returns:
-            Configurations, shape (m, k, dof), and which of them are free and bring the tool to its
-            goal between the bottom and the top of the block, shape (m, k).
+        Return configurations (m, k, dof), and which of them are free, with the block at its pose
+        if there is one, and bring the tool to its goal between the block's bottom and top, (m, k).
         """
         (m, k), edge = start.shape, self._region.edge
         height = self._bank_tools[start.ravel(), 2] - self._ground
@@ -300,14 +279,7 @@ class FeasibilityTest:
 
 
 def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bool_]:
-    """Return whether the paths of blocks are clear of obstacles and base, even if they turn.
-
-    line: y where the paths end [m].
-    blocks: Poses at the start, shape (n, 7).
-
-    Returns:
-        Shape (n,).
-    """
+    """Return whether paths of blocks (n, 7) to a line are clear of obstacles and base, (n,)."""
     assert space.scene.block is not None
     step = _SPACING * space.scene.block.size[1]
     parts = int((line - blocks[:, 1].min()) / step) + 2
@@ -324,13 +296,9 @@ def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bo
 def sample_tools_in_box(
     space: FreeSpace, low: Array, high: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Sample free configurations whose tools are in a box.
+    """Sample free configurations (n, dof) whose tools (n, 3) [m] are in a box: ``_BANK`` at most.
 
-    low: Lowest corner of the box in the root frame, shape (3,) [m].
-
-    Returns:
-        Configurations, shape (n, dof), and tool positions, shape (n, 3) [m]; at most ``_BANK``, and
-        fewer if ``_ROUNDS`` rounds find fewer.
+    They are fewer if ``_ROUNDS`` rounds find fewer.
     """
     robot = space.scene.robot
     kept, kept_tools = np.zeros((0, robot.dof)), np.zeros((0, 3))
@@ -346,13 +314,9 @@ def sample_tools_in_box(
 
 
 def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Array, Indices]:
-    """Return tools of the first configurations, and which of these are in a box: ``_BANK`` at most.
+    """Return tools (m, 3) of the first m configurations, and indices of those in a box.
 
-    q: Configurations, shape (n, dof).
-    low: Lowest corner of the box in the root frame, shape (3,) [m].
-
-    Returns:
-        Tool positions, shape (m, 3) [m], where m <= n, and increasing indices below m.
+    There are ``_BANK`` indices at most, increasing; the other tools are not computed.
     """
     tools, inside = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
     for begin in range(0, len(q), _FEW):
@@ -365,11 +329,7 @@ def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Arra
 
 
 def _nearest(goals: Array, points: Array, count: int) -> Indices:
-    """Return the indices of the nearest points of each goal, in order, shape (n, at most count).
-
-    goals: Positions, shape (n, 2).
-    points: Positions, shape (m, 2).
-    """
+    """Return indices of the points (m, 2) nearest to goals (n, 2), in order, (n, up to count)."""
     count = min(count, len(points))
     x, y = (goals[:, i, None] - points[:, i] for i in range(2))
     distance = np.sqrt(x * x + y * y)
@@ -469,19 +429,14 @@ def sample_starts(
     blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
     x, y, z, qw, qx, qy, qz = blocks[0].tolist()
     q = _starts(space, blocks, start_seeds)
-    boxes: tuple[Block, ...] = ()
-    layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
+    among = no_obstacles(len(q))
     if obstacles:
-        size_seeds, layout_seeds = obstacle_seeds.spawn(2)
-        count, size = config.obstacles, config.obstacle_size
-        boxes = draw_boxes(robot, count, size, np.random.default_rng(size_seeds))
-        layouts, usable = draw_layouts(
-            FreeSpace(Scene(robot, block=block, obstacles=boxes, ground=ground)),
-            (config.train_layouts, config.eval_layouts),
-            layout_seeds,
+        among = draw_obstacles(
+            space.scene,
+            config,
+            obstacle_seeds,
             lambda space: _feasible_starts(space, region.line, q, blocks, behind, across),
         )
-        boxes = place_boxes(boxes, layouts[0])
     return PushStartSet(
         q=q,
         blocks=blocks,
@@ -489,13 +444,11 @@ def sample_starts(
         line=region.line,
         scale=region.scale,
         ground=ground,
-        obstacles=boxes,
-        layouts=layouts,
-        usable=usable,
         tried=tried,
         accepted=len(starts),
         behind=behind,
         across=across,
+        **among,
         **identity,
     )
 
@@ -542,11 +495,7 @@ def _feasible(
 
 
 def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
-    """Require a pose of the block from which the robot can push it, as ``sample_starts`` does.
-
-    block: Pose of the block, shape (7,).
-    line: y that the block's centre must cross [m].
-    """
+    """Require a pose (7,) of the block from which the robot can push it, as ``sample_starts``."""
     assert space.scene.block is not None
     edge, ground = space.scene.block.size[0], space.scene.ground or 0.0
     x, y, z, _, qx, qy, _ = block.tolist()
@@ -570,14 +519,7 @@ def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
 def _feasible_starts(
     space: FreeSpace, line: float, q: Array, blocks: Array, behind: Array, across: Array
 ) -> NDArray[np.bool_]:
-    """Return which starts the obstacles leave feasible, by their certificates, shape (n,).
-
-    line: y that the block's centre must cross [m].
-    q: Configurations at the start, shape (n, dof).
-    blocks: Poses of the block at the start, shape (n, 7).
-    behind: Configurations with the tool behind the block, shape (n, dof).
-    across: Configurations with the tool on the line, shape (n, dof).
-    """
+    """Return which starts the obstacles leave feasible, by their certificates, shape (n,)."""
     feasible = path_is_clear(space, line, blocks)
     for configurations, poses in ((q, blocks), (behind, blocks), (across, None)):
         rows = np.flatnonzero(feasible)
@@ -607,12 +549,9 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
     """Test that every block can be pushed across the line, by the configurations of the set.
 
     Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
-
-    Returns:
-        Faults, a line each: a block that does not stand on the ground, is past the line or in the
-        base; a configuration out of limits or in collision; a certificate whose tool is not behind
-        the block, or not on the line; a set of another robot or other obstacles; see also
-        ``layout_faults``.
+    Faults, a line each, are blocks that do not stand on the ground, are past the line or in the
+    base; configurations out of limits or in collision; certificates whose tool is not behind the
+    block, or not on the line; a set of another robot; and ``layout_faults``.
     """
     n = len(pushes.blocks)
     configurations = {

@@ -142,10 +142,9 @@ class ReachEnvs(TaskEnvs):
 def _reachable_configuration(
     space: FreeSpace, goal: Array, starts: Array, *, with_rotation: bool
 ) -> Array | None:
-    """Return a free configuration that brings the tool to a goal, or None if none was found.
+    """Return a free configuration with the tool at a goal, (3,) or (7,), or None without one.
 
-    goal: Position, shape (3,), or pose, shape (7,).
-    starts: Configurations from which inverse kinematics starts, shape (n, dof).
+    Inverse kinematics starts from the nearest of some configurations (n, dof).
     """
     robot = space.scene.robot
     tools = frame_pose(robot, starts, TOOL)[:, :3, 3]
@@ -167,11 +166,7 @@ def _reachable_configuration(
 def evaluate_reach(
     config: ReachConfig, goal: torch.Tensor, state: TaskState, angle: torch.Tensor | None = None
 ) -> StepResult:
-    """Compare tools with their goals.
-
-    goal: Goal poses of the tools, shape (k, 7).
-    angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
-    """
+    """Compare tools with goal poses (k, 7); the angles between are None for goals of positions."""
     distance = row_norms(state.tool - goal[..., :3])
     return StepResult(
         success=is_near(config, distance, angle) & ~state.diverged,
@@ -186,11 +181,7 @@ def evaluate_reach(
 def is_near(
     config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Return whether tools are at their goals, shape (k,), bool.
-
-    distance: Distance between tool and goal, shape (k,) [m].
-    angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
-    """
+    """Return whether tools at distances (k,) [m] and angles (k,) [rad] are at their goals."""
     near = distance < config.near
     return near if angle is None else near & (angle < config.near_angle)
 
@@ -202,12 +193,7 @@ def reach_terms(
     acceleration: torch.Tensor,
     angle: torch.Tensor | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours).
-
-    distance: Distance between tool and goal, shape (k,) [m].
-    limit_violation: See ``TaskState``, shape (k,).
-    acceleration: See ``TaskState``, shape (k,).
-    """
+    """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours)."""
     terms = {
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "joint_acceleration": -config.joint_acceleration_weight * acceleration,
@@ -233,9 +219,6 @@ def goal_terms(config: ReachConfig, achieved: torch.Tensor, desired: torch.Tenso
 def anybody_score(
     config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Return the score of a step, shape (k,): a bonus where near, else the squared distance.
-
-    For the arguments see ``is_near``.
-    """
+    """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
     far = -config.score_square * (distance * distance)
     return choose(is_near(config, distance, angle), config.score_near, far)

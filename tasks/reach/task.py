@@ -25,7 +25,7 @@ from morphgen.tasks.free_space import (
     outside_limits,
 )
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.scenes.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
+from morphgen.tasks.scenes.obstacles import draw_obstacles, layout_faults, no_obstacles
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GOAL, EnvSpec, Marker, Task
 from morphgen.typing import Array
@@ -74,108 +74,6 @@ class ReachGoalSet:
         return self.poses
 
 
-def sample_goals(
-    robot: Robot,
-    config: ReachConfig,
-    *,
-    obstacles: bool,
-    ground: float,
-    seeds: np.random.SeedSequence,
-    identity: Mapping[str, Any],
-) -> ReachGoalSet:
-    """Sample a robot's goal set; see ``Task.sample``.
-
-    Configurations are uniform within the joint limits. Those that collide, also with the ground,
-    and those outside of the main component of free C-space (``free_space``) are drawn again.
-    Obstacles do not matter: each of their layouts leaves some of the configurations free.
-    """
-    goals_seeds, obstacle_seeds = seeds.spawn(2)
-    goals_rng = np.random.default_rng(goals_seeds)
-    space = FreeSpace(Scene(robot, ground=ground))
-    planes = cspace_components(robot)
-    q, tried = space.sample(
-        config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
-    )
-    poses = _pose_rows(frame_pose(robot, q, TOOL))
-    moved = float(np.linalg.norm(poses[:, :3] - poses[0, :3], axis=1).max())
-    if moved <= config.near and len(poses) > 1:
-        raise TaskError(
-            f"robot {robot.name!r} cannot reach: over {len(poses)} configurations its tool moves "
-            f"{moved:.2g} m, and a goal is reached within {config.near:g} m; place the frame "
-            f"{TOOL!r} at the working point"
-        )
-    boxes: tuple[Block, ...] = ()
-    layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
-    if obstacles:
-        size_seeds, layout_seeds = obstacle_seeds.spawn(2)
-        count, size = config.obstacles, config.obstacle_size
-        boxes = draw_boxes(robot, count, size, np.random.default_rng(size_seeds))
-        layouts, usable = draw_layouts(
-            FreeSpace(Scene(robot, obstacles=boxes, ground=ground)),
-            (config.train_layouts, config.eval_layouts),
-            layout_seeds,
-            lambda space: space.free(q),
-        )
-        boxes = place_boxes(boxes, layouts[0])
-    return ReachGoalSet(
-        q=q,
-        poses=poses,
-        obstacles=boxes,
-        layouts=layouts,
-        usable=usable,
-        tried=tried,
-        accepted=len(q),
-        **identity,
-    )
-
-
-def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
-    """Test that every goal is reachable.
-
-    Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
-
-    Returns:
-        Faults, a line each: a configuration out of limits, in collision, in another component of
-        C-space, or whose tool is not at the goal; a set of another robot or other obstacles; see
-        also ``layout_faults``.
-    """
-    if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
-        return [
-            f"configurations {goals.q.shape} and poses {goals.poses.shape} are not goals of robot "
-            f"{robot.name!r} with {robot.dof} joints"
-        ]
-    faults = [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
-    rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
-
-    def free_goals(space: FreeSpace) -> NDArray[np.bool_]:
-        """Return where a goal is free; those outside of all limits are faults already."""
-        free = np.ones(len(goals.q), dtype=np.bool_)
-        free[rows] = space.free(goals.q[rows])
-        return free
-
-    faults += layout_faults(goals, robot, scene, free_goals)
-    free = free_goals(FreeSpace(replace(scene, robot=robot, obstacles=())))
-    blocked = np.flatnonzero(~free).tolist()
-    faults += [f"goal {i}: its configuration is in collision" for i in blocked]
-    planes = cspace_components(robot)
-    for i in rows[free[rows]].tolist():
-        for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
-            a, b = planes[k].pairs[0]
-            faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
-    tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[rows]))
-    for i, tool in zip(rows.tolist(), tools, strict=True):
-        pose = goals.poses[i]
-        distance = float(np.linalg.norm(pose[:3] - tool[:3]))
-        # A quaternion and its negative are the same rotation.
-        rotation = min(float(np.linalg.norm(pose[3:] - sign * tool[3:])) for sign in (1, -1))
-        if not (distance <= EXACT and rotation <= EXACT):
-            faults.append(
-                f"goal {i}: the tool of its configuration is {distance:.2g} m away, and its "
-                f"quaternion {rotation:.2g}"
-            )
-    return faults
-
-
 def _pose_rows(T: Array) -> Array:
     """Return poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
     poses = [Pose.from_matrix(matrix) for matrix in T]
@@ -220,14 +118,74 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         seeds: np.random.SeedSequence,
         identity: Mapping[str, Any],
     ) -> ReachGoalSet:
-        """Sample free configurations; see ``sample_goals``."""
-        return sample_goals(
-            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+        """Sample free configurations, whose tool poses are the goals; see ``Task.sample``.
+
+        Configurations are uniform within the joint limits. Those that collide, with the ground,
+        too, and those outside of the main component of free C-space are drawn again.
+        Obstacles do not matter: each of their layouts leaves some of the configurations free.
+        """
+        goals_seeds, obstacle_seeds = seeds.spawn(2)
+        goals_rng = np.random.default_rng(goals_seeds)
+        space = FreeSpace(Scene(robot, ground=ground))
+        planes = cspace_components(robot)
+        q, tried = space.sample(
+            config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
         )
+        poses = _pose_rows(frame_pose(robot, q, TOOL))
+        moved = float(np.linalg.norm(poses[:, :3] - poses[0, :3], axis=1).max())
+        if moved <= config.near and len(poses) > 1:
+            raise TaskError(
+                f"robot {robot.name!r} cannot reach: over {len(poses)} configurations its tool "
+                f"moves {moved:.2g} m, and a goal is reached within {config.near:g} m; place the "
+                f"frame {TOOL!r} at the working point"
+            )
+        among = no_obstacles(len(q))
+        if obstacles:
+            among = draw_obstacles(space.scene, config, obstacle_seeds, lambda space: space.free(q))
+        return ReachGoalSet(q=q, poses=poses, tried=tried, accepted=len(q), **among, **identity)
 
     def certify(self, goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
-        """Test every configuration; see ``certify_goals``."""
-        return certify_goals(goals, robot, scene)
+        """Test that every goal is reachable.
+
+        Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
+        Faults, a line each, are configurations out of limits, in collision, in another component of
+        C-space, or with the tool elsewhere; a set of another robot; and ``layout_faults``.
+        """
+        if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
+            return [
+                f"configurations {goals.q.shape} and poses {goals.poses.shape} are not goals of "
+                f"robot {robot.name!r} with {robot.dof} joints"
+            ]
+        faults = [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
+        rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+
+        def free_goals(space: FreeSpace) -> NDArray[np.bool_]:
+            """Return where a goal is free; those outside of all limits are faults already."""
+            free = np.ones(len(goals.q), dtype=np.bool_)
+            free[rows] = space.free(goals.q[rows])
+            return free
+
+        faults += layout_faults(goals, robot, scene, free_goals)
+        free = free_goals(FreeSpace(replace(scene, robot=robot, obstacles=())))
+        blocked = np.flatnonzero(~free).tolist()
+        faults += [f"goal {i}: its configuration is in collision" for i in blocked]
+        planes = cspace_components(robot)
+        for i in rows[free[rows]].tolist():
+            for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
+                a, b = planes[k].pairs[0]
+                faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
+        tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[rows]))
+        for i, tool in zip(rows.tolist(), tools, strict=True):
+            pose = goals.poses[i]
+            distance = float(np.linalg.norm(pose[:3] - tool[:3]))
+            # A quaternion and its negative are the same rotation.
+            rotation = min(float(np.linalg.norm(pose[3:] - sign * tool[3:])) for sign in (1, -1))
+            if not (distance <= EXACT and rotation <= EXACT):
+                faults.append(
+                    f"goal {i}: the tool of its configuration is {distance:.2g} m away, and its "
+                    f"quaternion {rotation:.2g}"
+                )
+        return faults
 
     def make_envs(
         self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int

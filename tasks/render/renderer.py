@@ -70,12 +70,7 @@ class RenderModel:
 def render_model(
     scene: Scene, markers: Sequence[Marker], configurations: Array, points: Array
 ) -> RenderModel:
-    """Compile a scene whose robot stands at the origin for rendering.
-
-    markers: Shapes that show a goal.
-    configurations: Joint positions at which the robot must be in view, shape (n, dof).
-    points: Further points that must be in view, shape (m, 3) [m].
-    """
+    """Compile a scene for rendering, whose robot stands at the origin; see ``Renderer``."""
     robot = scene.robot
     points = np.concatenate(
         [
@@ -265,10 +260,7 @@ class Renderer:
     ) -> None:
         """Compile the scene and place the camera.
 
-        markers: Shapes that show a goal.
-        configurations: Joint positions at which the robot must be in view, shape (n, dof).
-        points: Further points that must be in view, shape (m, 3) [m].
-        size: Width and height of frames [pixels].
+        The robot at the configurations (n, dof), and further points (m, 3) [m], must be in view.
         """
         self.size, self._robot = size, scene.robot
         self._model = render_model(scene, markers, configurations, points)
@@ -306,13 +298,9 @@ class Renderer:
         return cls(spec.scene, markers, configurations, points, size)
 
     def frame(self, state: RenderState, turn: float = 0.0) -> Frame:
-        """Render a state.
+        """Render a state, shape (height, width, 3), with the scene turned by an angle [degrees].
 
-        turn: Angle by which the camera and the light have gone around the middle of the points
-            in view [degrees]: the scene is on a turntable in front of a fixed camera.
-
-        Returns:
-            Shape (height, width, 3).
+        It is on a turntable in front of a fixed camera: camera and light go around its middle.
         """
         if self._closed:
             raise ValueError("this renderer is closed")
@@ -388,11 +376,9 @@ def require_video_path(path: Path) -> None:
 
 
 def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
-    """Write a video: H.264 in ``.mp4``, or an endless ``.gif``.
+    """Write a video of one or more frames: H.264 in ``.mp4``, of even size, or an endless ``.gif``.
 
     The file appears when it is complete. The same frames give the same bytes.
-
-    frames: At least one frame, shape (height, width, 3) each; even sizes for ``.mp4``.
     """
     require_video_path(path)
     written = 0

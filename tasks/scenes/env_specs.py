@@ -101,8 +101,6 @@ def load_robot(
 
     A robot has the same goals and scores whether it is named by words, by its bundle, by the
     bundle's URDF, or passed as ``morphgen.compose`` or ``morphgen.read`` returns it.
-
-    geometry: Collision shapes: fitted boxes, cylinders and spheres, or the original ones.
     """
     parts = default_library(library)
     robot = resolve_robot(source, parts)

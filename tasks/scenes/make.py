@@ -229,9 +229,7 @@ def batch_from_specs(
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
 
-    geometry: Collision shapes of the simulated robots: all primitives (``primitive``), or
-        convex pieces of the meshes (``convex``). Observations and goals do not
-        depend on it.
+    Observations and goals do not depend on the collision geometry of the simulated robots.
     """
     if observe is not None and not isinstance(observe, ObservationConfig):
         raise TaskError(f"observe {observe!r}: expected an ObservationConfig")

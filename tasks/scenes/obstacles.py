@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,25 @@ _AWAY = Pose((0.0, 0.0, -1e4))
 """Pose of boxes without one: far below everything; ``FreeSpace`` keeps its block far above."""
 
 
+def no_obstacles(num_goals: int) -> dict[str, Any]:
+    """Return the fields of a goal set without obstacles that ``draw_obstacles`` fills."""
+    usable = np.zeros((0, num_goals), dtype=np.bool_)
+    return {"obstacles": (), "layouts": np.zeros((0, 0, 7)), "usable": usable}
+
+
+def draw_obstacles(
+    scene: Scene, config: TaskConfig, seeds: np.random.SeedSequence, usable: Usable
+) -> dict[str, Any]:
+    """Return the fields ``obstacles``, ``layouts`` and ``usable`` of a robot's goal set."""
+    size_seeds, layout_seeds = seeds.spawn(2)
+    rng = np.random.default_rng(size_seeds)
+    boxes = draw_boxes(scene.robot, config.obstacles, config.obstacle_size, rng)
+    space = FreeSpace(replace(scene, obstacles=boxes))
+    counts = (config.train_layouts, config.eval_layouts)
+    layouts, possible = draw_layouts(space, counts, layout_seeds, usable)
+    return {"obstacles": place_boxes(boxes, layouts[0]), "layouts": layouts, "usable": possible}
+
+
 def draw_boxes(
     robot: Robot, count: int, size: tuple[float, float], rng: np.random.Generator
 ) -> tuple[Block, ...]:
@@ -76,10 +95,8 @@ def draw_layouts(
     less than ``KEPT`` of the free configurations. A layout is accepted if it leaves ``KEPT_GOALS``
     of the goals. Boxes may overlap. Fewer layouts of a kind are the beginning of more.
 
-    Returns:
-        Poses in the world, in single precision, as simulators have them: x, y, z, qw, qx, qy, qz of
-        L layouts of O boxes, those for training first, shape (L, O, 7); and which goals they leave
-        possible, shape (L, G).
+    Return poses in the world of L layouts of O boxes, those for training first, (L, O, 7), in
+    single precision, as simulators have them; and which goals they leave possible, (L, G).
     """
     probe_seeds, *side_seeds = seeds.spawn(3)
     plain = FreeSpace(replace(space.scene, obstacles=(), block=None))
@@ -183,9 +200,8 @@ def layout_faults(
 ) -> list[str]:
     """Return the faults of a set's layouts, a line each.
 
-    Returns:
-        Obstacles that are not those of the scene; arrays of a wrong shape; a box that touches the
-        robot at home; a goal that its layout does not leave possible; too few goals.
+    They are other obstacles than those of the scene; arrays of a wrong shape; a box that touches
+    the robot at home; a goal that its layout does not leave possible; too few goals.
     """
     if scene.obstacles != goals.obstacles:
         return ["the obstacles of the scene are not those of the goal set"]

@@ -88,13 +88,9 @@ class RobotTables:
     def nearest_turns(
         self, robots: torch.Tensor, q: torch.Tensor, near: torch.Tensor
     ) -> torch.Tensor:
-        """Return configurations that differ by full turns of joints, and are nearer to others.
+        """Return configurations (..., n, J) turned by full turns, to be nearer to others (n, J).
 
         Joints stay within their limits. Only joints that move the tool turn.
-
-        robots: Index of the robot of each column, shape (n,), int64.
-        q: Configurations, shape (..., n, J) [rad or m].
-        near: Configurations that they should be near to, shape (n, J) [rad or m].
         """
         nearer = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
         turns = ~self.is_prismatic[robots] & self.moves_tool[robots]

@@ -163,12 +163,9 @@ class BulletSimulation:
         messages: Sequence[tuple[Worker, bytes]],
         work_here: Callable[[BulletBatch], dict[int, str] | None],
     ) -> dict[int, str]:
-        """Send messages to workers, do this process's share, and wait for all answers.
+        """Do the work in workers and here; return the reason for each environment that diverged.
 
         An interruption closes the simulation: it leaves answers in the pipes that nobody reads.
-
-        Returns:
-            The reason for each environment that diverged.
         """
         failures: list[Exception] = []
         reasons: dict[int, str] = {}
@@ -231,11 +228,7 @@ def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:
 
 
 def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
-    """Divide environments among processes so that all have about as many joints to simulate.
-
-    Returns:
-        The environments of each process, ascending; none is empty.
-    """
+    """Divide environments among processes, none idle, with about as many joints to simulate."""
     shares: list[list[int]] = [[] for _ in range(min(processes, len(scenes)))]
     loads = [0] * len(shares)
     weights = [_BASE_LOAD + len(scene.robot.movable_joints) for scene in scenes]

@@ -242,10 +242,7 @@ class BulletScene:
         block_pose: Sequence[float],
         obstacle_poses: Sequence[Sequence[float]] | None = None,
     ) -> None:
-        """Put robot and block at rest, and clear the contact history.
-
-        positions: Positions of all movable joints [rad or m].
-        """
+        """Put robot, at positions of all movable joints, and block at rest; clear contacts."""
         for joint, position in zip(self.driven, positions, strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
         if self.block >= 0:
@@ -466,12 +463,9 @@ class BulletBatch:
             self._num_steps_at_reset[i] = self._num_steps
 
     def step(self, targets: Float32) -> dict[int, str]:
-        """Advance the environments by one control step; see ``Simulation.step``.
+        """Advance the environments by one control step; the targets (n, J) are contiguous, finite.
 
-        targets: Targets of all environments, shape (n, J), contiguous and finite.
-
-        Returns:
-            The reason for each environment that diverged: not finite, or beyond ``MAX_VELOCITY``.
+        Return the reason for each environment that diverged: not finite, or ``MAX_VELOCITY``.
         """
         if self._diverged:
             reason = next(iter(self._diverged.values()))
@@ -619,11 +613,7 @@ def send(worker: Worker, message: bytes) -> None:
 
 
 def gather(workers: Sequence[Worker]) -> tuple[dict[int, str], list[Exception]]:
-    """Wait for the answer of each worker.
-
-    Returns:
-        The reason for each environment that diverged; and the exceptions raised in the workers.
-    """
+    """Wait for all workers; return why environments diverged, and exceptions of the workers."""
     reasons: dict[int, str] = {}
     failures: list[Exception] = []
     for worker in workers:

@@ -43,15 +43,7 @@ class KinematicSimulation:
     Joints stay within their limits. Targets are clamped to them, and the response of the law to an
     impulse is never negative: a joint that starts at rest never passes the farthest target.
 
-    Tensors are updated in place.
-
-    Attributes:
-        scenes: Scene of each environment.
-        device: Device of all tensors.
-        q: Positions of the independent joints, shape (n, J) [rad or m].
-        qd: Velocities of the independent joints, shape (n, J) [rad/s or m/s].
-        block_pose: Zeros, shape (n, 7): there are no blocks.
-        block_velocity: Zeros, shape (n, 6).
+    Tensors are updated in place; those of blocks are zeros.
     """
 
     def __init__(
@@ -176,16 +168,9 @@ def _first_not_finite(rows: torch.Tensor) -> int | None:
     return None if bool(finite.all()) else int((~finite).any(dim=1).int().argmax())
 
 
-def _load(
-    scenes: Sequence[Scene], contacts: Contacts | None, workers: int, device: torch.device
-) -> KinematicSimulation:
-    """Load scenes; see ``Simulator.load``."""
-    return KinematicSimulation(scenes, contacts, device=device)
-
-
 SIMULATOR = Simulator(
     "kinematic",
-    _load,
+    lambda scenes, contacts, _, device: KinematicSimulation(scenes, contacts, device=device),
     native_step=None,
     max_envs=65_536,
     devices=("cpu", "cuda"),

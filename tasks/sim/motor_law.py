@@ -133,10 +133,7 @@ class MotorForces:
     """
 
     def __init__(self, robots: Sequence[Robot], efforts: Sequence[float]) -> None:
-        """Compute the inertia of each robot.
-
-        efforts: Largest force of each row [N m or N].
-        """
+        """Compute the inertia of each robot; efforts are the largest force of each row [N m, N]."""
         self._efforts = np.array(efforts, dtype=np.float64)
         max_dof = max((robot.dof for robot in robots), default=0)
         self._pull = np.zeros((max_dof, len(self._efforts)))
@@ -162,9 +159,8 @@ class MotorForces:
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
         """Return the largest forces in a control step, shape (m,) [N m or N].
 
-        errors: Distances from the targets at the beginning of the step, and at its end without
-            contacts, shape (m,) each [rad or m].
-        velocities: Velocities at the same times, shape (m,) each.
+        Errors [rad or m] and velocities are those at the beginning, and at the end without
+        contacts, shape (m,) each.
         """
         springs = [BANDWIDTH**2 * clamp(e, self._farthest) for e in errors]
         dampers = [2 * BANDWIDTH * v for v in velocities]

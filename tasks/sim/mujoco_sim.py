@@ -130,11 +130,7 @@ class MujocoState:
             self._block_pose[:] = self._exact_pose
 
     def faults(self) -> dict[int, str]:
-        """Return the environments that diverged, each with the reason.
-
-        Their contacts do not fit into MuJoCo's memory, or they have a velocity that is not finite
-        or beyond ``MAX_SPEED``.
-        """
+        """Return the environments that diverged, each with the reason: contacts or velocities."""
         self._warnings.read()
         if is_within(self._velocities.flat, MAX_SPEED) and is_within(self._warnings.flat, 0):
             return {}
@@ -217,10 +213,7 @@ class PositionControl:
     def controls(self, targets: Array, q: Array, qd: Array, velocities: Array, out: Array) -> None:
         """Compute the controls of all actuators from the data as the last step left them.
 
-        targets: Targets of the independent joints, shape (n, J); padding is zero.
-        q: Positions of the independent joints, shape (n, J).
-        qd: Velocities of the independent joints, shape (n, J).
-        out: Receives the controls, shape (n, J).
+        Targets, whose padding is zero, joint states and controls have the shape (n, J).
         """
         error = clamp(targets - q, self._farthest)
         mean_acceleration = BY_ERROR * error + BY_VELOCITY * qd

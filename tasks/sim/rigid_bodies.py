@@ -24,11 +24,8 @@ def merge_rigid_links(robot: Robot) -> Robot:
     Motion and contacts stay the same. Joints keep their names, order and home; a merged link has
     the name of its first link, but a root named ``world`` is renamed. Visual shapes and frames are
     dropped. Links with collision shapes are merged only if they ignore the same other links;
-    otherwise the fixed joint stays.
-
-    Returns:
-        A robot whose ``ignore_pairs`` also contain the pairs that no simulator should test: links
-        of one rigid part, and neighbours across a movable joint.
+    otherwise the fixed joint stays. ``ignore_pairs`` then also contain the pairs that no simulator
+    should test: links of one rigid part, and neighbours across a movable joint.
     """
     ignored = {
         (a, b)

@@ -111,8 +111,6 @@ def controls(
     """Compute the targets of the actuators, with the missing force of inverse dynamics.
 
     Threads: (worlds, J). See ``PositionControl``.
-
-    targets: Targets of the independent joints, (n, J).
     """
     world, joint = wp.tid()
     missing = float(0.0)
@@ -152,14 +150,9 @@ def read_state(
     out_pose: wp.array2d[float],
     out_velocity: wp.array2d[float],
 ) -> None:
-    """Write the state of a group's worlds into the rows of their environments.
+    """Write the state of a group's worlds into the rows of their environments; see ``Simulation``.
 
     Threads: (worlds,).
-
-    out_q: Receives positions of the independent joints, (n, J).
-    out_qd: Receives their velocities, (n, J).
-    out_pose: Receives poses of the blocks, (n, 7).
-    out_velocity: Receives velocities of the blocks in the world frame, (n, 6).
     """
     world = wp.tid()
     env = joints.env[world]
@@ -207,10 +200,6 @@ def find_diverged(
 
     Threads: (worlds,). A world diverged if a target, a position or a velocity is not finite, if a
     velocity is beyond ``MAX_SPEED``, or if its contacts do not fit into the memory.
-
-    targets: Targets of the independent joints, (n, J).
-    out_overflow: Receives the overflow bits, (n,).
-    out_diverged: Receives whether the world diverged, (n,).
     """
     world = wp.tid()
     env = joints.env[world]
@@ -266,12 +255,7 @@ def reset_worlds(
     """Put the worlds of masked environments at rest, and forget their past.
 
     Threads: (worlds,). Besides state and warm start, a step of MuJoCo Warp reads only what it
-    computed itself.
-
-    mask: Whether to reset each environment, (n,).
-    q: Positions of the independent joints, (n, J).
-    block_pose: Poses of the blocks, (n, 7).
-    obstacle_poses: Poses of the obstacles, (n, O, 7); O is 0 to leave them where they are.
+    computed itself. Without obstacle poses, (n, 0, 7), obstacles stay where they are.
     """
     world = wp.tid()
     env = joints.env[world]

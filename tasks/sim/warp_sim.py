@@ -176,11 +176,9 @@ def _same_indices(first: World, other: World) -> bool:
 
 
 def dof_leaders(world: World) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what each degree of freedom of a model follows.
+    """Return the independent joint that each degree of freedom of a model follows, (nv,) each.
 
-    Returns:
-        Independent joint that it follows, -1 for a block's; its gain; and its offset [rad or m],
-        shape (nv,) each.
+    It is -1 for a block's; then come the gain and the offset [rad or m].
     """
     matrix, offset = world.robot.mimic_map
     leader = np.full(world.model.nv, -1, dtype=np.int32)
@@ -357,11 +355,9 @@ class Group:
 
 
 def max_contacts(num_shapes: int) -> int:
-    """Return how many contacts a world may have; with more it diverges.
+    """Return how many contacts a world of so many shapes may have; with more it diverges.
 
     Trained arms that push had up to 1.3 contacts for each shape in MuJoCo.
-
-    num_shapes: Number of shapes of the robot, its block, obstacles and ground together.
     """
     return max(48, 2 * num_shapes)
 
@@ -432,15 +428,8 @@ class WarpSimulation:
     one physics step before. Contacts are found by other algorithms, and a world holds a limited
     number of them (``max_contacts``).
 
-    Attributes:
-        scenes: Scene of each environment.
-        device: Device of all tensors.
-        q: Positions of the independent joints, shape (n, J) [rad or m].
-        qd: Velocities of the independent joints, shape (n, J) [rad/s or m/s].
-        block_pose: Poses of the blocks, shape (n, 7).
-        block_velocity: Velocities of the blocks in the world, shape (n, 6).
-        counts: Numbers of control steps in which a world of each group diverged, and in which its
-            contacts did not fit into the memory, shape (groups, 2), int32.
+    ``counts`` has the numbers of control steps in which a world of each group diverged, and in
+    which its contacts did not fit into the memory, shape (groups, 2), int32.
     """
 
     group_type = Group
@@ -462,28 +451,20 @@ class WarpSimulation:
         found = structures(self.scenes, compiled)
         n, joints = len(scenes), max(world.robot.dof for world in compiled)
         most = max(len(scene.obstacles) for scene in scenes)
-        self.q, self.qd, self._targets, self._reset_q = (
-            torch.zeros(n, joints, device=self.device) for _ in range(4)
-        )
-        self.block_pose, self._reset_pose = torch.zeros(2, n, 7, device=self.device)
-        self.block_velocity = torch.zeros(n, 6, device=self.device)
-        self.counts = torch.zeros(len(found), 2, dtype=torch.int32, device=self.device)
-        self._overflow = torch.zeros(n, dtype=torch.int32, device=self.device)
-        self._diverged, self._mask = torch.zeros(2, n, dtype=torch.uint8, device=self.device)
+        shapes = dict.fromkeys(("q", "qd", "targets", "reset_q"), (n, joints))
+        shapes |= {"block_pose": (n, 7), "reset_pose": (n, 7), "block_velocity": (n, 6)}
+        tensors = {name: torch.zeros(shape, device=self.device) for name, shape in shapes.items()}
+        for name, shape, dtype in (
+            ("counts", (len(found), 2), torch.int32),
+            ("overflow", (n,), torch.int32),
+            ("diverged", (n,), torch.uint8),
+            ("mask", (n,), torch.uint8),
+        ):
+            tensors[name] = torch.zeros(shape, dtype=dtype, device=self.device)
+        self.q, self.qd, self.counts = (tensors[name] for name in ("q", "qd", "counts"))
+        self.block_pose, self.block_velocity = tensors["block_pose"], tensors["block_velocity"]
+        self._tensors = tensors
         self._obstacle_poses = torch.zeros(n, most, 7, device=self.device)
-        tensors = {
-            "q": self.q,
-            "qd": self.qd,
-            "targets": self._targets,
-            "reset_q": self._reset_q,
-            "block_pose": self.block_pose,
-            "reset_pose": self._reset_pose,
-            "block_velocity": self.block_velocity,
-            "counts": self.counts,
-            "overflow": self._overflow,
-            "diverged": self._diverged,
-            "mask": self._mask,
-        }
         buffers = {name: wp.from_torch(tensor) for name, tensor in tensors.items()}
         name = str(buffers["q"].device)
         self._groups = [self.group_type(each, i, name, buffers) for i, each in enumerate(found)]
@@ -504,9 +485,9 @@ class WarpSimulation:
         """Put some environments at rest; see ``Simulation.reset``."""
         self._require_open()
         require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, obstacle_poses)
-        self._mask.copy_(mask)
-        self._reset_q.copy_(q)
-        self._reset_pose.copy_(block_pose)
+        self._tensors["mask"].copy_(mask)
+        self._tensors["reset_q"].copy_(q)
+        self._tensors["reset_pose"].copy_(block_pose)
         if obstacle_poses is not None:
             self._obstacle_poses.copy_(obstacle_poses)
         poses = self._no_poses if obstacle_poses is None else self._poses
@@ -518,24 +499,24 @@ class WarpSimulation:
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
-        if targets.shape != self._targets.shape:
+        if targets.shape != self.q.shape:
             raise ValueError(
-                f"targets have shape {tuple(targets.shape)}, not {tuple(self._targets.shape)}"
+                f"targets have shape {tuple(targets.shape)}, not {tuple(self.q.shape)}"
             )
-        self._targets.copy_(targets)
+        self._tensors["targets"].copy_(targets)
         if self._streams is not None:
             self._streams.launch()
         else:
             with wp.ScopedDevice("cpu"):
                 for group in self._groups:
                     group.step()
-        diverged: torch.Tensor = self._diverged.bool()
+        diverged: torch.Tensor = self._tensors["diverged"].bool()
         return diverged
 
     def faults(self) -> dict[int, str]:
         """Return the environments that diverged in the last step, each with the reason."""
-        overflow = self._overflow.tolist()
-        return {env: _fault(overflow[env]) for env in torch.nonzero(self._diverged)[:, 0].tolist()}
+        overflow, diverged = (self._tensors[name].tolist() for name in ("overflow", "diverged"))
+        return {env: _fault(overflow[env]) for env, is_fault in enumerate(diverged) if is_fault}
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -551,7 +532,7 @@ class WarpSimulation:
             for row, box in (*boxes, *zip(poses[env], scene.obstacles, strict=False)):
                 row[:] = torch.tensor((*box.pose.position, *box.pose.quaternion))
         q, block, poses = (rows.to(self.device) for rows in (q, block, poses))
-        everything = torch.ones_like(self._mask, dtype=torch.bool)
+        everything = torch.ones(len(self.scenes), dtype=torch.bool, device=self.device)
         self.reset(everything, q, block, poses if poses.shape[1] else None)
 
     def _on_torch_stream(self) -> wp.ScopedStream | wp.ScopedDevice:
@@ -606,16 +587,9 @@ def _fault(overflow: int) -> str:
     return DIVERGED
 
 
-def _load(
-    scenes: Sequence[Scene], contacts: Contacts | None, workers: int, device: torch.device
-) -> WarpSimulation:
-    """Load scenes; see ``Simulator.load``."""
-    return WarpSimulation(scenes, contacts, device=device)
-
-
 SIMULATOR = Simulator(
     "warp",
-    _load,
+    lambda scenes, contacts, _, device: WarpSimulation(scenes, contacts, device=device),
     native_step=None,
     max_envs=65_536,
     devices=("cuda",),  # tests use the CPU, where MuJoCo is far faster

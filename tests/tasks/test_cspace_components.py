@@ -15,7 +15,7 @@ from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Link
 from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.task import certify_goals
+from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.sim.base import Scene
 
 ACROSS = ((0.5, 0.0), (0.12, 6.0))
@@ -95,7 +95,7 @@ def test_goals_are_in_the_larger_component(tmp_path):
     assert goals.accepted == 40 < goals.tried
     few = draw_goals(body, ReachConfig(num_goals=7), obstacles=False, seed=0, cache=tmp_path)
     assert (few.q == goals.q[:7]).all()
-    assert certify_goals(goals, body, Scene(body)) == []
+    assert REACH.certify(goals, body, Scene(body)) == []
 
 
 def test_too_few_goals_error_counts_the_unreachable_ones():
@@ -114,7 +114,7 @@ def test_certificate_detects_goals_in_another_component(tmp_path):
         ball(0.2), ReachConfig(num_goals=12), obstacles=False, seed=0, cache=tmp_path
     )
     body = walled(ACROSS)
-    lines = certify_goals(goals, body, Scene(body))
+    lines = REACH.certify(goals, body, Scene(body))
     there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
     assert there
     said = "'ball' and 'base' touch on every path to most others"

@@ -181,12 +181,6 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
     assert torch.equal(one.groups["push"].line, other.groups["push"].line)
 
 
-def test_a_state_of_an_older_version_is_refused(specs):
-    batch = stub_batch(specs, ["reach"], 2)
-    with pytest.raises(TaskError, match=r"the state is of morphgen 0\.2"):
-        batch.load_state_dict({"random": [{}, {}], "points": [{}, {}]})
-
-
 def test_a_seeded_reset_begins_with_the_first_episodes(specs):
     one, other = (stub_batch(specs, MIXED, 6, seed=seed) for seed in (3, 2**64 - 1))
     first = one.reset()

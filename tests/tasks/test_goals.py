@@ -21,7 +21,7 @@ from morphgen.tasks import free_space
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.reach import task as module
-from morphgen.tasks.reach.task import certify_goals
+from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.scenes.obstacles import (
     KEPT,
     draw_boxes,
@@ -61,7 +61,7 @@ def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
     assert len(goal_set.obstacles) == (3 if boxes else 0)
     assert goal_set.layouts.shape == ((5, 3, 7) if boxes else (0, 0, 7))
     assert goal_set.usable.shape == ((5, 12) if boxes else (0, 12))
-    assert certify_goals(goal_set, body, scene_of(body, goal_set, 0.0)) == []
+    assert REACH.certify(goal_set, body, scene_of(body, goal_set, 0.0)) == []
     assert 12 == goal_set.accepted <= goal_set.tried
     assert len(np.unique(goal_set.q, axis=0)) == 12
 
@@ -69,8 +69,8 @@ def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
 def test_goals_are_above_the_ground_at_any_height(body, cache):
     here, there = (sample_goals(body, cache, ground=ground) for ground in (0.0, LIFTED))
     assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
-    assert certify_goals(there, body, scene_of(body, there)) == []
-    assert certify_goals(there, body, scene_of(body, there, 0.5)) != []
+    assert REACH.certify(there, body, scene_of(body, there)) == []
+    assert REACH.certify(there, body, scene_of(body, there, 0.5)) != []
     assert here.key != there.key
 
 
@@ -311,7 +311,7 @@ def test_certificate_names_every_fault(body, cache):
     scene = scene_of(body, goal_set)
 
     def faults(**changes):
-        return certify_goals(replace(goal_set, **changes), body, scene)
+        return REACH.certify(replace(goal_set, **changes), body, scene)
 
     q, poses = goal_set.q.copy(), goal_set.poses.copy()
     q[3, 1] = joint_limits(body)[1, 1] + 0.1
@@ -333,7 +333,7 @@ def test_certificate_detects_a_collision(body, cache):
     goal_set = sample_goals(body, cache)
     around = Shape(Box((2.0, 2.0, 2.0)))
     walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])
-    lines = certify_goals(goal_set, walled, scene_of(walled, goal_set))
+    lines = REACH.certify(goal_set, walled, scene_of(walled, goal_set))
     assert "goal 0: its configuration is in collision" in lines
 
 

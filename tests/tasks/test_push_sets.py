@@ -221,7 +221,7 @@ def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
     def across_the_way(*_):
         return np.array([[0.0, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0]])
 
-    monkeypatch.setattr(module, "draw_boxes", wall)
+    monkeypatch.setattr(obstacles, "draw_boxes", wall)
     monkeypatch.setattr(obstacles, "_draw_poses", across_the_way)
     with pytest.raises(BenchmarkError, match="of its first 20 goals only 0 or fewer: take"):
         sample_starts("prims", cache, obstacles=True)

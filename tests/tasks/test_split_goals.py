@@ -353,7 +353,7 @@ def test_broken_index_is_named(home, cache, old, new, message):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(BenchmarkError) as caught:
+    with pytest.raises(MorphgenError) as caught:
         read_goals(home, "train")
     assert message in str(caught.value)
     assert str(home / "goals") in str(caught.value)
