@@ -9,11 +9,12 @@ from morphgen.errors import TaskError
 from morphgen.grammar.library import default_library
 from morphgen.tasks.actions import BINS, JointTargets, decode_actions
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.envs import curriculum_line, push_terms
+from morphgen.tasks.push.envs import curriculum_line, evaluate_push, push_terms
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.envs import anybody_score, reach_terms
+from morphgen.tasks.reach.envs import anybody_score, evaluate_reach, reach_terms
 from morphgen.tasks.rows import limit_violation
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
+from morphgen.tasks.task import TaskState
 
 CPU = torch.device("cpu")
 
@@ -104,6 +105,17 @@ def test_push_reward_terms():
     assert terms["success"].tolist() == [10.0, 0.0]
     assert terms["distance"].tolist() == pytest.approx([0.0, -0.3])
     assert terms["approach"].tolist() == pytest.approx([-0.05, -0.1])
+
+
+def test_a_diverged_step_is_never_a_success():
+    """Even with the tool at the goal and the block across the line."""
+    tool, block, zero = torch.zeros(2, 3), torch.zeros(2, 7), torch.zeros(2)
+    state = TaskState(tool, block, zero, zero, diverged=torch.tensor([False, True]))
+    reached = evaluate_reach(ReachConfig(), torch.zeros(2, 7), state)
+    assert reached.success.tolist() == [True, False]
+    pushed = evaluate_push(PushConfig(), torch.tensor([-0.1, -0.1]), state)
+    assert pushed.success.tolist() == pushed.terminated.tolist() == [True, False]
+    assert pushed.score.tolist() == [1.0, 0.0]
 
 
 def test_curriculum_line_moves_during_the_first_half_of_training():

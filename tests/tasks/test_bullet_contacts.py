@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from helpers.robots import arm
 from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, Block, Contacts, Scene
+from morphgen.tasks.sim.base import GRAVITY, Block, Contacts, Scene
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
@@ -23,21 +22,6 @@ def block_scene(friction=1.0, height=0.5, mass=0.1):
     edge = 0.1
     block = Block((edge, edge, edge / 2), Pose((0.4, 0.0, height)), mass, friction)
     return Scene(robot("arm=ur5 ee=plane"), Pose((-1.0, 0.0, 0.3)), block)
-
-
-def test_blocks_fall_and_come_to_rest(simulate):
-    simulation = simulate(block_scene())
-    q = reset(simulation)
-    for _ in range(10):
-        simulation.step(q)
-    t, n = 0.2, 10 * SUBSTEPS
-    fallen = 0.5 * GRAVITY * t**2 * (n + 1) / n
-    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.5 - fallen, abs=1e-5)
-    assert float(simulation.block_velocity[0, 2]) == pytest.approx(-GRAVITY * t, rel=1e-5)
-    for _ in range(100):
-        simulation.step(q)
-    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.025, abs=1e-3)
-    assert float(simulation.block_velocity.abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.6])
@@ -62,17 +46,6 @@ def test_robots_have_the_specified_friction(simulate):
     for link in (-1, *loaded.driven):
         info = pybullet.getDynamicsInfo(loaded.robot, link, physicsClientId=loaded.id)
         assert info[1] == FRICTION
-
-
-def test_block_without_mass_is_static(simulate):
-    scene = block_scene(mass=0.0)
-    simulation = simulate(scene)
-    pose = torch.tensor([[0.1, 0.2, 0.7, 1.0, 0.0, 0.0, 0.0]])
-    q = reset(simulation, pose=pose)
-    for _ in range(20):
-        simulation.step(q)
-    assert torch.allclose(simulation.block_pose, pose)
-    assert not simulation.block_velocity.any()
 
 
 def push(simulation, steps=60):

@@ -164,27 +164,6 @@ def test_killed_worker_is_reported_and_everything_is_freed(scratch):
     simulation.close()
 
 
-def test_worker_killed_during_a_step_is_reported():
-    scenes = [push_scene() for _ in range(8)]
-    simulation = BulletSimulation(scenes, processes=2)
-    envs, q, pose = starts(simulation)
-    reset_envs(simulation, envs, q, pose)
-    (pid,) = pids(simulation)
-    killer = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            f"""if True:
-        import os, time
-        time.sleep(0.3)
-        os.kill({pid}, 9)""",
-        ]
-    )
-    with pytest.raises(SimulationError, match="died"):
-        keep_stepping(simulation, q)
-    killer.wait()
-
-
 def test_close_removes_processes_and_files(scratch):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     running = pids(simulation)

@@ -179,6 +179,8 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
     for name, values in one.reset().items():
         assert torch.equal(values, observation[name]), name
     assert torch.equal(one.groups["push"].line, other.groups["push"].line)
+    with pytest.raises(TaskError, match="the state is of 6 environments; expected 3"):
+        stub_batch(specs, MIXED, 3).load_state_dict(one.state_dict())
 
 
 def test_a_seeded_reset_begins_with_the_first_episodes(specs):

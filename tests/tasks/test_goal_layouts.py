@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.goal_sets import CONFIG, LIFTED, sample_goals
-from morphgen.errors import BenchmarkError, TaskError
+from morphgen.errors import BenchmarkError
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.scenes import obstacles
 from morphgen.tasks.scenes.obstacles import (
@@ -51,11 +51,6 @@ def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, cache):
         np.testing.assert_array_equal(small.usable[few], large.usable[many][: len(few), :30])
     assert len(np.unique(large.layouts[:, 0], axis=0)) == 9
     assert (large.layouts == large.layouts.astype(np.float32)).all()
-
-
-def test_unknown_layouts_are_rejected():
-    with pytest.raises(TaskError, match="unknown layouts 'test'; valid: train, eval"):
-        layouts_of(CONFIG, "test")
 
 
 def test_a_layout_without_goals_is_an_error(body):

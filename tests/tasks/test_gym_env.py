@@ -15,7 +15,6 @@ from stable_baselines3.common.env_checker import check_env as check_for_sb3
 import morphgen
 from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.errors import CompositionError, MorphgenError, TaskError
-from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
@@ -193,15 +192,6 @@ def test_unseeded_resets_continue_the_random_sequence(make):
     assert len(starts) > 1
 
 
-def test_first_unseeded_episode_is_random_after_reading_np_random(make):
-    starts = set()
-    for _ in range(6):
-        env = make("morphgen/Reach-v0")
-        assert env.unwrapped.np_random is not None
-        starts.add(tuple(env.reset()[0]["tokens"].ravel()))
-    assert len(starts) > 1
-
-
 def test_robot_above_the_default_max_links_needs_the_option(make):
     body = morphgen.compose("chain beads=7", geometry="primitive")
     with pytest.raises(MorphgenError, match="max_links 25 or more"):
@@ -210,30 +200,6 @@ def test_robot_above_the_default_max_links_needs_the_option(make):
     for robot, links, numbered in ((body, 25, 25), ("arm3-stick", 7, 23)):
         seen, _ = make("morphgen/Reach-v0", robot=robot).reset(seed=0)
         assert seen["tokens"][:, 0] * (numbered - 1) == pytest.approx(range(links))
-
-
-def test_episodes_equal_those_of_a_batch(make, cache):
-    env = make("morphgen/Reach-v0")
-    batch = make_batch(
-        "reach", ["arm3-stick"], 1, sim="mujoco", seed=7, configs=(REACH,), cache=cache
-    )
-    seen, _ = env.reset(seed=7)
-    expected = batch.reset()
-    for k in range(2 * STEPS):
-        assert np.array_equal(seen["goal"], expected["goal"][0].numpy())
-        links = len(seen["tokens"])
-        assert seen["tokens"] == pytest.approx(expected["tokens"][0, :links].numpy(), abs=1e-6)
-        action = np.full(env.action_space.shape, 0.1 * (-1) ** k, dtype=np.float32)
-        seen, reward, _, over, info = env.step(action)
-        actions = torch.zeros(1, batch.robot_tables.max_links)
-        actions[:, list(env.unwrapped.action_links)] = torch.from_numpy(action)
-        step = batch.step(actions)
-        expected = step.observation
-        assert reward == pytest.approx(float(step.reward[0]), abs=1e-6)
-        assert info["distance"] == pytest.approx(float(step.distance[0]), abs=1e-6)
-        if over:
-            seen, _ = env.reset()
-    batch.close()
 
 
 def test_last_observation_of_an_episode_is_returned(make):

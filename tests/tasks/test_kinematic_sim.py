@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
 from helpers.resets import reset_envs
 from helpers.robots import arm, finger
-from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, real_arm_scene, robot
+from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, robot
 from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
@@ -167,71 +167,6 @@ def test_joints_without_limits_turn_on():
     assert sim.q[0, elbow] > 2 * np.pi
 
 
-def scenes_without_things():
-    return [reach_scene(), replace(push_scene(), block=None, obstacles=()), real_arm_scene()]
-
-
-def test_environments_give_the_same_bits_alone_and_in_any_batch():
-    scenes = scenes_without_things()
-    joints = max(scene.robot.dof for scene in scenes)
-    starts = [(*scene.robot.home, *[0.0] * (joints - scene.robot.dof)) for scene in scenes]
-    changes = np.random.default_rng(0).uniform(-0.3, 0.3, (SECOND, joints))
-
-    def paths(order):
-        sim = KinematicSimulation([scenes[i] for i in order])
-        width = sim.q.shape[1]
-        start = np.array([starts[i][:width] for i in order])
-        reset(sim, start)
-        states = []
-        for change in changes[:, :width]:
-            sim.step(torch.from_numpy(start + change).float())
-            states.append(torch.stack([sim.q, sim.qd], dim=1).clone())
-        return {i: torch.stack(states)[:, row] for row, i in enumerate(order)}
-
-    together = paths([2, 0, 1] * 11)
-    for i, scene in enumerate(scenes):
-        alone, dof = paths([i])[i], scene.robot.dof
-        assert torch.equal(alone[..., :dof], together[i][..., :dof])
-        assert not together[i][..., dof:].any()
-
-
-def test_padding_of_targets_and_starts_is_ignored():
-    sim = KinematicSimulation(scenes_without_things())
-    targets = sim.q + 0.1
-    targets[~sim._is_joint] = torch.nan
-    sim.step(targets)
-    assert sim.q.isfinite().all()
-    reset(sim, targets[:1], [0])
-    assert sim.q.isfinite().all()
-
-
-def test_reset_puts_only_the_named_environments_at_rest():
-    sim = KinematicSimulation([reach_scene()] * 4)
-    home = sim.q.clone()
-    for _ in range(5):
-        sim.step(home + 0.2)
-    moved, speed = sim.q.clone(), sim.qd.clone()
-    assert (speed.abs().sum(dim=1) > 0).all()
-    reset(sim, home[:2] + 0.05, [2, 0])
-    assert torch.equal(sim.q[[0, 2]], home[:2] + 0.05)
-    assert not sim.qd[[0, 2]].any()
-    assert torch.equal(sim.q[[1, 3]], moved[[1, 3]])
-    assert torch.equal(sim.qd[[1, 3]], speed[[1, 3]])
-    sim.step(sim.q.clone())
-    assert torch.equal(sim.q[[0, 2]], home[:2] + 0.05)
-
-
-def test_robots_are_at_home_before_the_first_reset():
-    sim = KinematicSimulation(scenes_without_things())
-    for env, scene in enumerate(sim.scenes):
-        dof = scene.robot.dof
-        assert sim.q[env, :dof].tolist() == pytest.approx(scene.robot.home)
-        assert not sim.q[env, dof:].any()
-    assert sim.q.dtype == sim.qd.dtype == sim.block_pose.dtype == torch.float32
-    assert sim.block_pose.shape == (3, 7)
-    assert sim.block_velocity.shape == (3, 6)
-
-
 class CountOperations(TorchDispatchMode):
     """Counts the tensor operations within a ``with`` block."""
 
@@ -271,27 +206,3 @@ def test_requested_contacts_are_refused():
         with pytest.raises(SimulationError, match="has no contacts"):
             KinematicSimulation([reach_scene()], contacts)
     KinematicSimulation([reach_scene()], NO_CONTACTS)
-
-
-def test_invalid_arguments_are_rejected_and_change_nothing():
-    sim = KinematicSimulation([reach_scene()] * 2)
-    q, block = sim.q.clone(), sim.block_pose
-    with pytest.raises(ValueError, match="there are no scenes"):
-        KinematicSimulation([])
-    with pytest.raises(ValueError, match=r"targets have shape \(1, "):
-        sim.step(q[:1])
-    with pytest.raises(ValueError, match=r"environment 1 .*not finite"):
-        sim.step(torch.stack([q[0] + 1, q[1] * torch.nan]))
-    with pytest.raises(ValueError, match=r"expected \(2,\) and torch.bool"):
-        sim.reset(torch.tensor([0, 1]), q, block)
-    with pytest.raises(ValueError, match=r"expected \(2, "):
-        sim.reset(torch.ones(2, dtype=torch.bool), q[:1], block)
-    with pytest.raises(ValueError, match=r"environment 1 .*reset to q"):
-        reset_envs(sim, [0, 1], torch.stack([q[0] + 1, q[1] * torch.inf]))
-    assert torch.equal(sim.q, q)
-    sim.close()
-    sim.close()
-    with pytest.raises(SimulationError, match="closed"):
-        sim.step(q)
-    with pytest.raises(SimulationError, match="closed"):
-        reset(sim, q)

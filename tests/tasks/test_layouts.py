@@ -88,15 +88,6 @@ def test_unknown_layouts_are_rejected(build_batch):
         build_batch("reach", layouts="test")
 
 
-def test_the_same_seed_draws_the_same_layouts(build_batch):
-    a, b = build_batch("reach", "push", seed=3), build_batch("reach", "push", seed=3)
-    for _ in range(5):
-        seen, again = a.reset(), b.reset()
-        assert all(torch.equal(seen[name], again[name]) for name in seen)
-        assert torch.equal(a.layouts.current, b.layouts.current)
-    assert torch.equal(a.layouts.poses, b.layouts.poses)
-
-
 def test_starts_and_goals_are_free_in_their_layout(build_batch, specs):
     batch = build_batch("reach", "push")
     for _ in range(10):

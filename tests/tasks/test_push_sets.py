@@ -1,6 +1,6 @@
 """Push goal sets: block positions that every kind of robot can push across the line."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +12,9 @@ from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push import starts as module
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import (
     CLOSE,
-    PushStartSet,
-    effective_reach,
     path_is_clear,
     push_region,
 )
@@ -114,15 +111,6 @@ def test_short_robots_have_a_scaled_down_push_region(cache):
     assert push_set.line == pytest.approx(0.2 * push_set.scale)
 
 
-def test_effective_reach_follows_the_right_triangle():
-    reach, height, share = 1.0, 0.4, 0.2
-    e = effective_reach(reach, height, share)
-    assert np.hypot(e, height - share * e / 2) == pytest.approx(reach)
-    assert e > np.sqrt(reach**2 - height**2)
-    assert effective_reach(1.0, 0.0, 1e-9) == pytest.approx(1.0)
-    assert effective_reach(1.0, 1.5, 0.2) == 0
-
-
 def test_ground_may_be_below_the_base(cache):
     words = "arm=panda ee=panda_hand"
     push_set = sample_starts(words, cache, ground=-0.05)
@@ -145,56 +133,6 @@ def test_block_positions_and_orientations_are_random(cache):
     assert np.histogram(push_set.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
     yaw = 2 * np.arctan2(push_set.blocks[:, 6], push_set.blocks[:, 3])
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
-
-
-@pytest.mark.slow
-def test_smaller_sets_are_prefixes_of_larger_ones(cache):
-    few = sample_starts("arm=ur5 ee=plane", cache)
-    more = sample_starts("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
-    for name in ("q", "blocks", "behind", "across"):
-        assert (getattr(more, name)[:5] == getattr(few, name)).all()
-
-
-def test_stored_set_equals_the_sampled_set(cache, monkeypatch):
-    fresh = sample_starts("prims", cache, obstacles=True)
-
-    def forbidden(*_):
-        raise AssertionError("it was made again")
-
-    monkeypatch.setattr(module, "FreeSpace", forbidden)
-    stored = sample_starts("prims", cache, obstacles=True)
-    for field in fields(PushStartSet):
-        a, b = getattr(stored, field.name), getattr(fresh, field.name)
-        assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
-
-
-def test_same_seed_gives_the_same_bytes(tmp_path):
-    for folder in ("here", "there"):
-        sample_starts("prims", tmp_path / folder, obstacles=True)
-    files = [list((tmp_path / folder).iterdir()) for folder in ("here", "there")]
-    assert [path.name for path in files[0]] == [path.name for path in files[1]]
-    assert files[0][0].read_bytes() == files[1][0].read_bytes()
-
-
-@pytest.mark.slow
-def test_cache_key_depends_on_exactly_the_relevant_inputs(cache):
-    base = {"config": CONFIG}
-    changes = [
-        base,
-        {"config": replace(CONFIG, num_goals=6)},
-        {"config": replace(CONFIG, start_depth=0.01)},
-        {"config": replace(CONFIG, block_size=(0.15, 0.16))},
-        {"config": replace(CONFIG, block_mass=0.2)},
-        {"config": replace(CONFIG, free_x=(-0.1, 0.1))},
-        {**base, "seed": 1},
-        {**base, "obstacles": True},
-    ]
-    keys = [sample_starts("prims", cache, **change).key for change in changes]
-    assert len(set(keys)) == len(keys)
-    same = replace(CONFIG, max_episode_steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
-    other = replace(robot("prims"), name="other")
-    push_set = draw_goals(other, same, obstacles=False, seed=0, cache=cache)
-    assert (push_set.key, push_set.robot) == (keys[0], "other")
 
 
 def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
@@ -241,21 +179,3 @@ def test_invalid_constants_are_rejected(changes, text, cache):
         sample_starts("prims", cache, config=replace(CONFIG, **changes))
     with pytest.raises(BenchmarkError, match="with seed -1"):
         sample_starts("prims", cache, seed=-1)
-
-
-def test_broken_or_renamed_file_is_named(cache):
-    first, second = sample_starts("prims", cache), sample_starts("prims", cache, seed=1)
-    paths = [cache / f"{each.key}.npz" for each in (first, second)]
-    paths[1].write_bytes(paths[0].read_bytes())
-    with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
-        sample_starts("prims", cache, seed=1)
-    paths[0].write_bytes(paths[0].read_bytes()[:-100])
-    with pytest.raises(TaskError, match=f"{paths[0].name}: not a PushStartSet: .*; delete it"):
-        sample_starts("prims", cache)
-
-
-def test_unwritable_cache_is_a_warning(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot store a PushStartSet"):
-        push_set = sample_starts("prims", tmp_path / "file" / "pushes")
-    assert len(push_set.q) == 5

@@ -15,9 +15,6 @@ from helpers.goal_sets import draw_spec
 from helpers.resets import reset_envs
 from helpers.simulators import PYBULLET
 from morphgen.model.dynamics import actuation
-from morphgen.rl.baselines.simple import Random
-from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.sim.base import Contacts
@@ -100,47 +97,3 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
             ends.append(batch.simulation.q.clone())
     assert (ends[0] - ends[1]).abs().max() < 0.01
     assert (ends[0] - torch.tensor(robot.home)).abs().min() > 0.05
-
-
-@pytest.mark.parametrize("task", ["reach", "push"])
-def test_obstacles_never_contain_the_goal_or_start(robot, task, cache):
-    """In the original code a goal could lie inside an obstacle."""
-    config = FEW if task == "reach" else replace(PushConfig(), num_goals=6, max_episode_steps=40)
-    setting = draw_spec(robot, config, obstacles=True, seed=0, cache=cache)
-    space = FreeSpace(setting.scene)
-    with closing(batch_from_specs([setting], 6, sim="mujoco")) as batch:
-        for seed in range(3):
-            batch.reset(seed)
-            blocks = batch.simulation.block_pose.numpy() if task == "push" else None
-            assert space.free(batch.q.numpy(), blocks).all()
-            if task == "reach":
-                assert space.free(batch.groups["reach"].goal_configuration.numpy()).all()
-
-
-def test_goal_is_constant_during_an_episode(robot, cache):
-    """The original code sampled the goal again during the episode."""
-    setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
-    with closing(batch_from_specs([setting], 3, sim="mujoco")) as batch:
-        batch.reset()
-        goal, acting = batch.field("goal").clone(), Random(0)
-        for _ in range(FEW.max_episode_steps - 1):
-            batch.step(acting.act(batch))
-            assert torch.equal(batch.field("goal"), goal)
-        batch.step(acting.act(batch))
-        assert not torch.equal(batch.field("goal"), goal)
-
-
-@pytest.mark.parametrize("task", ["reach", "push"])
-def test_seed_determines_the_episodes(robot, task, cache):
-    """The random generators of the original code were not seeded."""
-    config = FEW if task == "reach" else replace(PushConfig(), num_goals=6)
-    setting = draw_spec(robot, config, obstacles=False, seed=0, cache=cache)
-    seen = []
-    for seed in (5, 5, 6):
-        with closing(batch_from_specs([setting], 4, sim="mujoco", seed=seed)) as batch:
-            batch.reset()
-            seen.append(
-                torch.cat([batch.q, batch.field("goal"), batch.simulation.block_pose], dim=1)
-            )
-    assert torch.equal(seen[0], seen[1])
-    assert not torch.equal(seen[0], seen[2])

@@ -98,14 +98,6 @@ def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
     assert (among.goals.poses == single[1].goals.poses).all()
 
 
-def test_goals_depend_on_the_seed_despite_the_cache(cache):
-    first, second = (sample_sets(reaching(), cache, replace(RECIPE, seed=seed)) for seed in (0, 1))
-    for a, b in zip(first, second, strict=True):
-        assert (a.goals.seed, b.goals.seed) == (0, 1)
-        assert not np.isin(a.goals.q, b.goals.q).any()
-    assert GoalConfig().seed == 0
-
-
 def test_every_member_has_a_set_in_train_test_order(cache):
     member_sets = sample_sets(mixed(), cache, certified=True)
     assert [(one.side, one.robot, one.task) for one in member_sets] == [

@@ -8,7 +8,6 @@ import torch
 
 from helpers.goal_sets import draw_spec
 from morphgen.rl.baselines.simple import Random
-from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -19,7 +18,6 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from helpers.pybullet_states import client_of
-from helpers.resets import reset_envs
 
 REACH, PUSH = ReachConfig(num_goals=5), PushConfig(num_goals=5)
 CHANNELS = ObservationConfig(velocity=True, previous_action=True, tool=True)
@@ -112,73 +110,6 @@ def test_episode_after_divergence_is_unchanged(build_batch):
     assert step.diverged.tolist() == [True, False, False, False]
     assert torch.equal(batch.field("goal")[0], whole.field("goal")[0])
     assert torch.equal(batch.targets[0], whole.targets[0])
-
-
-@pytest.mark.slow
-def test_episodes_report_divergence(build_batch):
-    class Breaks(Random):
-        acted = 0
-
-        def act(self, task):
-            self.acted += 1
-            if self.acted == 10:
-                break_physics(task, 0)
-            return super().act(task)
-
-    batch = build_batch()
-    first, second, *others = run_episodes(batch, Breaks(0), 2)
-    assert (first.env, first.unstable, first.steps) == (0, True, 10)
-    assert (second.env, second.unstable, second.steps) == (0, False, REACH.max_episode_steps)
-    assert not any(each.unstable for each in others)
-    assert len(others) == 2 * ENVS - 2
-
-
-@pytest.mark.slow
-def test_diverged_episode_is_never_a_success(build_batch):
-    """Even with the tool at the goal or the block across the line."""
-    batch = build_batch()
-
-    def put_at_goals():
-        q, block = batch.simulation.q.clone(), batch.simulation.block_pose.clone()
-        joints = q.shape[1]
-        q[0], block[1, 1] = (
-            batch.groups["reach"].goal_configuration[0, :joints],
-            batch.field("line")[:, 0][1] + 0.05,
-        )
-        batch.targets[0] = batch.groups["reach"].goal_configuration[0]
-        reset_envs(batch.simulation, [0, 1], q[:2], block[:2])
-
-    batch.reset()
-    put_at_goals()
-    good = batch.step(torch.zeros(batch.action_mask.shape))
-    assert good.success.tolist() == [True, True, False, False]
-    assert good.terminated.tolist() == [False, True, False, False]
-
-    batch.reset()
-    put_at_goals()
-    break_physics(batch, 0)
-    break_physics(batch, 1)
-    step = batch.step(torch.zeros(batch.action_mask.shape))
-    assert step.distance[:2].max() < REACH.near
-    assert step.diverged.tolist() == step.truncated.tolist() == [True, True, False, False]
-    assert not step.success.any()
-    assert not step.terminated.any()
-    assert step.score[1] == step.terms["success"][1] == 0
-
-    class Breaks:
-        def act(self, task):
-            if not task.episode_step[0]:
-                put_at_goals()
-                break_physics(task, 0)
-                break_physics(task, 1)
-            return torch.zeros(task.action_mask.shape)
-
-    reached, pushed, *_ = run_episodes(batch, Breaks(), 1)
-    assert reached.unstable
-    assert pushed.unstable
-    assert not reached.success
-    assert not pushed.success
-    assert pushed.score == 0
 
 
 @pytest.mark.parametrize("build_batch", ["mujoco"], indirect=True)

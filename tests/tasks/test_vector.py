@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -77,33 +76,6 @@ def test_empty_observation_entries_are_omitted(cache):
         assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
 
 
-@pytest.mark.slow
-def test_steps_equal_those_of_the_batch(batch_from_specs):
-    batch, envs = batch_from_specs(seed=3), TaskVector(batch_from_specs(seed=99))
-    expected, (seen, _) = batch.reset(), envs.reset(seed=3)
-    rng = np.random.default_rng(0)
-    for _ in range(2 * REACH.max_episode_steps):
-        for name, values in seen.items():
-            wide = expected[name].numpy()
-            if name == "actions":
-                wide = wide[:, envs.action_links]
-            elif name in ("tokens", "links"):
-                assert not wide[:, values.shape[1] :].any()  # rows that no robot has
-                wide = wide[:, : values.shape[1]]
-            assert np.array_equal(values, wide.reshape(values.shape)), name
-        actions = rng.uniform(-1, 1, (4, batch.robot_tables.max_links)).astype(np.float32)
-        step = batch.step(torch.from_numpy(actions))
-        actions = actions[:, envs.action_links]
-        seen, reward, terminated, truncated, infos = envs.step(actions)
-        expected = step.observation
-        assert np.array_equal(reward, step.reward.numpy())
-        assert np.array_equal(terminated, step.terminated.numpy())
-        assert np.array_equal(truncated, step.truncated.numpy())
-        assert np.array_equal(infos["distance"], step.distance.numpy())
-        for name, term in step.terms.items():
-            assert np.array_equal(infos["terms"][name], term.numpy())
-
-
 def test_autoreset_returns_the_final_observation(batch_from_specs):
     envs = TaskVector(batch_from_specs())
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
@@ -139,26 +111,6 @@ def test_returned_arrays_are_copies(batch_from_specs):
         assert all(np.array_equal(later[name], then[name]) for name in then)
     first, second = (envs.step(envs.action_space.sample())[0] for _ in range(2))
     assert not any(np.shares_memory(first[name], second[name]) for name in first)
-
-
-def test_cleanrl_style_loop_runs(batch_from_specs):
-    """The loop collects episode statistics and final observations in preallocated arrays."""
-    envs = RecordEpisodeStatistics(TaskVector(batch_from_specs()))
-    envs.reset(seed=1)
-    rewards, dones = np.zeros((50, 4)), np.zeros((50, 4), dtype=bool)
-    returns, bootstrapped = [], 0
-    envs.action_space.seed(0)
-    for t in range(50):
-        _, rewards[t], terminated, truncated, infos = envs.step(envs.action_space.sample())
-        dones[t] = terminated | truncated
-        if "final_info" in infos:
-            returns += infos["episode"]["r"][infos["_episode"]].tolist()
-            rows = [infos["final_obs"][env]["tokens"] for env in np.flatnonzero(truncated)]
-            bootstrapped += len(torch.as_tensor(np.array(rows)))
-    assert bootstrapped == dones.sum() == len(returns) == 2 * (50 // 12) + 2 * (50 // 9)
-    ends = np.flatnonzero(dones[:, 0])
-    assert returns[2] == pytest.approx(rewards[: ends[0] + 1, 0].sum(), rel=1e-5)
-    envs.close()
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
