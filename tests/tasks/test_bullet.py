@@ -1,13 +1,24 @@
-"""PyBullet in one process: padding, resets, errors and closing."""
+"""PyBullet in one process: resets, clients, joints, motors, contacts, friction."""
 
 import gc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
+from helpers.robots import arm
+from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError
+from morphgen.model.dynamics import mass_matrix
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    joint_limits,
+    movable_positions,
+)
+from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
@@ -15,6 +26,7 @@ import pybullet
 from helpers.pybullet_states import PUSHING, client_of, reset, touching, wander
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation
+from morphgen.tasks.sim.bullet_batch import FRICTION, OVERSPEED
 
 
 def touching_starts(scene, seed):
@@ -91,3 +103,200 @@ def test_garbage_collected_simulation_frees_its_clients():
     del simulation
     gc.collect()
     assert not pybullet.isConnected(client)
+
+
+@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
+def test_link_poses_match_forward_kinematics(simulate, request_):
+    T = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.2, 0.4, -0.7))
+    body = robot(request_)
+    simulation = simulate(Scene(body, T), contacts=Contacts(False, False))
+    q = np.array(body.home) + 0.1
+    reset(simulation, q)
+    loaded = client_of(simulation)
+    merged = merge_rigid_links(body)
+    T_world_link = T.matrix @ forward_kinematics(body, q)
+    for k in merged.movable_joints:
+        name = merged.joints[k].child
+        found = pybullet.getLinkState(
+            loaded.robot,
+            loaded.driven[merged.movable_joints.index(k)],
+            computeForwardKinematics=True,
+            physicsClientId=loaded.id,
+        )
+        expected = T_world_link[body.link_index[name], :3, 3]
+        assert found[4] == pytest.approx(expected, abs=1e-6), name
+
+
+def test_effort_is_limited(simulate):
+    body = robot("prims")
+    weak = tuple(replace(j, effort=5.0) if j.name == "gantry_x" else j for j in body.joints)
+    body = replace(body, joints=weak)
+    simulation = simulate(Scene(body))
+    q = reset(simulation, body.home)
+    q[0, 0] = 0.5
+    simulation.step(q)
+    acceleration = 5.0 / mass_matrix(body, body.home)[0, 0]
+    expected = acceleration * SUBSTEPS * TIMESTEP
+    assert float(simulation.qd[0, 0]) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("pushes", [False, True])
+def test_joints_return_to_their_limits(simulate, pushes):
+    """Joints return whatever pushed them; scenes with a block use another solver."""
+    body = arm()
+    block = Block((0.1, 0.1, 0.1), Pose((3.0, 0.0, 0.05)), 1.0) if pushes else None
+    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0)), block=block))
+    q = reset(simulation, [1.95, 0.0, 0.0, 0.0])
+    loaded = client_of(simulation)
+    link = loaded.driven[0]
+    farthest = 0.0
+    for _ in range(100):
+        pybullet.applyExternalTorque(
+            loaded.robot,
+            link,
+            [0.0, 200.0, 0.0],
+            pybullet.WORLD_FRAME,
+            physicsClientId=loaded.id,
+        )
+        simulation.step(q)
+        farthest = max(farthest, float(simulation.q[0, 0]))
+    assert farthest > 2.0
+    assert float(simulation.q[0, 0]) == pytest.approx(2.0, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_strong_contacts_do_not_exceed_joint_speed_limits(simulate):
+    """The arm presses against itself and the ground with full effort."""
+    body = robot("arm=ur5 ee=plane")
+    simulation = simulate(*[Scene(body)] * 8)
+    corners = torch.randn(8, body.dof, generator=torch.Generator().manual_seed(0)).sign()
+    low, high = (torch.tensor(each, dtype=torch.float32) for each in joint_limits(body).T)
+    final_targets = torch.where(corners > 0, high, low)
+    q = reset(simulation)
+    fastest = max(joint.velocity for joint in body.joints if joint.is_movable)
+    for _ in range(200):
+        before = simulation.q.clone()
+        q = q + (final_targets - q).clamp(-0.05, 0.05)
+        simulation.step(q)
+        moved = (simulation.q - before).abs().max()
+        assert float(moved) <= OVERSPEED * fastest * SUBSTEPS * TIMESTEP * (1 + 1e-4)
+
+
+def test_mimic_joints_follow_their_leaders(simulate):
+    body = arm()
+    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0))))
+    q = reset(simulation, body.home)
+    q[0, 3] = 0.035
+    loaded = client_of(simulation)
+    for _ in range(40):
+        simulation.step(q)
+        states = pybullet.getJointStates(loaded.robot, loaded.driven, physicsClientId=loaded.id)
+        expected = movable_positions(body, simulation.q[0].numpy())
+        np.testing.assert_allclose([s[0] for s in states], expected, atol=2e-4)
+    assert float(simulation.q[0, 3]) == pytest.approx(0.035, abs=1e-4)
+
+
+def block_scene(friction=1.0, height=0.5, mass=0.1):
+    edge = 0.1
+    block = Block((edge, edge, edge / 2), Pose((0.4, 0.0, height)), mass, friction)
+    return Scene(robot("arm=ur5 ee=plane"), Pose((-1.0, 0.0, 0.3)), block)
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.6])
+@pytest.mark.parametrize("degrees", [0, 30, 45])
+def test_friction_follows_coulombs_law(simulate, friction, degrees):
+    simulation = simulate(block_scene(friction, height=0.025))
+    q = reset(simulation)
+    simulation.step(q)
+    before = simulation.block_pose[0, :2].clone()
+    loaded = client_of(simulation)
+    ahead = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    pybullet.resetBaseVelocity(loaded.block, (*0.8 * ahead, 0.0), physicsClientId=loaded.id)
+    for _ in range(60):
+        simulation.step(q)
+    expected = 0.8**2 / (2 * friction * GRAVITY) * ahead
+    moved = (simulation.block_pose[0, :2] - before).numpy()
+    np.testing.assert_allclose(moved, expected, atol=0.05 * np.linalg.norm(expected))
+
+
+def test_robots_have_the_specified_friction(simulate):
+    loaded = client_of(simulate(push_scene()))
+    for link in (-1, *loaded.driven):
+        info = pybullet.getDynamicsInfo(loaded.robot, link, physicsClientId=loaded.id)
+        assert info[1] == FRICTION
+
+
+def push(simulation, steps=60):
+    q = reset(simulation)
+    for _ in range(steps):
+        q[:, 1] += 0.008
+        simulation.step(q)
+
+
+def test_gantry_pushes_the_block(simulate):
+    simulation = simulate(push_scene())
+    push(simulation)
+    plate = float(simulation.q[0, 1]) + 0.005
+    assert float(simulation.block_pose[0, 1]) == pytest.approx(plate + 0.075, abs=0.01)
+    assert float(simulation.block_pose[0, 1]) > 0.2
+
+
+def test_plate_passes_through_the_block_without_contacts(simulate):
+    simulation = simulate(push_scene(), contacts=Contacts(scene=False))
+    push(simulation)
+    assert float(simulation.q[0, 1]) > 0.2
+    assert float(simulation.block_pose[0, 1]) == pytest.approx(0.0, abs=1e-3)
+    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.075, abs=1e-3)
+
+
+def test_obstacles_stop_the_robot(simulate):
+    wall = Block((1.0, 0.1, 1.0), Pose((0.0, 0.1, 0.5)))
+    simulation = simulate(replace(push_scene(), block=None, obstacles=(wall,)))
+    push(simulation, 80)
+    half_plate = 0.3
+    assert float(simulation.q[0, 1]) == pytest.approx(0.05 - half_plate, abs=0.01)
+
+
+def test_fixed_base_touches_blocks_but_not_static_objects(simulate):
+    """The arm's base overlaps the ground and a box, and touches a block."""
+    box = Block((0.1, 0.1, 0.05), Pose((0.0, 0.0, -0.01)))
+    scene = Scene(robot("arm=ur5 ee=plane"), obstacles=(box,))
+    simulation = simulate(scene, replace(scene, block=replace(box, mass=0.1), obstacles=()))
+    q = reset(simulation)
+    simulation.step(q)
+    assert touching(simulation) == set()
+    loaded = client_of(simulation, 1)
+    assert ((loaded.robot, -1), (loaded.block, -1)) in touching(simulation, 1)
+
+
+def self_contact(simulate, body, **contacts):
+    simulation = simulate(
+        Scene(body, Pose((0.0, 0.0, 2.0)), ground=None), contacts=Contacts(**contacts)
+    )
+    reset(simulation, (0.0, 0.0, 0.0, 0.0))
+    # Before a step, because a step separates overlapping bodies.
+    client = client_of(simulation).id
+    pybullet.performCollisionDetection(physicsClientId=client)
+    points = pybullet.getContactPoints(physicsClientId=client)
+    return {((p[1], p[3]), (p[2], p[4])) for p in points if p[8] < 0}
+
+
+def overlapping():
+    """An arm whose third link overlaps its base."""
+    body = arm()
+    joints = list(body.joints)
+    joints[2] = replace(joints[2], T_parent_joint=Pose((0.0, 0.0, -0.4)))
+    return replace(body, joints=tuple(joints))
+
+
+def test_links_collide_unless_their_pair_is_ignored(simulate):
+    body = overlapping()
+    touched = self_contact(simulate, body)
+    assert touched
+    merged = merge_rigid_links(body)
+    names = {-1: merged.root.name} | {k: joint.child for k, joint in enumerate(merged.joints)}
+    pairs = {tuple(sorted((names[a], names[b]))) for (_, a), (_, b) in touched}
+    assert ("base", "slider") in pairs or ("slider", "upper") in pairs
+    assert self_contact(simulate, replace(body, ignore_pairs=tuple(sorted(pairs)))) == set()
+    assert self_contact(simulate, body, self_collision=False) == set()
+    assert self_contact(simulate, body, scene=False) == touched

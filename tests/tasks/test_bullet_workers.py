@@ -229,38 +229,27 @@ while True:
 
 
 @pytest.mark.slow
-def test_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
-    process, running = script(tmp_path, "raise RuntimeError('on purpose')")
-    _, errors = process.communicate(timeout=20)
-    assert "on purpose" in errors
-    assert len(running) == 2
-    assert not any(map(is_running, running))
-    assert leftovers(scratch, process.pid) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", [FOREVER, FOREVER.replace("simulation.step(q)", "pass")])
-def test_ctrl_c_ends_the_workers(tmp_path, scratch, ending):
-    """A terminal sends Ctrl-C to all foreground processes."""
+@pytest.mark.parametrize(
+    ("ending", "stop", "says"),
+    [
+        ("raise RuntimeError('on purpose')", None, "on purpose"),
+        (FOREVER, lambda pid: os.killpg(pid, signal.SIGINT), "KeyboardInterrupt"),  # as a terminal
+        (FOREVER.replace("simulation.step(q)", "pass"), lambda pid: os.killpg(pid, 2), "Keyboard"),
+        (FOREVER, lambda pid: os.kill(pid, signal.SIGKILL), ""),
+    ],
+    ids=["exception", "Ctrl-C", "Ctrl-C while idle", "killed"],
+)
+def test_workers_end_with_the_parent(tmp_path, scratch, ending, stop, says):
     process, running = script(tmp_path, ending)
-    time.sleep(0.3)
-    os.killpg(process.pid, signal.SIGINT)
+    if stop is not None:
+        time.sleep(0.3)
+        stop(process.pid)
     _, errors = process.communicate(timeout=20)
-    assert process.returncode in (1, -signal.SIGINT)
-    assert errors.count("Traceback") == 1
-    assert "KeyboardInterrupt" in errors
-    assert len(running) == 2
-    assert not any(map(is_running, running))
-    assert leftovers(scratch, process.pid) == []
-
-
-@pytest.mark.slow
-def test_workers_end_when_the_parent_is_killed(tmp_path, scratch):
-    process, running = script(tmp_path, FOREVER)
-    process.kill()
-    process.communicate(timeout=20)
+    assert says in errors
+    assert errors.count("Traceback") == bool(says)
     assert len(running) == 2
     assert eventually(lambda: not any(map(is_running, running)))
+    assert not says or leftovers(scratch, process.pid) == []  # a killed process leaves its files
     assert list(Path("/dev/shm").glob(f"*{process.pid}*")) == []
 
 

@@ -1,12 +1,16 @@
-"""Collision-free configurations, compared with hand-computed spheres and MuJoCo's plane."""
+"""Free configurations, their connected components, and straight paths between them."""
 
+import math
+import re
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 
-from helpers.scenes import push_scene, reach_scene, real_arm_scene
+from helpers.goal_sets import draw_goals
+from helpers.scenes import ball, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import PENETRATION
 from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf.write import to_spec
@@ -14,7 +18,10 @@ from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space as module
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.batch_observation import SAME, StraightPaths
+from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
@@ -42,22 +49,60 @@ def free(scene, *q):
     return FreeSpace(scene).free([[value] for value in q]).tolist()
 
 
-def test_links_may_touch_but_not_penetrate_the_ground():
-    lowest = -0.5 + 0.1
-    assert free(Scene(aside()), 0.0, lowest - SHALLOW, lowest - DEEP) == [True, True, False]
-    assert free(Scene(aside(), ground=None), lowest - DEEP) == [True]
-
-
-def test_links_deep_below_the_ground_are_in_collision():
-    assert free(Scene(aside(), Pose((0.0, 0.0, -3.0))), 0.0) == [False]
-
-
-def test_root_and_links_fixed_to_it_may_be_in_the_ground():
+def with_foot():
+    """The robot with a ball below the ground that is fixed to its plate."""
     foot = Link("foot", collisions=(Shape(Sphere(0.2)),))
     fixed = Joint("to_foot", "fixed", "plate", "foot", Pose((0.0, 0.5, 0.0)))
-    robot = aside()
-    robot = replace(robot, links=(*robot.links, foot), joints=(*robot.joints, fixed))
-    assert free(Scene(robot), 0.0) == [True]
+    return replace(aside(), links=(*aside().links, foot), joints=(*aside().joints, fixed))
+
+
+def named_like_surroundings():
+    names = ("world", "ground")
+    links = tuple(replace(a, name=b) for a, b in zip(aside().links, names, strict=True))
+    joint = replace(aside().joints[0], name="to_root", parent="world", child="ground")
+    return Robot("r", links, (joint,), (Frame("tool", "ground"),), (0.0,))
+
+
+def pointing(z):
+    """The robot whose tool is above or below its ball."""
+    return replace(aside(), frames=(Frame("tool", "ball", Pose((0.0, 0.0, z))),))
+
+
+LOWEST, UNDER_SLAB = -0.5 + 0.1, 1.0 - 0.1 - 0.1 - 0.5
+HIGH_SLAB, THIN = (
+    replace(SLAB, pose=Pose((0.5, 0.0, 1.0))),
+    Block((0.1,) * 3, Pose((0.5, 0.0, 0.9))),
+)
+
+
+@pytest.mark.parametrize(
+    ("scene", "expected"),
+    [
+        (Scene(aside()), {0.0: True, LOWEST - SHALLOW: True, LOWEST - DEEP: False}),
+        (Scene(aside(), ground=None), {LOWEST - DEEP: True}),
+        (Scene(aside(), Pose((0.0, 0.0, -3.0))), {0.0: False}),
+        (Scene(with_foot()), {0.0: True}),
+        (
+            Scene(aside(), obstacles=(HIGH_SLAB,)),
+            {UNDER_SLAB + SHALLOW: True, UNDER_SLAB + DEEP: False},
+        ),
+        # Simulators do not test contacts between static objects, so FreeSpace must.
+        (Scene(aside(), obstacles=(Block((0.05,) * 3),)), {0.0: False, 0.5: False}),
+        (Scene(pointing(0.3), obstacles=(THIN,)), {0.0: True, 0.1: False, 0.2: True}),
+        (Scene(replace(aside(), frames=()), obstacles=(THIN,)), {0.1: True}),
+        (Scene(pointing(-0.3), obstacles=(THIN,)), {-0.25: True}),
+        (Scene(aside(), HALF_TURN), {0.0: True, 0.5: False, -0.5: True}),  # the slide points down
+        (Scene(aside(), Pose((0.0, 0.0, 1.0))), {0.5: True, -0.5: True}),
+        (Scene(aside(), block=replace(SLAB, mass=0.1)), {0.0: True}),
+        (Scene(aside(), obstacles=(replace(SLAB, mass=0.1),)), {0.0: False}),
+        (
+            Scene(named_like_surroundings(), obstacles=(SLAB,)),
+            {0.0: False, -0.41: False, 0.9: True},
+        ),
+    ],
+)
+def test_configurations_are_free_where_nothing_penetrates(scene, expected):
+    assert free(scene, *expected) == list(expected.values())
 
 
 def test_links_collide_unless_adjacent_or_their_pair_is_ignored():
@@ -75,12 +120,6 @@ def test_links_collide_unless_adjacent_or_their_pair_is_ignored():
         assert FreeSpace(Scene(body, above)).free([[0.0, z] for z in q]).tolist() == expected
 
 
-def test_links_collide_with_obstacles():
-    scene = Scene(aside(), obstacles=(replace(SLAB, pose=Pose((0.5, 0.0, 1.0))),))
-    touching = 1.0 - 0.1 - 0.1 - 0.5
-    assert free(scene, touching + SHALLOW, touching + DEEP) == [True, False]
-
-
 def test_obstacle_hits_are_named_and_obstacles_may_overlap():
     near, far = SLAB, replace(SLAB, pose=Pose((0.5, 0.0, 0.35)))
     sunk = Block((1.0, 1.0, 1.0), Pose((5.0, 0.0, 0.0)))
@@ -93,44 +132,6 @@ def test_obstacle_hits_are_named_and_obstacles_may_overlap():
         [False, False, False],
     ]
     assert space.free([[0.5]]).all()
-
-
-def test_obstacle_in_the_base_leaves_no_free_configuration():
-    """Simulators do not test contacts between static objects, so FreeSpace must."""
-    inside = Block((0.05, 0.05, 0.05))
-    assert free(Scene(aside(), obstacles=(inside,)), 0.0, 0.5) == [False, False]
-
-
-def test_tool_point_inside_an_obstacle_is_in_collision():
-    fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
-    robot = replace(aside(), frames=(fingertip,))
-    thin = Block((0.1, 0.1, 0.1), Pose((0.5, 0.0, 0.9)))
-    assert free(Scene(robot, obstacles=(thin,)), 0.0, 0.1, 0.2) == [True, False, True]
-    assert free(Scene(replace(robot, frames=()), obstacles=(thin,)), 0.1) == [True]
-    below = replace(aside(), frames=(Frame("tool", "ball", Pose((0.0, 0.0, -0.3))),))
-    assert free(Scene(below, obstacles=(thin,)), -0.25) == [True]
-
-
-def test_robot_base_pose_of_the_scene_is_used():
-    """With an inverted base the slide points down."""
-    assert free(Scene(aside(), HALF_TURN), 0.0, 0.5, -0.5) == [True, False, True]
-    assert free(Scene(aside(), Pose((0.0, 0.0, 1.0))), 0.5, -0.5) == [True, True]
-
-
-def test_pushable_block_is_not_an_obstacle():
-    block = replace(SLAB, mass=0.1)
-    assert free(Scene(aside(), block=block), 0.0) == [True]
-    assert free(Scene(aside(), obstacles=(block,)), 0.0) == [False]
-
-
-def test_any_link_names_are_accepted():
-    links = tuple(
-        replace(link, name=name)
-        for link, name in zip(aside().links, ("world", "ground"), strict=True)
-    )
-    joint = replace(aside().joints[0], name="to_root", parent="world", child="ground")
-    robot = Robot("r", links, (joint,), (Frame("tool", "ground"),), (0.0,))
-    assert free(Scene(robot, obstacles=(SLAB,)), 0.0, -0.41, 0.9) == [False, False, True]
 
 
 def test_configurations_have_the_shape_of_the_robot():
@@ -313,3 +314,150 @@ def test_block_clearance_far_away_equals_the_full_test():
     clear = space.block_is_clear(blocks)
     assert clear.tolist() == space.free(away, blocks).tolist()
     assert 0 < clear.sum() < len(clear)
+
+
+ACROSS = ((0.5, 0.0), (0.12, 6.0))
+GAP = (((0.5, -1.2), (0.1, 2.0)), ((0.5, 1.2), (0.1, 2.0)))
+HERE, THERE = np.array([-1.5, 1.0]), np.array([1.5, 1.0])
+
+
+def walled(*walls):
+    """A ball on slides, among walls: (x, y) of their middles and edges.
+
+    The cart has a shape, far above, lest ball and base are neighbours, which may touch.
+    """
+    shapes = tuple(Shape(Box((*edges, 0.4)), Pose((*middle, 0.2))) for middle, edges in walls)
+    above = Shape(Sphere(0.01), Pose((0.0, 0.0, 5.0)))
+    links = [Link("base", collisions=shapes), Link("cart", collisions=(above,))]
+    return ball(0.2).with_links(links)
+
+
+def hinged(kind, *walls):
+    """The same robot with a hinge as first joint, so that the ball circles the origin."""
+    body = walled(*walls)
+    first, second = body.joints
+    limits = None if kind == "continuous" else (-2 * math.pi, 2 * math.pi)
+    turning = replace(first, kind=kind, axis=(0.0, 0.0, 1.0), limits=limits)
+    sliding = replace(second, axis=(1.0, 0.0, 0.0), limits=(0.6, 1.2))
+    return replace(body, joints=(turning, sliding), home=(0.0, 0.9))
+
+
+def test_wall_splits_the_joint_range():
+    body = walled(ACROSS)
+    (component,) = cspace_components(body)
+    assert component.pairs == (("ball", "base"),)
+    assert component.joints == (0, 1)
+    assert in_other_component([component], THERE).tolist() == [True]
+    assert in_other_component([component], HERE).tolist() == [False]
+    for x, far in ((0.33, False), (0.67, True)):
+        assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
+        assert in_other_component([component], np.array([x, 0.0]))[0] == far
+
+
+@pytest.mark.parametrize("walls", [(), GAP])
+def test_passable_obstacle_does_not_split_the_range(walls):
+    assert cspace_components(walled(*walls)) == ()
+
+
+def test_continuous_joint_wraps_around():
+    """Two walls split a continuous joint; with joint limits one wall is enough."""
+    left, right = ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0))
+    assert cspace_components(hinged("continuous", left)) == ()
+    body = hinged("continuous", left, right)
+    components = cspace_components(body)
+    assert in_other_component(components, np.array([math.pi - 0.1, 0.9])).all()
+    assert in_other_component(components, np.array([0.1 - math.pi, 0.9])).all()
+    assert not in_other_component(components, np.array([0.5, 0.9])).any()
+
+
+def test_ranges_of_full_turns_are_not_split():
+    """For a hinge with two turns, the angle matters and not the turn."""
+    body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
+    found = cspace_components(body)
+    for turns in (-1, 0):
+        assert not in_other_component(found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
+    assert in_other_component(found, np.array([math.pi, 0.9])).all()
+
+
+@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
+def test_library_robots_have_one_component(words):
+    assert cspace_components(robot(words)) == ()
+
+
+def test_goals_are_in_the_larger_component(tmp_path):
+    body = walled(ACROSS)
+    both, _ = FreeSpace(Scene(body)).sample(40, np.random.default_rng(0))
+    assert 5 < (both[:, 0] > 0.5).sum() < 35
+    goals = draw_goals(body, ReachConfig(num_goals=40), obstacles=False, seed=0, cache=tmp_path)
+    assert (goals.q[:, 0] < 0.5).all()
+    assert goals.accepted == 40 < goals.tried
+    few = draw_goals(body, ReachConfig(num_goals=7), obstacles=False, seed=0, cache=tmp_path)
+    assert (few.q == goals.q[:7]).all()
+    assert REACH.certify(goals, body, Scene(body)) == []
+
+
+def test_too_few_goals_error_counts_the_unreachable_ones():
+    space = FreeSpace(Scene(walled(ACROSS)))
+    with pytest.raises(BenchmarkError) as caught:
+        space.sample(1, np.random.default_rng(0), lambda q: False)
+    said = re.search(
+        r"only 0 of 1,000 .* free of collisions and (\d+) more are, but cut", str(caught.value)
+    )
+    q = random_configurations(space.scene.robot, 1000, np.random.default_rng(0))
+    assert int(said[1]) == space.free(q).sum() > 100
+
+
+def test_certificate_detects_goals_in_another_component(tmp_path):
+    goals = draw_goals(
+        ball(0.2), ReachConfig(num_goals=12), obstacles=False, seed=0, cache=tmp_path
+    )
+    body = walled(ACROSS)
+    lines = REACH.certify(goals, body, Scene(body))
+    there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
+    assert there
+    said = "'ball' and 'base' touch on every path to most others"
+    assert [line for line in lines if "touch" in line] == [f"goal {i}: {said}" for i in there]
+
+
+def test_joints_that_do_not_move_the_tool_are_not_split():
+    body = walled(ACROSS)
+    (frame,) = body.frames
+    assert cspace_components(replace(body, frames=(replace(frame, link="cart"),))) == ()
+
+
+START, BEHIND, BESIDE = np.array([-0.5, 0.0]), np.array([0.5, 0.0]), np.array([-0.5, 0.5])
+
+
+class Layouts:
+    """Two environments of a ball on slides along x and y; in the first there is a wall."""
+
+    wall = Block((0.2, 0.4, 0.4), Pose((0.0, 0.0, 0.2)))
+
+    def obstacles(self, env):
+        return (self.wall,) if env == 0 else ()
+
+    def scene(self, env):
+        return Scene(ball(0.2), obstacles=self.obstacles(env))
+
+
+def test_the_first_end_with_a_free_path_is_found():
+    first_free = StraightPaths(Layouts(), torch.tensor([0, 1]))
+    assert first_free(0, START, np.array([BEHIND, BESIDE])) == 1
+    assert first_free(0, START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
+    assert first_free(0, START, BEHIND[None]) is None
+    assert first_free(0, START, np.zeros((0, 2))) is None
+    assert first_free(1, START, np.array([BEHIND, BESIDE])) == 0
+
+
+def test_obstacles_count_where_they_are_now():
+    layouts = Layouts()
+    first_free = StraightPaths(layouts, torch.tensor([0]))
+    assert first_free(0, START, BEHIND[None]) is None
+    layouts.wall = replace(layouts.wall, pose=Pose((0.0, 2.0, 0.2)))
+    assert first_free(0, START, BEHIND[None]) == 0
+
+
+def test_padding_of_configurations_is_ignored():
+    first_free = StraightPaths(Layouts(), torch.tensor([0]))
+    padded = np.array([[*BEHIND, 0.0], [*BESIDE, 0.0]])
+    assert first_free(0, np.array([*START, 9.0]), padded) == 1

@@ -1,4 +1,4 @@
-"""MuJoCo simulation: control law, resets, divergence and reproducibility."""
+"""MuJoCo simulation: models, limits, divergence, threads, and contacts of block and robot."""
 
 import math
 import re
@@ -15,6 +15,7 @@ from helpers.resets import reset_envs
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs
+from morphgen.errors import SimulationError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robot
@@ -23,7 +24,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits, movable_positions
 from morphgen.model.robot import Frame
 from morphgen.tasks.sim import mujoco_model
-from morphgen.tasks.sim.base import Block, Contacts, Scene
+from morphgen.tasks.sim.base import GRAVITY, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
@@ -266,3 +267,78 @@ def test_the_inertia_of_a_real_arm_stays():
     of_robot = movable_mass_matrix(body, body.home) + np.diag(armature(body))
     inertia = compiled_inertia(body)
     np.testing.assert_allclose(inertia, of_robot, rtol=1e-4, atol=1e-4)
+
+
+def block_scene(block, **rest):
+    return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), block=block, **rest)
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.6])
+def test_friction_is_that_of_the_block(friction):
+    """The slope is 10 % steeper or flatter than the friction limit."""
+    travelled = []
+    for share in (0.9, 1.1):
+        angle = math.atan(friction * share)
+        ramp = Pose.from_xyz_rpy((0, 0, 3.0), (angle, 0, 0))
+        block = Block((0.1,) * 3, ramp @ Pose((0, 0, 0.1)), 0.1, friction)
+        sim = MujocoSimulation(
+            [block_scene(block, obstacles=(Block((2, 4, 0.1), ramp, friction=0.9),))]
+        )
+        held(sim, 50)
+        before = sim.block_pose[0, :3].clone()
+        held(sim, 25)
+        travelled.append((sim.block_pose[0, :3] - before).norm().item())
+    slide = GRAVITY * (math.sin(angle) - friction * math.cos(angle))
+    assert travelled[0] < 1e-3
+    assert travelled[1] == pytest.approx(slide / 2 * (1.5**2 - 1), rel=0.05)
+
+
+def test_spin_is_in_the_world_frame():
+    """A block that leans on an edge topples about the world's x, however it is turned itself."""
+    lean = Pose.from_xyz_rpy((0, 0, 0.15), (-0.9, 0, 0))
+    turned = lean @ Pose.from_xyz_rpy((0, 0, 0), (0, 0, math.pi / 2))
+    spins = []
+    for pose in (lean, turned):
+        sim = held(MujocoSimulation([block_scene(Block((0.2,) * 3, pose, 0.1))]), 8)
+        spins.append(sim.block_velocity[0, 3:].tolist())
+    assert abs(spins[0][0]) > 0.5
+    assert spins[1] == pytest.approx(spins[0], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("contacts", "lowest"), [(Contacts(), -0.02), (Contacts(scene=False), -10.0)]
+)
+def test_ground_contacts_are_optional(contacts, lowest):
+    sim = MujocoSimulation([Scene(robot("prims"), Pose((0, 0, -0.5)))], contacts)
+    q = sim.q.clone()
+    depth = sim.scenes[0].robot.joint_index["gantry_z"]
+    column = sim.scenes[0].robot.independent_joints.index(depth)
+    for _ in range(60):
+        q[0, column] = max(q[0, column] - 0.02, 0.2)
+        sim.step(q)
+    reached = sim.q[0, column].item()
+    assert (reached < 0.21) == (lowest < -1)
+
+
+def test_self_contacts_are_optional_and_respect_ignored_pairs():
+    body = robot("arm=panda ee=panda_hand")
+    q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *joint_limits(body).T)
+    counts = []
+    for contacts in (Contacts(), Contacts(self_collision=False)):
+        sim = MujocoSimulation([Scene(body, ground=None)], contacts)
+        held(sim, 1)
+        assert sim._data[0].ncon == 0
+        reset_envs(sim, [0], torch.from_numpy(q[None]))
+        held(sim, 1)
+        counts.append(sim._data[0].ncon)
+    assert counts[0] > 0
+    assert counts[1] == 0
+
+
+def test_mujoco_errors_become_one_line():
+    scene = block_scene(Block((0.1, 0.0, 0.1), mass=0.1))
+    with pytest.raises(
+        SimulationError, match=r"environment 1, robot 'prims.*MuJoCo refuses"
+    ) as info:
+        MujocoSimulation([reach_scene(), scene])
+    assert "\n" not in str(info.value)

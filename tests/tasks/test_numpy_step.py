@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.simulators import PYBULLET, needs_pybullet
+from helpers.simulators import PYBULLET
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.env import TaskEnv, numpy_stepper
@@ -117,32 +117,38 @@ def run_both(env, batch, episodes, seed=2):
     return ends, successes
 
 
-@pytest.mark.parametrize("kind", ["continuous", "discrete"])
-@pytest.mark.parametrize(
-    ("sim", "obstacles"),
-    [
-        pytest.param("pybullet", False, marks=needs_pybullet),
-        pytest.param("pybullet", True, marks=needs_pybullet),
-        ("mujoco", False),
-        ("mujoco", True),
-        ("kinematic", False),
-    ],
-)
-def test_reach_equals_the_batch(make, sim, kind, obstacles):
-    env, batch = make("reach", sim=sim, kind=kind, obstacles=obstacles)
-    assert env._stepper is not None
-    ends, successes = run_both(env, batch, 4)
-    assert ends == [False] * 4
-    assert 0 < successes < 4 * STEPS
+POSE = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
 
 
-@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 @pytest.mark.parametrize("obstacles", [False, True])
-def test_push_equals_the_batch(make, sim, kind, obstacles):
-    env, batch = make("push", sim=sim, kind=kind, obstacles=obstacles)
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco", "kinematic"])
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_steps_equal_those_of_the_batch(make, task, sim, kind, obstacles):
+    if sim == "kinematic" and (obstacles or task == "push"):
+        pytest.skip("it has no contacts")
+    env, batch = make(task, sim=sim, kind=kind, obstacles=obstacles)
     assert env._stepper is not None
-    run_both(env, batch, 4)
+    ends, successes = run_both(env, batch, 4)
+    if task == "reach":
+        assert ends == [False] * 4
+        assert 0 < successes < 4 * STEPS
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "in_numpy"),
+    [
+        ("reach", {"robot": "arm=jaco2 ee=stick"}, True),  # joints without limits
+        ("reach", {"robot": "planar-cube"}, True),  # slides
+        ("reach", {"config": POSE}, False),
+        ("push", {"observe": ObservationConfig(points=5, state=False), "obstacles": True}, True),
+    ],
+)
+def test_other_environments_equal_the_batch(make, task, options, in_numpy):
+    env, batch = make(task, **options)
+    assert (env._stepper is not None) is in_numpy
+    run_both(env, batch, 2)
+    assert task == "reach" or not env.reset()[0]["object"].any()
 
 
 def test_push_over_the_line_terminates_as_in_the_batch(make):
@@ -185,26 +191,6 @@ def test_entries_in_numpy_equal_those_of_the_batch(make, task, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(env.batch, "requested_entries", None)  # a step in NumPy does not call it
         env.step(np.zeros(env.action_space.shape, np.float32))
-    run_both(env, batch, 2)
-
-
-def test_points_replace_the_state(make):
-    env, batch = make("push", observe=ObservationConfig(points=5, state=False), obstacles=True)
-    run_both(env, batch, 2)
-    assert not env.reset()[0]["object"].any()
-
-
-@pytest.mark.parametrize("robot", ["arm=jaco2 ee=stick", "planar-cube"])
-def test_joints_without_limits_and_slides_equal_the_batch(make, robot):
-    env, batch = make("reach", robot)
-    assert env._stepper is not None
-    run_both(env, batch, 2)
-
-
-def test_goals_that_are_poses_step_in_torch(make):
-    config = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
-    env, batch = make("reach", config=config)
-    assert env._stepper is None
     run_both(env, batch, 2)
 
 

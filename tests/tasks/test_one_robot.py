@@ -1,13 +1,18 @@
-"""One robot has the same shapes, key, goals and score however it is named."""
+"""Ways to name a robot, which has the same shapes, key, goals and score however it is named."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import morphgen
+from helpers.robots import arm
 from helpers.splits import member, split
 from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.errors import CompositionError, FormatError, PartError
+from morphgen.formats.urdf.write import urdf_text
+from morphgen.model.geometry import Mesh
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
@@ -56,20 +61,6 @@ def batches(named, tmp_path_factory):
         batch.close()
 
 
-@pytest.fixture(scope="module")
-def scores(batches):
-    """Return the rewards of all steps by name, for the same actions."""
-    rewards = {}
-    for name, batch in batches.items():
-        rng = np.random.default_rng(0)
-        batch.reset(0)
-        rewards[name] = [
-            float(batch.step(batch.action_mask * float(rng.uniform(-1, 1))).reward[0])
-            for _ in range(STEPS)
-        ]
-    return rewards
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_shapes_and_key_are_the_same(batches, name):
     reference, other = (batches[each].specs[0].robot for each in ("words", name))
@@ -80,28 +71,27 @@ def test_shapes_and_key_are_the_same(batches, name):
     assert other.home == reference.home
     assert other.ignore_pairs == reference.ignore_pairs
     assert robot_hash(other, visuals=False) == robot_hash(reference, visuals=False)
+    assert (batches[name].robot_tables.tokens == batches["words"].robot_tables.tokens).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_goals_are_the_same(batches, name):
+def test_goals_and_scores_are_the_same(batches, name):
     reference, other = (batches[each].specs[0].goals for each in ("words", name))
-    assert other.key == reference.key
-    assert other.tried == reference.tried
+    assert (other.key, other.tried) == (reference.key, reference.tried)
     assert other.obstacles == reference.obstacles
     np.testing.assert_array_equal(other.q, reference.q)
     np.testing.assert_array_equal(other.poses, reference.poses)
+    rewards, expected = (rewards_of(batches[each]) for each in (name, "words"))
+    assert rewards == expected
+    assert len(set(rewards)) > STEPS / 2
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_tokens_are_the_same(batches, name):
-    reference, other = (batches[each].robot_tables.tokens for each in ("words", name))
-    assert (other == reference).all()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_scores_are_the_same(scores, name):
-    assert scores[name] == scores["words"]
-    assert len(set(scores[name])) > STEPS / 2
+def rewards_of(batch):
+    """Return the rewards of all steps, for the same actions."""
+    rng = np.random.default_rng(0)
+    batch.reset(0)
+    actions = [batch.action_mask * float(rng.uniform(-1, 1)) for _ in range(STEPS)]
+    return [float(batch.step(action).reward[0]) for action in actions]
 
 
 def test_visuals_do_not_change_the_simulation_hash():
@@ -111,9 +101,67 @@ def test_visuals_do_not_change_the_simulation_hash():
     assert robot_hash(bare) != robot_hash(robot)
 
 
-def test_loading_a_robot_twice_changes_nothing():
-    once = load_robot("arm=ur5 ee=stick")
-    twice = load_robot(once)
-    assert [link.collisions for link in twice.links] == [link.collisions for link in once.links]
-    assert twice.fits == once.fits
-    assert twice.ignore_pairs == once.ignore_pairs
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("gantry-cube", "base=gantry ee=cube"),
+        ("arm3-stick", "arm=arm3 ee=stick"),
+        ("pedestal-arm3-stick", "base=pedestal arm=arm3 ee=stick"),
+        ("z1", "arm=z1"),
+        ("prims", "prims"),
+        ("chain beads=4", "chain beads=4"),
+        ("arm=arm3 ee=stick ee.length=0.3", "arm=arm3 ee=stick ee.length=0.3"),
+    ],
+)
+def test_names_are_compose_arguments(given, words):
+    expected = morphgen.compose(words, geometry="primitive")
+    assert load_robot(given).name == expected.name
+    assert robot_hash(load_robot(given)) == robot_hash(expected)
+
+
+def test_collision_shapes_are_primitives_by_default():
+    def has_meshes(robot):
+        shapes = (shape for link in robot.links for shape in link.collisions)
+        return any(isinstance(shape.geometry, Mesh) for shape in shapes)
+
+    assert not has_meshes(load_robot("ur5-plane"))
+    assert has_meshes(load_robot("ur5-plane", geometry="mesh"))
+
+
+def test_robot_files_are_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = morphgen.write(arm(), "bundles", picture=False)
+    Path("own.urdf").write_text(urdf_text(arm(), str))
+    for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
+        assert load_robot(given).dof == arm().dof
+        assert load_robot(given).frame("tool")
+    Path("lr=3").mkdir()
+    Path("own.urdf").rename("lr=3/own.urdf")
+    assert load_robot("lr=3/own.urdf").dof == arm().dof
+
+
+def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("prims").mkdir()
+    assert load_robot("prims").name == "prims"
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        ("ur5-plain", CompositionError, "'plain' is not a part; did you mean 'plane'?"),
+        ("prismz", CompositionError, "did you mean 'prims'?"),
+        ("chian beads=4", CompositionError, "did you mean 'chain'?"),
+        ("bead", CompositionError, "'bead' is a segment, which only a grammar can use"),
+        ("ur5-ur10", CompositionError, "arm is given twice: ur5 and ur10"),
+        ("arm=ur5 ee=plain", PartError, "did you mean 'plane'?"),
+        ("robots/missing", FormatError, "robots/missing: no such file"),
+        ("missing.urdf", FormatError, "missing.urdf: no such file"),
+        (Path("missing"), FormatError, "missing: no such file"),
+        (" ", CompositionError, "no robot is named"),
+    ],
+)
+def test_unknown_name_suggests_the_nearest(given, error, says):
+    with pytest.raises(error) as caught:
+        load_robot(given)
+    assert says in str(caught.value)

@@ -1,4 +1,4 @@
-"""The same joint targets lead to the same states in PyBullet and MuJoCo."""
+"""The same joint targets lead to the same states in PyBullet and MuJoCo, also under contact."""
 
 from dataclasses import replace
 
@@ -8,11 +8,15 @@ import torch
 
 from helpers.joint_targets import SECOND, smooth_walk
 from helpers.resets import reset_envs
+from helpers.robots import finger
 from helpers.scenes import PAPER_ROBOTS, push_scene, robot
+from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
+from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
+from morphgen.tasks.sim.base import CONTROL_PERIOD, GRAVITY, Block, Contacts, Scene
+from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation
@@ -98,3 +102,111 @@ def test_pushed_blocks_move_the_same_distance(friction, aside):
     assert ends[0][1] > 0.2
     assert (ends[0][:3] - ends[1][:3]).norm() < 0.02
     assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
+
+
+EDGE = 0.08
+
+
+@pytest.fixture(params=[BulletSimulation, MujocoSimulation])
+def simulator(request):
+    return request.param
+
+
+def pushed(simulator, block_mass, speed, way, finger_mass=2.0, height=0.3):
+    """Rows of (lag of the finger, rise of the block, its tilt), and how far it got, metres, rad."""
+    block = Block((EDGE, EDGE, EDGE), Pose((0.0, 0.0, EDGE / 2)), block_mass)
+    simulation = simulator([Scene(finger(finger_mass), block=block)])
+    try:
+        q = torch.tensor([[-EDGE / 2 - 0.011, height * EDGE]])
+        pose = torch.tensor([[0.0, 0.0, EDGE / 2, 1.0, 0.0, 0.0, 0.0]])
+        reset_envs(simulation, [0], q, pose)
+        rows = []
+        for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
+            q[:, 0] += speed * CONTROL_PERIOD
+            simulation.step(q)
+            _, _, z, _, x, y, _ = simulation.block_pose[0].tolist()
+            tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
+            rows.append((float(q[0, 0] - simulation.q[0, 0]), z - EDGE / 2, tilt))
+        return np.array(rows), float(simulation.block_pose[0, 1])
+    finally:
+        simulation.close()
+
+
+@pytest.mark.parametrize(("block_mass", "finger_mass"), [(3.0, 2.0), (6.0, 2.0), (6.0, 4.0)])
+def test_finger_deflection_matches_its_stiffness(simulator, block_mass, finger_mass):
+    speed = 0.02
+    rows, _ = pushed(simulator, block_mass, speed, 0.06, finger_mass)
+    load = block_mass * GRAVITY / (GAIN * BANDWIDTH**2 * (finger_mass + 0.2))
+    free = 2 * speed / BANDWIDTH
+    lag = rows[len(rows) // 2 :, 0].mean()
+    assert lag == pytest.approx(free + load, rel=0.35)
+
+
+def test_pushed_block_stays_on_the_ground(simulator):
+    rows, far = pushed(simulator, 0.1, 0.3, 0.25)
+    assert far > 0.2
+    assert rows[:, 1].max() < 1e-3
+    assert np.degrees(rows[:, 2].max()) < 3
+
+
+ARM = "arm=arm3 ee=claw"
+
+
+@pytest.mark.parametrize(
+    ("request_", "roll", "count"),
+    [(ARM, 0.0, 2), (ARM, 0.1, 1), ("arm=ur5 ee=plane", 0.0, None), ("planar_arm", 0.0, None)],
+)
+def test_level_links_have_constant_height_and_tilt(request_, roll, count):
+    body, T_world_root = robot(request_), Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0))
+    drawn = np.random.default_rng(0).uniform(*joint_limits(body).T, (9, body.dof))
+    T_world_link = T_world_root.matrix @ np.array([forward_kinematics(body, q) for q in drawn])
+    moved = np.ptp(T_world_link[:, :, 2], axis=0).max(axis=1)
+    steady = {link.name for link, by in zip(body.links, moved, strict=True) if by < 1e-9}
+    assert ground_contact_links(body, T_world_root) == steady
+    assert count is None or len(steady) == count
+
+
+@pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
+def test_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
+    """The disc of arm3 rests on the ground and no joint changes its height."""
+    body = robot(ARM)
+    block = Block((0.1, 0.1, 0.1), Pose((0.0, -0.7, 0.05)), mass=0.1)
+    n = 16
+    scene = Scene(body, block=block)
+    places = torch.tensor([*block.pose.position, *block.pose.quaternion]).repeat(n, 1)
+    q = torch.tensor(body.home, dtype=torch.float32).repeat(n, 1)
+    q[:, 0] = torch.linspace(0.2, 2.0, n)
+    paths = []
+    for contacts in (Contacts(self_collision=False), Contacts(False, False)):
+        sim = simulation([scene] * n, contacts)
+        reset_envs(sim, torch.arange(n), q, places)
+        path = []
+        for i in range(1, 16):
+            turned = q.clone()
+            turned[:, 0] += 0.05 * i
+            turned[:, 3] -= 0.03 * i
+            sim.step(turned)
+            path.append(sim.q.clone())
+        sim.close()
+        paths.append(torch.stack(path))
+    torch.testing.assert_close(*paths, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
+def test_links_on_a_turntable_collide_with_obstacles(simulation):
+    """The horizontally stretched arm is stopped by a post."""
+    body = robot("arm=arm3 ee=claw arm.length=0.3")
+    q = torch.tensor([body.home], dtype=torch.float32)
+    q[0, 1:4] = torch.tensor([0.0, 0.0, 0.0])
+    post = Block((0.05, 0.05, 0.4), Pose((0.25, 0.35, 0.2)))
+    places = torch.zeros(1, 7)
+    for obstacles in ((), (post,)):
+        sim = simulation([Scene(body, obstacles=obstacles)], Contacts(self_collision=False))
+        reset_envs(sim, [0], q, places)
+        for i in range(1, 40):
+            turned = q.clone()
+            turned[0, 0] = min(float(q[0, 0]) + 0.05 * i, 3.1)
+            sim.step(turned)
+        base = float(sim.q[0, 0])
+        sim.close()
+        assert (base > 3.0) == (not obstacles)
