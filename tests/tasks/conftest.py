@@ -25,10 +25,10 @@ def simulate():
         simulation.close()
 
 
-@pytest.fixture
-def cache(tmp_path):
-    """Folder of stored goal sets, which does not exist yet."""
-    return tmp_path / "goals"
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of stored goal sets, which the tests of a process share."""
+    return tmp_path_factory.mktemp("goals")
 
 
 @pytest.fixture(scope="module")

@@ -41,8 +41,7 @@ BOUND = 6.0
 
 
 @pytest.fixture(scope="module")
-def specs(tmp_path_factory):
-    cache = tmp_path_factory.mktemp("goals")
+def specs(cache):
     arm, gantry = robot("arm3"), robot("prims")
     return {
         "reach": draw_spec(arm, REACH, cache=cache),

@@ -21,11 +21,6 @@ PUSH = "train", "gantry-cylinder"
 LAST = "test", "planar-plane"
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 def some(**more):
     """A split with reach and push members, with and without obstacles."""
     train = [member(TRAIN[0], task="reach"), member(TRAIN[2])]

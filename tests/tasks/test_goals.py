@@ -38,6 +38,12 @@ WORDS = (
 )
 
 
+@pytest.fixture
+def cache(tmp_path):
+    """Folder of stored goal sets, which does not exist yet."""
+    return tmp_path / "goals"
+
+
 def scene_of(body, goal_set, ground=LIFTED, layout=0):
     boxes = goal_set.obstacles
     if boxes:
@@ -225,23 +231,20 @@ def test_invalid_constants_are_rejected(changes, text):
         replace(CONFIG, **changes)
 
 
-@pytest.mark.parametrize("keep", [0, 100, -200])
-def test_broken_file_is_named(body, cache, keep):
-    sample_goals(body, cache)
-    (path,) = cache.iterdir()
-    path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(TaskError, match=f"{path.name}: not a ReachGoalSet: .*; delete it"):
-        sample_goals(body, cache)
+def changed_byte(data, goal_set):
+    at = data.index(goal_set.q.tobytes()) + 5
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
 
 
-def test_changed_byte_is_detected(body, cache):
+@pytest.mark.parametrize(
+    "change",
+    [lambda *_: b"", lambda data, _: data[:100], lambda data, _: data[:-200], changed_byte],
+)
+def test_broken_file_is_named(body, cache, change):
     goal_set = sample_goals(body, cache)
     (path,) = cache.iterdir()
-    data = path.read_bytes()
-    assert goal_set.q.tobytes() in data
-    at = data.index(goal_set.q.tobytes()) + 5
-    path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-    with pytest.raises(TaskError, match="delete it"):
+    path.write_bytes(change(path.read_bytes(), goal_set))
+    with pytest.raises(TaskError, match=f"{path.name}: not a ReachGoalSet: .*; delete it"):
         sample_goals(body, cache)
 
 

@@ -38,8 +38,7 @@ SIZES = {"lag": 1, "joint": 10, "poses": 15, "jacobian": 20, "dls": 3, "ik": 6}
 
 
 @pytest.fixture(scope="module")
-def specs(tmp_path_factory):
-    cache = tmp_path_factory.mktemp("goals")
+def specs(cache):
     robots = [morphgen.compose(words, geometry="primitive") for words in WORDS]
     config = replace(ReachConfig(), num_goals=10)
     return [draw_spec(robot, config, obstacles=False, seed=0, cache=cache) for robot in robots]

@@ -45,8 +45,7 @@ SIMULATIONS = {
 
 
 @pytest.fixture(scope="module")
-def specs(tmp_path_factory):
-    cache = tmp_path_factory.mktemp("goals")
+def specs(cache):
     arm, gantry = robot("arm3"), robot("prims")
     return {
         "reach": draw_spec(arm, REACH, obstacles=True, cache=cache),

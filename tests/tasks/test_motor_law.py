@@ -46,14 +46,6 @@ def test_joint_forces_of_an_arm_are_coupled():
     np.testing.assert_allclose(limits(body, error), wanted, rtol=1e-12)
 
 
-def test_mimic_finger_follows_its_leader():
-    body = arm()
-    error = np.zeros(5)
-    error[body.movable_joints.index(body.joint_index["left"])] = 0.01
-    left, right = limits(body, error)[-2:]
-    assert left == right > 0
-
-
 def test_force_is_zero_at_rest_and_never_exceeds_the_effort():
     assert (limits(finger(), 0.0) == 0).all()
     assert (limits(finger(), 0.05, effort=3.0) == 3).all()
@@ -68,18 +60,6 @@ def test_force_at_the_expected_lag_is_only_the_slack():
 def test_position_error_is_limited_by_the_speed_limit():
     fast = 2.0
     assert (limits(finger(), 50.0) == limits(finger(), LAG * fast)).all()
-
-
-def test_forces_are_bit_identical_alone_and_in_a_batch():
-    bodies = [finger(), robot("arm=ur5 ee=plane"), arm()]
-    rows = [len(body.movable_joints) for body in bodies]
-    error = np.random.default_rng(0).normal(size=sum(rows))
-    every = MotorForces(bodies, [PLENTY] * sum(rows)).limits((error, error), (error, error))
-    ends = np.cumsum(rows)
-    for body, n, end in zip(bodies, rows, ends, strict=True):
-        own = error[end - n : end]
-        alone = MotorForces([body], [PLENTY] * n).limits((own, own), (own, own))
-        assert (alone == every[end - n : end]).all()
 
 
 def test_joints_without_a_speed_limit_use_the_default():

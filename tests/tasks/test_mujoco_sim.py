@@ -26,7 +26,6 @@ from morphgen.model.robot import Frame
 from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
@@ -85,14 +84,6 @@ def test_mimic_joints_root_poses_and_joint_order_are_kept():
     assert data.joint("right").qpos[0] == pytest.approx(-0.03, abs=1e-3)
     assert data.body("base").xpos == pytest.approx(at.position)
     assert model.body("base").dofnum == 0
-
-
-def test_model_has_one_body_per_rigid_group():
-    scene = real_arm_scene()
-    parts = merge_rigid_links(scene.robot).links
-    assert len(parts) < len(scene.robot.links)
-    world = MujocoSimulation([scene])._worlds[0]
-    assert world.model.nbody == 1 + len(parts)
 
 
 def test_root_link_may_be_named_world():
@@ -216,21 +207,6 @@ def test_full_speed_back_and_forth_is_stable(request_):
         target = np.clip(target + 0.02 * sign * np.array(speed), *limits.T)
         sim.step(torch.from_numpy(target[None]).float())
         assert sim.qd.abs().max() < 40
-
-
-def test_movable_joint_order_matches_the_robot():
-    scene = reach_scene()
-    sim = MujocoSimulation([scene])
-    q = torch.from_numpy(
-        np.random.default_rng(0).uniform(*joint_limits(scene.robot).T)[None]
-    ).float()
-    reset_envs(sim, [0], q)
-    assert torch.equal(sim.q, q)
-    expected = movable_positions(scene.robot, q[0].double().numpy())
-    joint_positions = [
-        sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable_joints
-    ]
-    assert joint_positions == pytest.approx(expected)
 
 
 def scaled_eigenvalues(inertia):

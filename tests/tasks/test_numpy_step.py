@@ -37,11 +37,6 @@ CHANNELS = ObservationConfig(
 )
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("goals")
-
-
 @pytest.fixture
 def make(cache):
     """Create an environment and a batch of the same one, and close them after the test."""

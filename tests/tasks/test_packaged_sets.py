@@ -76,9 +76,12 @@ def test_files_are_those_of_the_index():
 
 
 @pytest.mark.parametrize("member", [PUSH, REACH, OBSTACLES], ids=lambda m: f"{m.name}-{m.task}")
-def test_keys_are_those_of_robots_composed_now(member):
+def test_keys_are_those_of_robots_composed_now_and_certificates_hold(member):
     record = packaged_index()[key_of(member)]
     assert (record["robot"], record["task"], record["obstacles"]) == identity(member)
+    spec = env_spec(robot_of(member), member.task, obstacles=member.obstacles)
+    assert spec.goals.key in packaged_index()
+    assert certify_goal_set(spec.goals, spec) == ()
 
 
 @pytest.mark.slow
@@ -103,13 +106,6 @@ def test_packaged_sets_are_used_before_the_cache(tmp_path, monkeypatch):
         env_spec(body, "reach", cache=tmp_path, anew=True)
     with pytest.raises(AssertionError, match="it was sampled"):
         env_spec(body, "reach", GoalConfig(seed=1), cache=tmp_path)
-
-
-@pytest.mark.parametrize("member", [PUSH, REACH, OBSTACLES], ids=lambda m: f"{m.name}-{m.task}")
-def test_certificates_hold_for_what_is_stored(member):
-    spec = env_spec(robot_of(member), member.task, obstacles=member.obstacles)
-    assert spec.goals.key in packaged_index()
-    assert certify_goal_set(spec.goals, spec) == ()
 
 
 @pytest.mark.slow

@@ -29,11 +29,6 @@ SIZE = (160, 120)
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("goals")
-
-
-@pytest.fixture(scope="module")
 def reach(cache):
     config = ReachConfig(num_goals=10)
     return draw_spec(load_robot("arm3-stick"), config, obstacles=True, seed=0, cache=cache)

@@ -1,10 +1,7 @@
 """Goal sets of splits: sampling, storage with a built split, and loading."""
 
-import io
 import json
-import pickle
 import re
-import zipfile
 from contextlib import closing
 from dataclasses import fields, replace
 
@@ -224,12 +221,6 @@ def test_builds_are_byte_identical(home, tmp_path):
     ]
 
 
-def test_files_contain_no_timestamp(cache):
-    content = set_npz(sample_sets(reaching(), cache)[0].goals)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-
-
 def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
     which = mixed()
     write_goals(home, sample_sets(which, cache), RECIPE)
@@ -374,9 +365,3 @@ def test_non_finite_numbers_are_rejected(cache, tmp_path, name, value):
         BenchmarkError, match=rf"s\.npz: not a goal set .*: {name} has a number that is"
     ):
         goals_from_npz(content, "reach", tmp_path / "s.npz")
-
-
-def test_sets_can_be_pickled(cache):
-    one = sample_sets(mixed(), cache)[1]
-    assert one.goals is not None
-    assert same(pickle.loads(pickle.dumps(one)).goals, one.goals)

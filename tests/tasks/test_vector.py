@@ -30,11 +30,6 @@ REACH, PUSH = (
 )
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("goals")
-
-
 @pytest.fixture
 def batch_from_specs(cache):
     """Create batches of two robots with two tasks, one with obstacles."""
