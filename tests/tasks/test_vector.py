@@ -14,7 +14,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 from morphgen.errors import MissingDependencyError, TaskError
-from morphgen.progress import show_progress
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.sb3 import sb3_vector
@@ -187,15 +186,6 @@ def test_gymnasium_makes_vector_envs_of_several_robots(cache):
         envs.step(envs.action_space.sample())
     with pytest.raises(TaskError, match="these environments are closed"):
         envs.reset()
-
-
-def test_goal_sampling_reports_its_progress(cache):
-    calls = []
-    options = {"sim": "mujoco", "configs": (REACH,), "cache": cache}
-    with show_progress(lambda *call: calls.append(call)):
-        batch = make_batch("reach", ROBOTS, 2, **options)
-    batch.close()
-    assert calls == [(0, 2), (1, 2), (2, 2)]
 
 
 def test_spaces_have_the_bounds_declared_by_the_task():
