@@ -238,14 +238,11 @@ class StraightPaths:
 
 @dataclass(frozen=True, eq=False)
 class PhysicsState:
-    """State of the robots and blocks of n environments."""
+    """State of the robots and blocks of n environments; see ``Simulation``."""
 
     q: torch.Tensor
-    """Positions of the independent joints, shape (n, J) [rad or m]."""
     qd: torch.Tensor
-    """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
     block_pose: torch.Tensor
-    """Poses of the blocks, shape (n, 7); zeros without one."""
 
 
 class BatchObservation:

@@ -190,16 +190,12 @@ class _State:
     chain: FrameChain
     """Chains of the tools."""
     robot_index: torch.Tensor
-    """Robot of each environment, shape (n,), int64."""
     q: torch.Tensor
-    """Joint positions, shape (n, J) [rad or m]."""
     targets: torch.Tensor
-    """Joint targets, shape (n, J) [rad or m]."""
     T_root_link: torch.Tensor | None
     """Poses of the links, shape (n, L, 4, 4), if a channel needs them."""
     goals: ToolTargets
     block_pose: torch.Tensor
-    """Poses of the blocks, shape (n, 7)."""
 
     @cached_property
     def tool(self) -> tuple[torch.Tensor, torch.Tensor]:

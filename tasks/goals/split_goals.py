@@ -71,15 +71,11 @@ class GoalResult:
     """A robot's goal set, or the reason why it cannot be sampled."""
 
     robot: str
-    """Name of the robot."""
     side: Side | None
     """Side of the split; None for a robot without a split."""
     task: str
-    """Name of the task."""
     obstacles: bool
-    """Whether obstacles were requested."""
     goals: GoalSet | None = None
-    """The goal set, if it could be sampled."""
     robot_hash: str = ""
     """Hash of the robot with the collision shapes that the set was made for."""
     error: str = ""

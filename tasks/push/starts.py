@@ -359,14 +359,16 @@ _CONFIGURATIONS = 1000
 
 @dataclass(frozen=True, eq=False)
 class PushStartSet:
-    """Starts of a robot's push episodes, and the block and obstacles that they share."""
+    """Starts of a robot's push episodes, and the block and obstacles that they share.
+
+    See ``GoalSet`` for the fields that all tasks have.
+    """
 
     start_belongs_to_goal: ClassVar[bool] = True
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "behind", "across"))
 
     robot: str
     key: str
-    """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
     """Configurations at the start, free without obstacles, shape (S, dof) [rad or m]."""
     blocks: Array
@@ -380,15 +382,11 @@ class PushStartSet:
     ground: float
     """Height of the ground [m]."""
     obstacles: tuple[Block, ...]
-    """Boxes at the poses of the first layout."""
     layouts: Array
-    """Poses of the boxes in each layout, those for training first, shape (L, O, 7)."""
     usable: NDArray[np.bool_]
     """Which starts are feasible in each layout, by their certificates, shape (L, S)."""
     tried: int
-    """Number of tested poses of the block."""
     accepted: int
-    """Number of feasible poses that became starts: S."""
     seed: int
     behind: Array
     """Certificates: free configurations with the tool behind the block, at its height, (S, dof)."""

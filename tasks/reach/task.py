@@ -42,14 +42,13 @@ EXACT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ReachGoalSet:
-    """Goals of a robot, which are also its starts, and its obstacles."""
+    """Goals of a robot, which are also its starts, and its obstacles; see ``GoalSet``."""
 
     start_belongs_to_goal: ClassVar[bool] = False
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
 
     robot: str
     key: str
-    """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
     """Configurations in the main component of C-space, shape (G, dof) [rad or m]: free without
     obstacles."""
@@ -57,15 +56,11 @@ class ReachGoalSet:
     """Tool poses of the configurations in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0,
     shape (G, 7)."""
     obstacles: tuple[Block, ...]
-    """Boxes at the poses of the first layout."""
     layouts: Array
-    """Poses of the boxes in each layout, those for training first, shape (L, O, 7)."""
     usable: NDArray[np.bool_]
     """Which configurations are free in each layout, shape (L, G)."""
     tried: int
-    """Number of tested random configurations."""
     accepted: int
-    """Number of configurations that became goals: G."""
     seed: int
 
     @property

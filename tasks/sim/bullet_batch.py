@@ -331,16 +331,12 @@ ExportedRobot = tuple[Path, Robot]
 
 @dataclass(frozen=True, eq=False)
 class StateBuffers:
-    """State of a simulation, a row for each environment."""
+    """State of a simulation, a row for each environment; see ``Simulation``."""
 
     q: Float32
-    """Positions of the independent joints, shape (n, J) [rad or m]."""
     qd: Float32
-    """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
     block_pose: Float32
-    """Poses of the blocks, shape (n, 7)."""
     block_velocity: Float32
-    """Linear and angular velocities of the blocks, shape (n, 6) [m/s, rad/s]."""
 
 
 @dataclass(frozen=True)

@@ -164,15 +164,10 @@ def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
 
 def _same_indices(first: World, other: World) -> bool:
     """Return whether two worlds have joints, block and obstacles at the same indices."""
-    return (
-        np.array_equal(first.q_at, other.q_at)
-        and np.array_equal(first.qd_at, other.qd_at)
-        and np.array_equal(first.movable_q_at, other.movable_q_at)
-        and np.array_equal(first.movable_qd_at, other.movable_qd_at)
-        and first.block == other.block
-        and np.array_equal(first.obstacles, other.obstacles)
-        and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
-    )
+    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at", "obstacles", "block")
+    return all(
+        np.array_equal(getattr(first, name), getattr(other, name)) for name in names
+    ) and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
 
 
 def dof_leaders(world: World) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
@@ -297,60 +292,31 @@ class Group:
     def read(self) -> None:
         """Write the state into the buffers."""
         data, out = self.data, self._buffers
-        wp.launch(
-            kernels.read_state,
-            data.nworld,
-            [
-                self._joints,
-                self._things,
-                data.qpos,
-                data.qvel,
-                data.mocap_pos,
-                data.mocap_quat,
-            ],
-            [out["q"], out["qd"], out["block_pose"], out["block_velocity"]],
-        )
+        state = [data.qpos, data.qvel, data.mocap_pos, data.mocap_quat]
+        outputs = [out[name] for name in ("q", "qd", "block_pose", "block_velocity")]
+        wp.launch(kernels.read_state, data.nworld, [self._joints, self._things, *state], outputs)
 
     def _find_diverged(self) -> None:
         """Mark the environments that diverged in the step, and count them."""
         data, out = self.data, self._buffers
+        state = [out["targets"], data.qpos, data.qvel, data.overflow]
         wp.launch(
             kernels.find_diverged,
             data.nworld,
-            [
-                self._joints,
-                IGNORED_OVERFLOW,
-                self._number,
-                out["targets"],
-                data.qpos,
-                data.qvel,
-                data.overflow,
-            ],
+            [self._joints, IGNORED_OVERFLOW, self._number, *state],
             [out["overflow"], out["diverged"], out["counts"]],
         )
 
     def reset(self, obstacle_poses: wp.array) -> None:
         """Reset the worlds that the buffers mark, to the state in the buffers."""
         data, state = self.data, self._buffers
+        wanted = [state["mask"], state["reset_q"], state["reset_pose"], obstacle_poses]
+        dynamic = [data.qpos, data.qvel, data.qacc_warmstart]
         wp.launch(
             kernels.reset_worlds,
             data.nworld,
-            [
-                self._joints,
-                self._things,
-                state["mask"],
-                state["reset_q"],
-                state["reset_pose"],
-                obstacle_poses,
-            ],
-            [
-                data.qpos,
-                data.qvel,
-                data.qacc_warmstart,
-                data.mocap_pos,
-                data.mocap_quat,
-                data.overflow,
-            ],
+            [self._joints, self._things, *wanted],
+            [*dynamic, data.mocap_pos, data.mocap_quat, data.overflow],
         )
 
 
