@@ -36,6 +36,7 @@ from morphgen.checks.loaders import (
 )
 from morphgen.checks.repairs import repaired
 from morphgen.model.findings import Finding
+from morphgen.model.mesh import require_bounded_meshes
 from morphgen.model.robot import Robot
 
 Check = Callable[[Robot], Iterator[Finding]]
@@ -82,7 +83,11 @@ def check(
 
     Returns:
         Findings, sorted by severity, code and place.
+
+    Raises:
+        MeshError: If the meshes have too many triangles in all.
     """
+    require_bounded_meshes(robot)
     checks = (*CHECKS, check_tool) if tool_required else CHECKS
     if home_tested:
         checks = tuple(run for run in checks if run is not check_self_collision)

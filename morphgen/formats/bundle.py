@@ -37,7 +37,7 @@ from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
 from morphgen.model.kinematics import arm_reach
-from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts
+from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts, require_bounded_meshes
 from morphgen.model.robot import Robot
 
 URDF = "robot.urdf"
@@ -203,6 +203,7 @@ def split_colours(robot: Robot) -> Robot:
 
     A part of a single triangle is dropped, because MuJoCo refuses meshes of three vertices.
     """
+    require_bounded_meshes(robot)
     links = [
         replace(link, visuals=tuple(part for shape in link.visuals for part in _split_shape(shape)))
         for link in robot.links

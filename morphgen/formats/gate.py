@@ -31,6 +31,7 @@ from morphgen.formats.urdf.schema import CHILDREN
 from morphgen.formats.xacro.expand import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.geometry import Mesh
+from morphgen.model.mesh import require_bounded_meshes
 
 _CHILDREN = {
     **CHILDREN,
@@ -86,7 +87,7 @@ def _copy_urdf(path: Path, folder: Path, finder: PackageFinder, args: Mapping[st
         data = expand(path, args, finder)
     else:
         data = read_bytes(path, MAX_URDF_BYTES)
-    robot_from_xml(data, path, finder)
+    require_bounded_meshes(robot_from_xml(data, path, finder))
     root, _ = parse_description(data, str(path))
     meshes = resolved_meshes(root, path, finder).files
     _keep_known(root)

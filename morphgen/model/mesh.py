@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,8 +20,17 @@ from morphgen.typing import Array
 if TYPE_CHECKING:
     import trimesh
 
+    from morphgen.model.robot import Robot
+
 MAX_STL_FACES = 200_000
 """Number of triangles of the largest STL file that MuJoCo reads."""
+MAX_ROBOT_BYTES = 96 * 2**20
+"""Size of all mesh files of a robot [bytes]. The largest of 1,441 real robots, B1 with an arm, has
+61 MiB."""
+MAX_ROBOT_FACES = 2_000_000
+"""Number of triangles in all mesh files of a robot. The largest, Vega, has 0.94 million."""
+MAX_ROBOT_PIXELS = 2**26
+"""Number of pixels in all textures of a robot's mesh files."""
 FLATNESS_TOLERANCE = 1e-7
 """Ratio of thickness to size below which points count as flat."""
 
@@ -57,6 +68,37 @@ def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
 def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
     """Return the colour groups of a mesh file, in the order of their first triangles."""
     return tuple(group.part for group in _content(str(path.absolute()), _stamp(path))[0])
+
+
+def require_bounded_files(paths: Iterable[Path], origin: str) -> None:
+    """Require that the mesh files of one robot have at most ``MAX_ROBOT_BYTES``."""
+    size = sum(_stamp(path)[1] for path in {*paths})
+    _require_bounded(size, MAX_ROBOT_BYTES, "bytes", origin)
+
+
+def require_bounded_meshes(robot: Robot) -> None:
+    """Require that the meshes of a robot have few enough triangles, and pixels of textures.
+
+    Files are read until the bound is passed. What cannot be read is left to others.
+    """
+    origin, faces, pixels = f"robot {robot.name!r}", 0, 0
+    shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
+    meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
+    for path in dict.fromkeys(mesh.path for mesh in meshes):
+        with suppress(MeshError):
+            groups, _, more_pixels = _content(str(path.absolute()), _stamp(path))
+            faces += sum(group.part.faces for group in groups)
+            pixels += more_pixels
+        _require_bounded(faces, MAX_ROBOT_FACES, "triangles", origin)
+        _require_bounded(pixels, MAX_ROBOT_PIXELS, "pixels of textures", origin)
+
+
+def _require_bounded(count: int, most: int, what: str, origin: str) -> None:
+    if count > most:
+        raise MeshError(
+            f"{origin}: its meshes have {count} {what} or more; at most {most} of one robot are "
+            "read; decimate them"
+        )
 
 
 def left_out(path: Path) -> tuple[str, ...]:
@@ -98,7 +140,7 @@ def _scaled(
 
     if len(scale) != 3 or not all(math.isfinite(s) and s != 0 for s in scale):
         raise MeshError(f"{path}: scale {scale} is not three finite numbers other than zero")
-    groups, _ = _content(path, stamp)
+    groups = _content(path, stamp)[0]
     if part is not None:
         if not 0 <= part < len(groups):
             raise MeshError(f"{path}: no part {part}; valid: 0 to {len(groups) - 1}")
@@ -111,8 +153,11 @@ def _scaled(
 
 
 @lru_cache(maxsize=128)
-def _content(path: str, stamp: tuple[int, int]) -> tuple[tuple[_Group, ...], tuple[str, ...]]:
-    """Return a file's triangles by colour, and what is left out; ``stamp`` voids the cache."""
+def _content(path: str, stamp: tuple[int, int]) -> tuple[tuple[_Group, ...], tuple[str, ...], int]:
+    """Return a file's triangles by colour, what is left out, and the pixels of its textures.
+
+    ``stamp`` voids the cache.
+    """
     from morphgen.model.mesh_files import read_mesh_file
 
     del stamp
@@ -128,7 +173,7 @@ def _content(path: str, stamp: tuple[int, int]) -> tuple[tuple[_Group, ...], tup
     if not groups:
         count = sum(len(faces) for _, (_, faces) in content.pieces)
         raise MeshError(f"{path}: none of its {count} triangles has an area")
-    return tuple(groups), content.left_out
+    return tuple(groups), content.left_out, content.pixels
 
 
 def _concatenate(parts: list[_Triangles]) -> _Triangles:

@@ -104,6 +104,8 @@ class MeshContent:
     """Colour and triangles of every geometry."""
     left_out: tuple[str, ...]
     """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
+    pixels: int
+    """Number of pixels of the textures that were read, each use counted."""
 
 
 def read_mesh_file(path: Path) -> MeshContent:
@@ -120,10 +122,10 @@ def read_mesh_file(path: Path) -> MeshContent:
     except UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
-    notes = Counter(files.left_out)
-    return MeshContent(
-        tuple(pieces), tuple(f"{note} ({n} times)" if n > 1 else note for note, n in notes.items())
-    )
+    notes = [
+        f"{note} ({n} times)" if n > 1 else note for note, n in Counter(files.left_out).items()
+    ]
+    return MeshContent(tuple(pieces), tuple(notes), files.pixels)
 
 
 def _require_mesh(data: bytes, suffix: str) -> None:

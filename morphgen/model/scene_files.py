@@ -155,6 +155,11 @@ class FolderResolver(trimesh.resolvers.Resolver):
             return True
         return False
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the textures that were read, each use counted."""
+        return MAX_PIXELS - self._pixels_left
+
     def keys(self) -> list[str]:
         """Return no names, so that trimesh reads only the files that the mesh names."""
         return []
@@ -270,6 +275,8 @@ _MAX_NODES = 20_000
 """Number of nodes of the largest scene that is read, every instance counted."""
 _MAX_DEPTH = 100
 """Largest nesting depth of nodes in a scene."""
+MAX_DAE_SIZE = 40 * 2**20
+"""Size of the largest DAE file: its numbers as text take twenty times their bytes [bytes]."""
 _MAX_MARKUP = 500_000
 """Number of elements and attributes, or of JSON values, in the largest scene that is read."""
 
@@ -570,6 +577,8 @@ def _collada_pieces(root: etree._Element, files: FolderResolver) -> list[Piece]:
 
 
 def _collada(data: bytes) -> etree._Element:
+    if len(data) > MAX_DAE_SIZE:
+        raise ValueError(f"it holds {len(data)} bytes; at most {MAX_DAE_SIZE} of a .dae are read")
     # An encoding such as UTF-7 could hide a DOCTYPE or millions of elements.
     declared = re.match(rb"""[^<]*<\?xml[^>]*encoding\s*=\s*["']([^"'>]*)""", data[:1000])
     encoding = declared[1].decode("latin-1").lower() if declared else "utf-8"

@@ -9,15 +9,19 @@ import sys
 import mujoco
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.exchange.stl import export_stl
 
 from helpers.robots import arm
 from helpers.uploads import archive
 from morphgen.api.checks import conform
+from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.errors import FormatError, MorphgenError
-from morphgen.formats.bundle import MJCF, URDF, read_robot, write_bundle
+from morphgen.formats.bundle import MJCF, URDF, read_robot, split_colours, write_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
+from morphgen.model import mesh as mesh_module
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
 from morphgen.viewer.app.uploads import store_upload
@@ -301,6 +305,67 @@ def test_loaders_get_nothing_of_a_bundle_unchecked(text, folder):
     for compare in (conform, conformance):
         with pytest.raises(FormatError):
             compare(bundle, samples=1)
+
+
+def many_meshes(folder, suffix, meshes):
+    """Write a robot of meshes, each the bytes of its file, or the size of a sparse one."""
+    for i, mesh in enumerate(meshes):
+        with (folder / f"{i}.stl").open("wb") as file:
+            file.truncate(mesh) if isinstance(mesh, int) else file.write(mesh)
+    if suffix == "xml":
+        assets = "".join(f'<mesh name="m{i}" file="{i}.stl"/>' for i in range(len(meshes)))
+        geoms = "".join(f'<geom type="mesh" mesh="m{i}"/>' for i in range(len(meshes)))
+        text = MJCF_TEXT.format(f"<asset>{assets}</asset>", geoms)
+    else:
+        text = URDF_TEXT.format("".join(MESH.format(f"{i}.stl") for i in range(len(meshes))), "")
+    (folder / f"many.{suffix}").write_text(text)
+    return folder / f"many.{suffix}"
+
+
+@pytest.mark.parametrize("sizes", [[60 * 2**20] * 2, [10 * 2**20] * 10, [2**20] * 97])
+@pytest.mark.parametrize("suffix", ["urdf", "xml"])
+@pytest.mark.parametrize("reader", ["description", "robot", "copy for loaders"])
+def test_the_mesh_files_of_a_robot_are_bounded_in_all(sizes, suffix, reader, folder):
+    path = many_meshes(folder, suffix, sizes)
+    with pytest.raises(MorphgenError, match=f"meshes have {sum(sizes)} bytes"):
+        READERS[reader](path)
+    assert read_description(many_meshes(folder, "urdf", [2**20] * 96))  # none of them is opened
+
+
+@pytest.mark.parametrize("counts", [(1, 1), (2, 0), (0, 0, 0, 0, 0, 2)])
+@pytest.mark.parametrize("use", ["check", "split_colours", "copy"])
+def test_the_triangles_of_a_robot_are_bounded_in_all(counts, use, folder, monkeypatch):
+    meshes = [export_stl(trimesh.creation.icosphere(n, radius=0.1)) for n in counts]
+    faces = sum(20 * 4**n for n in counts)
+    path = many_meshes(folder, "urdf", meshes)
+    robot = read_description(path)
+    uses = {
+        "check": lambda: check(robot),
+        "split_colours": lambda: split_colours(robot),
+        "copy": lambda: copy(path),
+    }
+    monkeypatch.setattr(mesh_module, "MAX_ROBOT_FACES", faces)
+    uses[use]()
+    monkeypatch.setattr(mesh_module, "MAX_ROBOT_FACES", faces - 1)
+    with pytest.raises(MorphgenError, match=f"meshes have {faces} triangles or more"):
+        uses[use]()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_textures_of_a_robot_are_bounded_in_all(count, folder, monkeypatch):
+    Image.new("RGB", (8, 4)).save(folder / "t.png")
+    (folder / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    triangle = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
+    for i in range(count):
+        (folder / f"{i}.obj").write_text(triangle)
+    text = "".join(MESH.format(f"{i}.obj") for i in range(count))
+    (folder / "robot.urdf").write_text(URDF_TEXT.format(text, ""))
+    robot = read_description(folder / "robot.urdf")
+    monkeypatch.setattr(mesh_module, "MAX_ROBOT_PIXELS", 32 * count)
+    split_colours(robot)
+    monkeypatch.setattr(mesh_module, "MAX_ROBOT_PIXELS", 32 * count - 1)
+    with pytest.raises(MorphgenError, match=f"meshes have {32 * count} pixels"):
+        split_colours(robot)
 
 
 def test_loaders_get_the_robot_with_its_meshes(folder):

@@ -18,6 +18,7 @@ from morphgen.formats.urdf.schema import MAX_LINKS, counted_elements
 from morphgen.formats.xacro.evaluator import RefusedError
 from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding, left_out
+from morphgen.model.mesh import require_bounded_files
 
 MAX_MJCF_BYTES = 8 * 2**20
 """Largest MJCF that is read, with all its includes [bytes]."""
@@ -339,6 +340,7 @@ def _take_mesh_files(root: etree._Element, path: Path, finder: PackageFinder) ->
             )
     if missing:
         raise UnsoundError(str(path), missing)
+    require_bounded_files(meshes.values(), str(path))
     return meshes
 
 

@@ -42,6 +42,7 @@ from morphgen.model.geometry import (
     Sphere,
     dimensions,
 )
+from morphgen.model.mesh import require_bounded_files
 from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
@@ -230,7 +231,9 @@ def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> 
         findings.append(
             Finding("mesh-skipped", "warning", first.where, first.why, fix, f"{repair}: {names}")
         )
-    return _Meshes({uri: file.path for uri, file in found.items()}, packages, findings)
+    files = {uri: file.path for uri, file in found.items()}
+    require_bounded_files(files.values(), str(path))
+    return _Meshes(files, packages, findings)
 
 
 def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder) -> FoundFile:
