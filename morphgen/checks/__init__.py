@@ -11,29 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import cast
 
-from morphgen.checks.home_pose import check_links_apart, check_self_collision
-from morphgen.checks.inertia import check_inertia, check_masses
-from morphgen.checks.joints import (
-    check_axes,
-    check_drive,
-    check_home,
-    check_limits,
-    check_mimic,
-    check_mimic_range,
-)
-from morphgen.checks.loaders import (
-    check_capsules,
-    check_frame_names,
-    check_link_count,
-    check_mesh_scales,
-    check_mimic_loaders,
-    check_names,
-    check_reserved,
-    check_root,
-    check_shapes,
-    check_tool,
-    check_units,
-)
+from morphgen.checks import home_pose, inertia, joints, loaders
 from morphgen.checks.repairs import repaired
 from morphgen.model.findings import Finding
 from morphgen.model.mesh import require_bounded_meshes
@@ -41,28 +19,7 @@ from morphgen.model.robot import Robot
 
 Check = Callable[[Robot], Iterator[Finding]]
 
-CHECKS: tuple[Check, ...] = (
-    check_masses,
-    check_inertia,
-    check_axes,
-    check_limits,
-    check_drive,
-    check_home,
-    check_mimic,
-    check_mimic_range,
-    check_shapes,
-    check_units,
-    check_links_apart,
-    check_names,
-    check_reserved,
-    check_frame_names,
-    check_self_collision,
-    check_mimic_loaders,
-    check_capsules,
-    check_mesh_scales,
-    check_link_count,
-    check_root,
-)
+CHECKS: tuple[Check, ...] = (*inertia.CHECKS, *joints.CHECKS, *loaders.CHECKS, *home_pose.CHECKS)
 """The checks that apply to robots and parts; ``check_tool`` applies to robots only."""
 
 _SEVERITY_RANK = {"error": 0, "warning": 1, "info": 2}
@@ -88,9 +45,9 @@ def check(
         MeshError: If the meshes have too many triangles in all.
     """
     require_bounded_meshes(robot)
-    checks = (*CHECKS, check_tool) if tool_required else CHECKS
+    checks = (*CHECKS, loaders.check_tool) if tool_required else CHECKS
     if home_tested:
-        checks = tuple(run for run in checks if run is not check_self_collision)
+        checks = tuple(run for run in checks if run is not home_pose.check_self_collision)
     findings = {_apply_accepted(finding, robot) for run in checks for finding in run(robot)}
     findings.update(robot.source_findings)
     return tuple(

@@ -13,7 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lxml import etree
@@ -280,8 +282,11 @@ def _compared(
     slack = MASS_TOLERANCE * robot.mass + BOUND_MASS * (len(robot.links) + len(robot.frames))
     if abs(reading.mass - robot.mass) > slack:
         faults.append(f"weighs {reading.mass:.9g} kg, not {robot.mass:.9g} kg")
-    agreement = compare_joints(robot, reading)
-    faults += agreement.faults
+    columns = _compare_joints(robot, reading)
+    faults += chain.from_iterable(each or () for each in columns.values())
+    agreements: dict[str, Any] = {
+        name: None if each is None else not each for name, each in columns.items()
+    }
     if position_error > POSITION_TOLERANCE:
         faults.append(f"{frame} is {position_error:.3g} m off")
     if rotation_error > ROTATION_TOLERANCE:
@@ -297,74 +302,59 @@ def _compared(
         mass=reading.mass,
         position_error=position_error,
         rotation_error=rotation_error,
-        limits=agreement.limits,
-        mimic=agreement.mimic,
-        damping=agreement.damping,
-        gains=agreement.gains,
+        **agreements,
         gravity_error=gravity_error,
         inertia_error=inertia_error,
         message="; ".join(faults),
     )
 
 
-@dataclass(frozen=True)
-class JointAgreement:
-    """Whether a loader's joints agree with the robot's; None if the loader reads no such value."""
-
-    limits: bool | None
-    """Position, effort and velocity limits."""
-    mimic: bool | None
-    """Leader, multiplier and offset of mimic joints."""
-    damping: bool | None
-    """Damping and friction."""
-    gains: bool | None
-    """Gains and armature of position actuators."""
-    faults: tuple[str, ...]
-    """Description of each difference."""
-
-
-def compare_joints(robot: Robot, reading: Reading) -> JointAgreement:
+def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | None]:
     """Compare the joints of a robot with a loader's; joints that only one has are left out.
 
     A chain of mimic joints counts as its product.
+
+    Returns:
+        The differences of every column of joints; None if the loader reads no such values.
     """
     movable = [robot.joints[k].name for k in robot.movable_joints]
     shared = [name for name in movable if name in reading.joints]
     gains = {gain.joint: gain for gain in actuation(robot)} if reading.has_actuators else {}
-    faults: dict[str, list[str]] = {name: [] for name in ("limits", "damping", "gains")}
+    limits: list[str] = []
+    damping: list[str] = []
+    gain_faults: list[str] = []
     for name in shared:
         joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
         lower, upper = (-math.inf, math.inf) if joint.is_continuous else joint.effective_limits
-        faults["limits"] += _differences(
+        limits += _differences(
             name, ("lower limit", read.limits[0], lower), ("upper limit", read.limits[1], upper)
         )
         if read.effort not in _accepted_efforts(joint):
-            faults["limits"] += _differences(name, ("effort", read.effort, joint.effort or 0.0))
+            limits += _differences(name, ("effort", read.effort, joint.effort or 0.0))
         if joint.velocity is not None or read.velocity not in _WITHOUT_VELOCITY:
             velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-            faults["limits"] += _differences(name, ("velocity", read.velocity, velocity))
-        faults["damping"] += _differences(
+            limits += _differences(name, ("velocity", read.velocity, velocity))
+        damping += _differences(
             name,
             ("damping", read.damping, joint.damping),
             ("friction", read.friction, joint.friction),
         )
         if name in gains:
             gain = gains[name]
-            faults["gains"] += _differences(
+            gain_faults += _differences(
                 name,
                 ("stiffness", _or_nan(read.stiffness), gain.stiffness),
                 ("derivative gain", _or_nan(read.derivative_gain), gain.damping),
                 ("armature", _or_nan(read.armature), gain.armature),
             )
-    mimic_faults = list(_mimic_differences(robot, reading.mimics, shared))
     reads_damping = any(reading.joints[name].damping is not None for name in shared)
-    return JointAgreement(
-        limits=not faults["limits"],
-        mimic=None if reading.mimics is None else not mimic_faults,
-        damping=not faults["damping"] if reads_damping else None,
-        gains=not faults["gains"] if reading.has_actuators else None,
-        faults=(*faults["limits"], *mimic_faults, *faults["damping"], *faults["gains"]),
-    )
+    mimics = reading.mimics
+    return {
+        "limits": limits,
+        "mimic": None if mimics is None else [*_mimic_differences(robot, mimics, shared)],
+        "damping": damping if reads_damping else None,
+        "gains": gain_faults if reading.has_actuators else None,
+    }
 
 
 def _accepted_efforts(joint: Joint) -> tuple[float | None, ...]:
@@ -394,10 +384,8 @@ def _is_close(a: float, b: float) -> bool:
 
 
 def _mimic_differences(
-    robot: Robot, mimics: Mapping[str, Mimic] | None, shared: list[str]
+    robot: Robot, mimics: Mapping[str, Mimic], shared: list[str]
 ) -> Iterator[str]:
-    if mimics is None:
-        return
     known = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
     independent = {robot.joints[k].name for k in robot.independent_joints}
     for name in shared:

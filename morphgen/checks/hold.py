@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.checks.home_pose import home_penetrations
+from morphgen.checks.readers import bullet_client, load_model
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF, bundle_folder, write_bundle
 from morphgen.formats.quiet import quiet
@@ -108,6 +109,11 @@ class HoldRow:
     causes: tuple[str, ...] = ()
     """Known causes of the failure; empty if none is known."""
 
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether the robot fails without a known cause."""
+        return self.passed is False and not self.causes
+
 
 def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
     """Hold a robot at home and step its joints with the files of its bundle in each simulator."""
@@ -118,19 +124,17 @@ def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
             write_bundle(robot, bundle, picture=False)
             return hold(robot, bundle)
 
+    def hold_mjcf(robot: Robot, folder: Path) -> HoldRow:
+        return hold_row("mujoco (mjcf)", "mujoco", robot, partial(_mjcf, robot, folder), 0.0)
+
     rows = []
-    for hold in (_hold_mjcf, _hold_urdf):
+    for hold in (hold_mjcf, _hold_urdf):
         row, hold_anew = hold(robot, folder), partial(in_new_bundle, hold)
         # A robot that passes with new files has its fault in the old ones.
-        if _is_unknown(row) and hold_anew(robot).passed is False:
+        if row.is_unexplained and hold_anew(robot).passed is False:
             row = with_causes(row, robot, hold_anew)
         rows.append(row)
     return tuple(rows)
-
-
-def _is_unknown(row: HoldRow) -> bool:
-    """Return whether a robot fails without a known cause."""
-    return row.passed is False and not row.causes
 
 
 def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) -> HoldRow:
@@ -139,7 +143,7 @@ def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) ->
     A property of the joints is a cause if the robot fails with it and passes, or fails only for
     known causes, without it.
     """
-    if not _is_unknown(row):
+    if not row.is_unexplained:
         return row
     causes: list[str] = []
     for cause, change in CHANGES.items():
@@ -151,17 +155,13 @@ def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) ->
     return replace(row, causes=tuple(dict.fromkeys(causes)))
 
 
-def _hold_mjcf(robot: Robot, folder: Path) -> HoldRow:
-    return hold_row("mujoco (mjcf)", "mujoco", robot, partial(_mjcf, robot, folder), 0.0)
-
-
 def _hold_urdf(robot: Robot, folder: Path) -> HoldRow:
     def hold(iterations: int) -> HoldRow:
         urdf = partial(_urdf, robot, folder, iterations)
         return hold_row("pybullet (urdf)", "pybullet", robot, urdf, None)
 
     row = hold(SOLVER_ITERATIONS)
-    if not _is_unknown(row):
+    if not row.is_unexplained:
         return row
     more, causes = hold(MORE_ITERATIONS), []
     if more.passed or (row.step_error is None and more.step_error is not None):
@@ -355,10 +355,7 @@ def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
 
     from morphgen.formats.quiet import MujocoWarnings
 
-    try:
-        model = mujoco.MjModel.from_xml_path(str(folder / MJCF))
-    except ValueError as error:
-        raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
+    model = load_model(folder / MJCF)
     if "home" not in (model.key(i).name for i in range(model.nkey)):
         raise FormatError("no keyframe 'home'")
     addresses = {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)}
@@ -394,20 +391,12 @@ def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
 
 @contextmanager
 def _urdf(robot: Robot, folder: Path, iterations: int) -> Iterator[SimulatedRobot]:
-    with quiet():
-        import pybullet
-
-        client = pybullet.connect(pybullet.DIRECT)
-    options = {"physicsClientId": client}
-    try:
+    with bullet_client() as client:
         with quiet():
-            body = pybullet.loadURDF(str(folder / URDF), useFixedBase=True, **options)
-        pybullet.setGravity(0, 0, -GRAVITY, **options)
-        pybullet.setPhysicsEngineParameter(numSolverIterations=iterations, **options)
-        infos = [
-            pybullet.getJointInfo(body, i, **options)
-            for i in range(pybullet.getNumJoints(body, **options))
-        ]
+            body = client.loadURDF(str(folder / URDF), useFixedBase=True)
+        client.setGravity(0, 0, -GRAVITY)
+        client.setPhysicsEngineParameter(numSolverIterations=iterations)
+        infos = [client.getJointInfo(body, i) for i in range(client.getNumJoints(body))]
         joints = _joints(robot, {info[1].decode(): info[0] for info in infos})
         # Item 10 is the effort limit; one of zero counts as missing, as in the MJCF.
         forces = [infos[joint][10] or DEFAULT_EFFORT for joint in joints]
@@ -415,22 +404,13 @@ def _urdf(robot: Robot, folder: Path, iterations: int) -> Iterator[SimulatedRobo
         def run(targets: Array) -> Iterator[Array]:
             home = movable_positions(robot, robot.home).tolist()
             for joint, q in zip(joints, home, strict=True):
-                pybullet.resetJointState(body, joint, q, **options)
-            pybullet.setJointMotorControlArray(
-                body,
-                joints,
-                pybullet.POSITION_CONTROL,
-                targetPositions=movable_positions(robot, targets).tolist(),
-                forces=forces,
-                **options,
+                client.resetJointState(body, joint, q)
+            positions = movable_positions(robot, targets).tolist()
+            client.setJointMotorControlArray(
+                body, joints, client.POSITION_CONTROL, targetPositions=positions, forces=forces
             )
             while True:
-                pybullet.stepSimulation(**options)
-                states = pybullet.getJointStates(body, joints, **options)
-                yield np.array([state[0] for state in states])
+                client.stepSimulation()
+                yield np.array([state[0] for state in client.getJointStates(body, joints)])
 
-        yield SimulatedRobot(pybullet.getPhysicsEngineParameters(**options)["fixedTimeStep"], run)
-    except pybullet.error as error:
-        raise FormatError(f"PyBullet: {error}") from error
-    finally:
-        pybullet.disconnect(**options)
+        yield SimulatedRobot(client.getPhysicsEngineParameters()["fixedTimeStep"], run)

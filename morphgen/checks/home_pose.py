@@ -223,3 +223,6 @@ def _encloses(solid: _Triangles, others: _Triangles) -> bool:
     faces = np.arange(3 * len(solid)).reshape(-1, 3)
     winding = igl.fast_winding_number(solid.reshape(-1, 3), faces, corners)
     return bool((np.abs(winding) > 0.5).any())
+
+
+CHECKS = (check_links_apart, check_self_collision)

@@ -150,62 +150,44 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
         yield Finding("massless-between", "info", where, why, "give it a small mass")
     else:
         why = "it moves, and neither it nor anything beyond it has mass: simulators cannot move it"
-        yield Finding(
-            "massless-body",
-            "error",
-            where,
-            why,
-            "give it geometry and mass, or make its joint fixed",
-        )
+        fix = "give it geometry and mass, or make its joint fixed"
+        yield Finding("massless-body", "error", where, why, fix)
 
 
 def _gyration_findings(link: Link, inertial: Inertial, solid: Inertial) -> Iterator[Finding]:
-    radii, expected = gyration_radii(inertial), gyration_radii(solid)
+    radii, expected = _gyration_radii(inertial), _gyration_radii(solid)
     ratio = radii / expected
     if ratio.max() <= GYRATION_FACTOR and ratio.min() >= 1 / GYRATION_FACTOR:
         return
-    yield Finding(
-        "inertia-implausible",
-        "warning",
-        f"link {link.name}",
-        f"radii of gyration {_millimetres(radii)} mm; its solid geometry has "
-        f"{_millimetres(expected)} mm",
-        "compute the inertia from the geometry, or check its unit",
-    )
+    own, of_solid = (", ".join(f"{1000 * r:.3g}" for r in each) for each in (radii, expected))
+    why = f"radii of gyration {own} mm; its solid geometry has {of_solid} mm"
+    fix = "compute the inertia from the geometry, or check its unit"
+    yield Finding("inertia-implausible", "warning", f"link {link.name}", why, fix)
 
 
 def _placement_findings(link: Link, inertial: Inertial, solid: Inertial) -> Iterator[Finding]:
+    where = f"link {link.name}"
     low, high = bounding_box(link.collisions or link.visuals)
     margin = COM_MARGIN * (high - low) / 2
     if np.any(inertial.com < low - margin) or np.any(inertial.com > high + margin):
         x, y, z = inertial.com
-        yield Finding(
-            "com-outside",
-            "warning",
-            f"link {link.name}",
+        corners = " to ".join(f"({', '.join(f'{v:.3g}' for v in each)})" for each in (low, high))
+        why = (
             f"its centre of mass ({x:.4g}, {y:.4g}, {z:.4g}) m lies outside its geometry "
-            f"({_corner(low)} to {_corner(high)} m)",
-            "check the origin of <inertial>",
+            f"({corners} m)"
         )
+        yield Finding("com-outside", "warning", where, why, "check the origin of <inertial>")
     density = inertial.mass / solid.mass
     if not DENSITY_RANGE[0] <= density <= DENSITY_RANGE[1]:
-        yield Finding(
-            "density-implausible",
-            "warning",
-            f"link {link.name}",
-            f"{inertial.mass:.4g} kg in {solid.mass * 1e6:.4g} cm^3 are {density:.4g} kg/m^3",
-            f"check mass and geometry; {DENSITY_RANGE[0]:g} to {DENSITY_RANGE[1]:g} is plausible",
-        )
+        why = f"{inertial.mass:.4g} kg in {solid.mass * 1e6:.4g} cm^3 are {density:.4g} kg/m^3"
+        lowest, highest = DENSITY_RANGE
+        fix = f"check mass and geometry; {lowest:g} to {highest:g} is plausible"
+        yield Finding("density-implausible", "warning", where, why, fix)
 
 
-def gyration_radii(inertial: Inertial) -> Array:
+def _gyration_radii(inertial: Inertial) -> Array:
     """Return the principal radii of gyration about the centre of mass, ascending, (3,) [m]."""
     return np.asarray(np.sqrt(np.linalg.eigvalsh(inertial.matrix) / inertial.mass))
 
 
-def _millimetres(values: Array) -> str:
-    return ", ".join(f"{1000 * value:.3g}" for value in values.tolist())
-
-
-def _corner(point: Array) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in point.tolist()) + ")"
+CHECKS = (check_masses, check_inertia)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, Severity
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Robot
 
 AXIS_TOLERANCE = 1e-3
@@ -20,177 +20,149 @@ MIMIC_RANGE_TOLERANCE = 0.01
 """Overshoot of a mimic joint's limits that is not reported, as a fraction of their span."""
 
 
-def check_axes(robot: Robot) -> Iterator[Finding]:
-    """Find axes that are zero or not of unit length."""
-    for joint in _movable(robot):
-        length = math.hypot(*joint.axis)
-        if not is_axis_valid(joint):
-            yield Finding(
-                "axis-invalid",
-                "error",
-                f"joint {joint.name}",
-                f"its axis {joint.axis} has no direction",
-                "write a unit vector",
-            )
-        elif not is_axis_unit(joint):
-            prismatic = joint.kind == "prismatic"
-            yield Finding(
-                "axis-not-unit",
-                "error" if prismatic else "warning",
-                f"joint {joint.name}",
-                f"its axis {joint.axis} is {length:.4g} long"
-                + ("; PyBullet moves it that many times as far" if prismatic else ""),
-                "scale the axis to unit length, as the repair does",
-                repair=f"the axis {joint.axis} was scaled to unit length",
-            )
+_Fault = tuple[str, Severity, str, str, str]
+"""Code, severity, reason, remedy and repair of a finding about a joint; no repair is empty."""
 
 
-def check_limits(robot: Robot) -> Iterator[Finding]:
+def check_joints(robot: Robot) -> Iterator[Finding]:
+    """Find faults of single joints: of axis, limits, effort, velocity, home and ``<mimic>``."""
+    home = dict(zip(robot.independent_joints, robot.home, strict=True))
+    for k, joint in enumerate(robot.joints):
+        faults = [*_mimic_faults(robot, joint)]
+        if joint.is_movable:
+            faults += (*_axis_faults(joint), *_limit_faults(robot, joint))
+            faults += _drive_faults(robot, joint)
+        if k in home:
+            faults += _home_faults(joint, home[k])
+        for code, severity, *texts in faults:
+            yield Finding(code, severity, f"joint {joint.name}", *texts)
+
+
+def _axis_faults(joint: Joint) -> Iterator[_Fault]:
+    """Find an axis that is zero or not of unit length."""
+    axis = f"its axis {joint.axis}"
+    if not is_axis_valid(joint):
+        yield "axis-invalid", "error", f"{axis} has no direction", "write a unit vector", ""
+    elif not is_axis_unit(joint):
+        prismatic = joint.kind == "prismatic"
+        yield (
+            "axis-not-unit",
+            "error" if prismatic else "warning",
+            f"{axis} is {math.hypot(*joint.axis):.4g} long"
+            + ("; PyBullet moves it that many times as far" if prismatic else ""),
+            "scale the axis to unit length, as the repair does",
+            f"the axis {joint.axis} was scaled to unit length",
+        )
+
+
+def _limit_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
     """Find limits that are missing, contradictory or implausible."""
-    for joint in _movable(robot):
-        where = f"joint {joint.name}"
-        if joint.kind == "continuous":
-            if joint.limits is not None:
-                yield Finding(
-                    "limits-on-continuous",
-                    "warning",
-                    where,
-                    f"it is continuous but has limits {joint.limits}, which PyBullet reports "
-                    "and MuJoCo drops",
-                    "make it revolute if the limits are real; the repair drops them",
-                    repair=f"its limits {joint.limits} were dropped: it is continuous",
-                )
-            continue
-        if joint.limits is None or not all(map(math.isfinite, joint.limits)):
-            limits = "without limits" if joint.limits is None else f"with limits {joint.limits}"
-            yield Finding(
-                "limits-missing",
-                "error",
-                where,
-                f"it is {joint.kind} {limits}: PyBullet refuses the file, "
-                "MuJoCo lets it move without end",
-                "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
-            )
-            continue
-        lower, upper = sorted(joint.limits)
-        span, unit = upper - lower, "m" if joint.kind == "prismatic" else "rad"
-        widest = PRISMATIC_SPAN if joint.kind == "prismatic" else REVOLUTE_SPAN
-        if has_inverted_limits(joint):
-            yield Finding(
-                "limits-inverted",
-                "error",
-                where,
-                f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits",
-                "swap the limits, as the repair does",
-                repair=f"its limits were swapped to {lower:g} to {upper:g}",
-            )
-        if span == 0:
-            yield Finding(
-                "limits-empty",
-                "error",
-                where,
-                f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it",
-                "write the real limits, or make the joint fixed, as the repair does at zero",
-                repair="it was made fixed: both limits are 0" if is_locked(robot, joint) else "",
-            )
-        if span > widest:
-            yield Finding(
-                "limits-wide",
+    limits = joint.limits
+    if joint.kind == "continuous":
+        if limits is not None:
+            yield (
+                "limits-on-continuous",
                 "warning",
-                where,
-                f"its limits span {span:g} {unit}, more than {widest:.4g} {unit}",
-                f"check the unit of the limits ({unit})",
+                f"it is continuous but has limits {limits}, which PyBullet reports and MuJoCo "
+                "drops",
+                "make it revolute if the limits are real; the repair drops them",
+                f"its limits {limits} were dropped: it is continuous",
             )
+        return
+    if limits is None or not all(map(math.isfinite, limits)):
+        given = "without limits" if limits is None else f"with limits {limits}"
+        yield (
+            "limits-missing",
+            "error",
+            f"it is {joint.kind} {given}: PyBullet refuses the file, MuJoCo lets it move without "
+            "end",
+            "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
+            "",
+        )
+        return
+    lower, upper = sorted(limits)
+    span, unit = upper - lower, "m" if joint.kind == "prismatic" else "rad"
+    widest = PRISMATIC_SPAN if joint.kind == "prismatic" else REVOLUTE_SPAN
+    if has_inverted_limits(joint):
+        yield (
+            "limits-inverted",
+            "error",
+            f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits",
+            "swap the limits, as the repair does",
+            f"its limits were swapped to {lower:g} to {upper:g}",
+        )
+    if span == 0:
+        yield (
+            "limits-empty",
+            "error",
+            f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it",
+            "write the real limits, or make the joint fixed, as the repair does at zero",
+            "it was made fixed: both limits are 0" if is_locked(robot, joint) else "",
+        )
+    if span > widest:
+        why = f"its limits span {span:g} {unit}, more than {widest:.4g} {unit}"
+        yield "limits-wide", "warning", why, f"check the unit of the limits ({unit})", ""
 
 
-def check_drive(robot: Robot) -> Iterator[Finding]:
-    """Find joints without usable effort or velocity, and negative damping or friction."""
-    for joint in _movable(robot):
-        where = f"joint {joint.name}"
-        units = ("N", "m/s") if joint.kind == "prismatic" else ("N m", "rad/s")
-        consequence = ": PyBullet has no force to move it, MuJoCo no limit"
-        is_driven = joint.is_independent and not is_locked(robot, joint)
-        for name, value, default, unit, effect in (
-            ("effort", joint.effort, DEFAULT_EFFORT, units[0], consequence),
-            ("velocity", joint.velocity, DEFAULT_VELOCITY, units[1], ""),
-        ):
-            if is_driven and not is_positive(value):
-                fault = f"it has no {name}" if value is None else f"its {name} is {value:g}"
-                yield Finding(
-                    f"{name}-missing",
-                    "warning",
-                    where,
-                    fault + effect,
-                    f"write its largest {name}; the repair takes {default:g} {unit}",
-                    repair=f"its {name} was set to {default:g} {unit}",
-                )
-        for name, value in (("damping", joint.damping), ("friction", joint.friction)):
-            if not value >= 0 or math.isinf(value):
-                yield Finding(
-                    f"{name}-invalid",
-                    "warning",
-                    where,
-                    f"its {name} is {value}",
-                    "write a finite number of at least 0",
-                )
-
-
-def check_home(robot: Robot) -> Iterator[Finding]:
-    """Find home positions outside the limits."""
-    for k, position in zip(robot.independent_joints, robot.home, strict=True):
-        joint = robot.joints[k]
-        lower, upper = position_range(joint)
-        if not (math.isfinite(position) and lower <= position <= upper):
-            yield Finding(
-                "home-outside-limits",
-                "error",
-                f"joint {joint.name}",
-                f"home is {position:g}, its limits are {lower:g} to {upper:g}",
-                "move home between the limits, as the repair does",
-                repair=f"its home was moved from {position:g} to the nearest limit",
-            )
-
-
-def check_mimic(robot: Robot) -> Iterator[Finding]:
-    """Find mimic joints that cannot move, or whose leader is fixed."""
-    for joint in robot.joints:
-        mimic = joint.mimic
-        if mimic is None:
-            continue
-        where = f"joint {joint.name}"
-        if not joint.is_movable:
-            yield Finding(
-                "mimic-on-fixed",
+def _drive_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
+    """Find effort or velocity that is missing, and negative damping or friction."""
+    units = ("N", "m/s") if joint.kind == "prismatic" else ("N m", "rad/s")
+    consequence = ": PyBullet has no force to move it, MuJoCo no limit"
+    is_driven = joint.is_independent and not is_locked(robot, joint)
+    for name, value, default, unit, effect in (
+        ("effort", joint.effort, DEFAULT_EFFORT, units[0], consequence),
+        ("velocity", joint.velocity, DEFAULT_VELOCITY, units[1], ""),
+    ):
+        if is_driven and not is_positive(value):
+            yield (
+                f"{name}-missing",
                 "warning",
-                where,
-                f"it is fixed but mimics {mimic.joint}",
-                "remove <mimic>, or give the joint a movable type",
+                (f"it has no {name}" if value is None else f"its {name} is {value:g}") + effect,
+                f"write its largest {name}; the repair takes {default:g} {unit}",
+                f"its {name} was set to {default:g} {unit}",
             )
-            continue
-        if not robot.joints[robot.joint_index[mimic.joint]].is_movable:
-            yield Finding(
-                "mimic-leader-fixed",
-                "error",
-                where,
-                f"it mimics {mimic.joint}, which is fixed: loaders disagree whether it moves",
-                "make it fixed, let it move by itself or name another leader",
-            )
-        if not (math.isfinite(mimic.multiplier) and math.isfinite(mimic.offset)):
-            yield Finding(
-                "mimic-invalid",
-                "error",
-                where,
-                f"its position is {mimic.multiplier} q + {mimic.offset}, which is not finite",
-                "write a finite multiplier and offset",
-            )
-        elif mimic.multiplier == 0:
-            yield Finding(
-                "mimic-still",
-                "warning",
-                where,
-                f"its multiplier is 0: it never moves with {mimic.joint}",
-                "write the multiplier, or make the joint fixed",
-            )
+    for name, value in (("damping", joint.damping), ("friction", joint.friction)):
+        if not value >= 0 or math.isinf(value):
+            fix = "write a finite number of at least 0"
+            yield f"{name}-invalid", "warning", f"its {name} is {value}", fix, ""
+
+
+def _home_faults(joint: Joint, position: float) -> Iterator[_Fault]:
+    """Find a home position outside the limits."""
+    lower, upper = position_range(joint)
+    if not (math.isfinite(position) and lower <= position <= upper):
+        yield (
+            "home-outside-limits",
+            "error",
+            f"home is {position:g}, its limits are {lower:g} to {upper:g}",
+            "move home between the limits, as the repair does",
+            f"its home was moved from {position:g} to the nearest limit",
+        )
+
+
+def _mimic_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
+    """Find a mimic joint that cannot move, or whose leader is fixed."""
+    mimic = joint.mimic
+    if mimic is None:
+        return
+    if not joint.is_movable:
+        fix = "remove <mimic>, or give the joint a movable type"
+        yield "mimic-on-fixed", "warning", f"it is fixed but mimics {mimic.joint}", fix, ""
+        return
+    if not robot.joints[robot.joint_index[mimic.joint]].is_movable:
+        yield (
+            "mimic-leader-fixed",
+            "error",
+            f"it mimics {mimic.joint}, which is fixed: loaders disagree whether it moves",
+            "make it fixed, let it move by itself or name another leader",
+            "",
+        )
+    if not (math.isfinite(mimic.multiplier) and math.isfinite(mimic.offset)):
+        why = f"its position is {mimic.multiplier} q + {mimic.offset}, which is not finite"
+        yield "mimic-invalid", "error", why, "write a finite multiplier and offset", ""
+    elif mimic.multiplier == 0:
+        why = f"its multiplier is 0: it never moves with {mimic.joint}"
+        yield "mimic-still", "warning", why, "write the multiplier, or make the joint fixed", ""
 
 
 def check_mimic_range(robot: Robot) -> Iterator[Finding]:
@@ -261,5 +233,4 @@ def is_positive(value: float | None) -> bool:
     return value is not None and math.isfinite(value) and value > 0
 
 
-def _movable(robot: Robot) -> Iterator[Joint]:
-    return (robot.joints[k] for k in robot.movable_joints)
+CHECKS = (check_joints, check_mimic_range)

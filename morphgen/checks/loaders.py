@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from morphgen.errors import MeshError
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, Severity
 from morphgen.model.geometry import Capsule, Geometry, Mesh, Shape, dimensions
 from morphgen.model.inertia import bounding_box, inertial_from_density
 from morphgen.model.mesh import MAX_STL_FACES, convex_hull, left_out, load_mesh
@@ -41,41 +41,31 @@ def check_shapes(robot: Robot) -> Iterator[Finding]:
                 yield from _mesh_findings(geometry, where, collides=geometry in collisions)
             elif not is_readable(geometry):
                 kind = type(geometry).__name__.lower()
-                yield Finding(
-                    "size-not-positive",
-                    "error",
-                    where,
-                    f"a {kind} with dimensions {dimensions(geometry)} m",
-                    "write lengths above 0",
-                )
+                why = f"a {kind} with dimensions {dimensions(geometry)} m"
+                yield Finding("size-not-positive", "error", where, why, "write lengths above 0")
 
 
 def check_units(robot: Robot) -> Iterator[Finding]:
     """Find links with an implausible size, or a visual-to-collision ratio that is one of units."""
     for link in robot.links:
+        where = f"link {link.name}"
         visual, collision = _extent(link.visuals), _extent(link.collisions)
         for kind, extent in (("visual", visual), ("collision", collision)):
             if extent is not None and not EXTENT_RANGE[0] <= extent <= EXTENT_RANGE[1]:
-                yield Finding(
-                    "extent-implausible",
-                    "warning",
-                    f"link {link.name}",
-                    f"its {kind} geometry is {extent:.4g} m large",
-                    "check the unit (m) and the mesh scale",
-                )
+                why = f"its {kind} geometry is {extent:.4g} m large"
+                fix = "check the unit (m) and the mesh scale"
+                yield Finding("extent-implausible", "warning", where, why, fix)
         if not visual or not collision:
             continue
         ratio = max(visual, collision) / min(visual, collision)
         for unit, units in UNIT_RATIOS.items():
             if unit / UNIT_TOLERANCE <= ratio <= unit * UNIT_TOLERANCE:
-                yield Finding(
-                    "visual-collision-scale",
-                    "warning",
-                    f"link {link.name}",
+                why = (
                     f"visual {visual:.4g} m and collision {collision:.4g} m differ {ratio:.4g} "
-                    f"times, about {units}",
-                    "correct the mesh scale of one of them",
+                    f"times, about {units}"
                 )
+                fix = "correct the mesh scale of one of them"
+                yield Finding("visual-collision-scale", "warning", where, why, fix)
                 break
 
 
@@ -127,40 +117,30 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
             "mesh-unresolved", "error", where, f"{mesh.path}: no such file", "correct the mesh path"
         )
         return
+    name = mesh.path.name
     if not is_scale_valid(mesh):
-        yield Finding(
-            "mesh-scale-invalid",
-            "error",
-            where,
-            f"{mesh.path.name}: scale {mesh.scale}",
-            "write finite factors other than 0",
-        )
+        why, fix = f"{name}: scale {mesh.scale}", "write finite factors other than 0"
+        yield Finding("mesh-scale-invalid", "error", where, why, fix)
         return
     fault = mesh_fault(mesh)
     if fault is not None:
         yield Finding("mesh-unreadable", "error", where, fault, "export the mesh again")
         return
     if parts := left_out(mesh.path):
-        yield Finding(
-            "mesh-left-out",
-            "info" if all(map(_ONLY_DRAWN.match, parts)) else "warning",
-            where,
-            f"{mesh.path.name}: left out: {'; '.join(parts)}",
-            "export the mesh as triangles with its materials beside it",
-        )
+        why = f"{name}: left out: {'; '.join(parts)}"
+        fix = "export the mesh as triangles with its materials beside it"
+        severity: Severity = "info" if all(map(_ONLY_DRAWN.match, parts)) else "warning"
+        yield Finding("mesh-left-out", severity, where, why, fix)
     flat = mesh_fault(mesh, reader=convex_hull) if collides else None
     if flat is not None:
         yield Finding("mesh-flat", "error", where, flat, "collide with a thin box instead")
     faces = len(load_mesh(mesh).faces)
     if faces > MAX_STL_FACES:
-        yield Finding(
-            "mesh-huge",
-            "warning",
-            where,
-            f"{mesh.path.name} has {faces} triangles; MuJoCo reads no STL of more than "
-            f"{MAX_STL_FACES} (the bundle writes OBJ then)",
-            "decimate the mesh",
+        why = (
+            f"{name} has {faces} triangles; MuJoCo reads no STL of more than {MAX_STL_FACES} "
+            "(the bundle writes OBJ then)"
         )
+        yield Finding("mesh-huge", "warning", where, why, "decimate the mesh")
 
 
 def _extent(shapes: Sequence[Shape]) -> float | None:
@@ -176,7 +156,7 @@ MAX_ROBOT_NAME = 200
 
 
 def check_names(robot: Robot) -> Iterator[Finding]:
-    """Find empty names and names with characters that loaders misinterpret."""
+    """Find names that loaders misinterpret, reserve, or have twice when frames are links."""
     for element, names in all_names(robot).items():
         for name in names:
             if name == safe_robot_name(name) if element == "robot" else is_name_safe(name):
@@ -193,10 +173,6 @@ def check_names(robot: Robot) -> Iterator[Finding]:
                 f"{MAX_ROBOT_NAME}; the repair writes '_'",
                 repair="its name was rewritten with '_' for what loaders dislike",
             )
-
-
-def check_reserved(robot: Robot) -> Iterator[Finding]:
-    """Find a link other than the root that has MuJoCo's reserved name ``world``."""
     if robot.link_index.get(_WORLD, 0) > 0:
         yield Finding(
             "name-reserved",
@@ -206,46 +182,30 @@ def check_reserved(robot: Robot) -> Iterator[Finding]:
             "rename the link, as the repair does",
             repair="it was renamed: MuJoCo keeps that name for the world",
         )
-
-
-def check_frame_names(robot: Robot) -> Iterator[Finding]:
-    """Find frames whose link and joint in a URDF would clash with existing names."""
     for frame in robot.frames:
         for element, name, taken in (
             ("link", frame.name, robot.link_index),
             ("joint", f"{frame.name}_joint", robot.joint_index),
         ):
             if name in taken:
-                yield Finding(
-                    "frame-name-taken",
-                    "error",
-                    f"frame {frame.name}",
-                    f"a URDF represents it by a {element} {name!r}, and that name is taken",
-                    "rename the frame or the " + element,
-                )
+                why = f"a URDF represents it by a {element} {name!r}, and that name is taken"
+                fix = f"rename the frame or the {element}"
+                yield Finding("frame-name-taken", "error", f"frame {frame.name}", why, fix)
 
 
 def check_tool(robot: Robot) -> Iterator[Finding]:
     """Find a robot without a tool frame, or with one that no joint moves."""
     tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
     if tool is None:
-        yield Finding(
-            "tool-missing",
-            "warning",
-            f"robot {robot.name}",
-            "it has no frame 'tool': tasks and reach need one",
-            "name the frame at the working point 'tool'",
-        )
+        why = "it has no frame 'tool': tasks and reach need one"
+        fix = "name the frame at the working point 'tool'"
+        yield Finding("tool-missing", "warning", f"robot {robot.name}", why, fix)
     elif robot.dof > 0 and not any(
         robot.joints[k].is_movable for k in robot.joint_chain(tool.link)
     ):
-        yield Finding(
-            "tool-still",
-            "warning",
-            f"frame {TOOL}",
-            f"it is on link {tool.link}, which no joint moves",
-            "put the frame on the end-effector",
-        )
+        why = f"it is on link {tool.link}, which no joint moves"
+        fix = "put the frame on the end-effector"
+        yield Finding("tool-still", "warning", f"frame {TOOL}", why, fix)
 
 
 def is_name_safe(name: str) -> bool:
@@ -283,80 +243,48 @@ PYBULLET_LINKS = 127
 """Largest number of links below the root in PyBullet 3.2.7, which fails silently on more."""
 
 
-def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
-    """Report mimic joints, which some URDF loaders do not couple to their leader."""
-    followers = [
-        robot.joints[k].name for k in robot.movable_joints if robot.joints[k].mimic is not None
-    ]
+def check_loaders(robot: Robot) -> Iterator[Finding]:
+    """Report what some loaders do not have: mimic joints, many links, and bases without mass."""
+    where = f"robot {robot.name}"
+    movable = [robot.joints[k] for k in robot.movable_joints]
+    followers = ", ".join(joint.name for joint in movable if joint.mimic is not None)
     if followers:
-        yield Finding(
-            "mimic-ignored-by-loaders",
-            "info",
-            f"robot {robot.name}",
-            f"PyBullet, older MuJoCo and (unless asked) Pinocchio ignore <mimic> of "
-            f"{', '.join(followers)}",
-            "load robot.xml, where it is an equality, or drive the followers yourself",
-        )
-
-
-def check_capsules(robot: Robot) -> Iterator[Finding]:
-    """Report links with capsules, which URDF does not have."""
-    for link in robot.links:
-        shapes = (*link.visuals, *link.collisions)
-        if any(isinstance(shape.geometry, Capsule) for shape in shapes):
-            yield Finding(
-                "capsule-in-urdf",
-                "info",
-                f"link {link.name}",
-                "URDF has no capsule: robot.urdf holds a cylinder and two spheres instead",
-                "load robot.xml, which has the capsule itself",
-            )
-
-
-def check_mesh_scales(robot: Robot) -> Iterator[Finding]:
-    """Report meshes that their scale mirrors or stretches."""
-    for link in robot.links:
-        shapes = (*link.visuals, *link.collisions)
-        meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
-        for mesh in dict.fromkeys(meshes):
-            if not is_scale_valid(mesh):
-                continue
-            if mesh.scale[0] * mesh.scale[1] * mesh.scale[2] < 0:
-                code, why = "mesh-mirrored", "mirrors it; some loaders turn it inside out"
-            elif min(mesh.scale) < max(mesh.scale):
-                code, why = "mesh-stretched", "stretches it; some loaders use one factor only"
-            else:
-                continue
-            yield Finding(
-                code,
-                "info",
-                f"link {link.name}",
-                f"{mesh.path.name}: scale {mesh.scale} {why}",
-                "nothing to do in a bundle, whose meshes have the scale applied",
-            )
-
-
-def check_link_count(robot: Robot) -> Iterator[Finding]:
-    """Find robots with more links than PyBullet supports."""
-    links = len(robot.links) + len(robot.frames)
-    if links - 1 > PYBULLET_LINKS:
-        yield Finding(
-            "links-too-many",
-            "error",
-            f"robot {robot.name}",
-            f"{links - 1} links below the root; PyBullet holds {PYBULLET_LINKS}",
-            "leave out bare frames, or import a part of it with --root-link",
-        )
-
-
-def check_root(robot: Robot) -> Iterator[Finding]:
-    """Report a base with shapes but without mass."""
+        why = f"PyBullet, older MuJoCo and (unless asked) Pinocchio ignore <mimic> of {followers}"
+        fix = "load robot.xml, where it is an equality, or drive the followers yourself"
+        yield Finding("mimic-ignored-by-loaders", "info", where, why, fix)
+    links = len(robot.links) + len(robot.frames) - 1
+    if links > PYBULLET_LINKS:
+        why = f"{links} links below the root; PyBullet holds {PYBULLET_LINKS}"
+        fix = "leave out bare frames, or import a part of it with --root-link"
+        yield Finding("links-too-many", "error", where, why, fix)
     base = rigid_groups(robot)[0]
     if base.mass == 0 and any(not link.is_empty for link in base.links):
-        yield Finding(
-            "massless-root",
-            "info",
-            f"link {robot.root.name}",
-            "the base has geometry but no mass: PyBullet never lets a massless base move",
-            "give it a mass if the base should ever move freely",
-        )
+        why = "the base has geometry but no mass: PyBullet never lets a massless base move"
+        fix = "give it a mass if the base should ever move freely"
+        yield Finding("massless-root", "info", f"link {robot.root.name}", why, fix)
+
+
+def check_bundled_shapes(robot: Robot) -> Iterator[Finding]:
+    """Report shapes that a bundle rewrites: capsules, and meshes with a mirror or a stretch."""
+    for link in robot.links:
+        where = f"link {link.name}"
+        geometries = {shape.geometry: None for shape in (*link.visuals, *link.collisions)}
+        if any(isinstance(geometry, Capsule) for geometry in geometries):
+            why = "URDF has no capsule: robot.urdf holds a cylinder and two spheres instead"
+            fix = "load robot.xml, which has the capsule itself"
+            yield Finding("capsule-in-urdf", "info", where, why, fix)
+        for mesh in geometries:
+            if not isinstance(mesh, Mesh) or not is_scale_valid(mesh):
+                continue
+            if math.prod(mesh.scale) < 0:
+                code, effect = "mesh-mirrored", "mirrors it; some loaders turn it inside out"
+            elif min(mesh.scale) < max(mesh.scale):
+                code, effect = "mesh-stretched", "stretches it; some loaders use one factor only"
+            else:
+                continue
+            why = f"{mesh.path.name}: scale {mesh.scale} {effect}"
+            fix = "nothing to do in a bundle, whose meshes have the scale applied"
+            yield Finding(code, "info", where, why, fix)
+
+
+CHECKS = (check_shapes, check_units, check_names, check_loaders, check_bundled_shapes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from morphgen.checks.quirks import (
     YOURDFPY_QUIRKS,
     Quirk,
 )
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
 from morphgen.formats.usd import convert_urdf, prim_name
@@ -151,91 +152,77 @@ def _yourdfpy_joint(joint: yourdfpy.Joint) -> JointReading:
     )
 
 
+@contextmanager
+def bullet_client() -> Iterator[Any]:
+    """Yield PyBullet with a world of its own."""
+    with quiet():  # it writes its build time on the first import
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
+        client = BulletClient(pybullet.DIRECT)
+    try:
+        yield client
+    except pybullet.error as error:
+        raise FormatError(f"PyBullet: {error}") from error
+    finally:
+        client.disconnect()
+
+
 def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
     """Read the URDF with PyBullet, with a floating base, because a fixed one reports no mass.
 
     The forces and inertia are those of a second body with a fixed base. PyBullet is asked for the
     inertia of the file, instead of which it takes that of the collision shapes by default.
     """
-    with quiet():
-        import pybullet
-
-        client = pybullet.connect(pybullet.DIRECT)
-        try:
-            body = pybullet.loadURDF(str(folder / URDF), physicsClientId=client)
-            indices = range(pybullet.getNumJoints(body, physicsClientId=client))
-            infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in indices]
-            # In PyBullet's joint infos, 1 is the name, 2 the type and 12 the child link's name.
-            movable = {
-                info[1].decode(): i
-                for i, info in zip(indices, infos, strict=True)
-                if info[2] != pybullet.JOINT_FIXED
-            }
-            joints = {name: _pybullet_joint(infos[i]) for name, i in movable.items()}
-            links = {info[12].decode(): i for i, info in zip(indices, infos, strict=True)}
-            links[pybullet.getBodyInfo(body, physicsClientId=client)[0].decode()] = -1
-            mass = sum(
-                pybullet.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in (-1, *indices)
-            )
-            if frame and frame not in links:
-                raise FormatError(f"no link {frame!r}")
-            forces, inertia = _pybullet_dynamics(folder / URDF, list(movable), q, n, client)
-            poses = np.tile(np.eye(4), (n, 1, 1))
-            for i in range(n if links.get(frame, -1) >= 0 else 0):
-                for name, index in movable.items():
-                    if name in q:
-                        pybullet.resetJointState(
-                            body, index, float(q[name][i]), physicsClientId=client
-                        )
-                # Items 4 and 5 of a link state are the pose of the link's URDF frame.
-                position, (x, y, z, w) = pybullet.getLinkState(
-                    body, links[frame], computeForwardKinematics=1, physicsClientId=client
-                )[4:6]
-                poses[i, :3, 3] = position
-                poses[i, :3, :3] = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
-        except pybullet.error as error:
-            raise FormatError(f"PyBullet: {error}") from error
-        finally:
-            pybullet.disconnect(client)
+    with quiet(), bullet_client() as client:
+        body = client.loadURDF(str(folder / URDF))
+        infos = [client.getJointInfo(body, i) for i in range(client.getNumJoints(body))]
+        # In PyBullet's joint infos, 0 is the index, 1 the name, 2 the type, 12 the child's name.
+        movable = {info[1].decode(): info for info in infos if info[2] != client.JOINT_FIXED}
+        joints = {name: _pybullet_joint(info) for name, info in movable.items()}
+        links = {info[12].decode(): info[0] for info in infos}
+        links[client.getBodyInfo(body)[0].decode()] = -1
+        mass = sum(client.getDynamicsInfo(body, link)[0] for link in range(-1, len(infos)))
+        if frame and frame not in links:
+            raise FormatError(f"no link {frame!r}")
+        forces, inertia = _pybullet_dynamics(client, folder / URDF, list(movable), q, n)
+        poses = np.tile(np.eye(4), (n, 1, 1))
+        for i in range(n if links.get(frame, -1) >= 0 else 0):
+            for name in movable.keys() & q.keys():
+                client.resetJointState(body, movable[name][0], float(q[name][i]))
+            # Items 4 and 5 of a link state are the pose of the link's URDF frame.
+            state = client.getLinkState(body, links[frame], computeForwardKinematics=1)
+            x, y, z, w = state[5]
+            poses[i] = Pose(state[4], (w, x, y, z)).matrix
     return Reading(joints, float(mass), poses, mimics=None, forces=forces, inertia=inertia)
 
 
 def _pybullet_dynamics(
-    urdf: Path, names: Sequence[str], q: Mapping[str, Array], n: int, client: int
+    client: Any,  # noqa: ANN401
+    urdf: Path,
+    names: Sequence[str],
+    q: Mapping[str, Array],
+    n: int,
 ) -> tuple[Array, Array]:
     """Return the forces and the inertia; see ``Reading``."""
-    import pybullet
-
-    body = pybullet.loadURDF(
-        str(urdf),
-        useFixedBase=True,
-        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-        physicsClientId=client,
-    )
+    flags = client.URDF_USE_INERTIA_FROM_FILE
+    body = client.loadURDF(str(urdf), useFixedBase=True, flags=flags)
     # Inverse dynamics takes gravity in the principal axes of the base, item 4 of its dynamics.
-    x, y, z, w = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)[4]
+    x, y, z, w = client.getDynamicsInfo(body, -1)[4]
     R_base_axes = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
-    gravity = R_base_axes.T @ (0.0, 0.0, -GRAVITY)
-    pybullet.setGravity(*gravity.tolist(), physicsClientId=client)
+    client.setGravity(*(R_base_axes.T @ (0.0, 0.0, -GRAVITY)).tolist())
     # Inverse dynamics (PyBullet 3.2.7) refuses inertia that is not symmetric to 1e-14 kg m^2, which
     # rounding passes in links of 200 kg m^2. A power of two scales all numbers without rounding.
-    for i in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        mass, _, moments = pybullet.getDynamicsInfo(body, i, physicsClientId=client)[:3]
-        pybullet.changeDynamics(
-            body,
-            i,
-            mass=mass * _MASS_SCALE,
-            localInertiaDiagonal=[moment * _MASS_SCALE for moment in moments],
-            physicsClientId=client,
-        )
+    for i in range(client.getNumJoints(body)):
+        mass, _, moments = client.getDynamicsInfo(body, i)[:3]
+        scaled = [moment * _MASS_SCALE for moment in moments]
+        client.changeDynamics(body, i, mass=mass * _MASS_SCALE, localInertiaDiagonal=scaled)
     forces, inertia = _no_dynamics(names, n)
     zero = [0.0] * len(names)
     for i in range(len(forces) if names else 0):
         positions = [float(q[name][i]) if name in q else 0.0 for name in names]
-        forces[i] = pybullet.calculateInverseDynamics(
-            body, positions, zero, zero, physicsClientId=client
-        )
-        inertia[i] = pybullet.calculateMassMatrix(body, positions, physicsClientId=client)
+        forces[i] = client.calculateInverseDynamics(body, positions, zero, zero)
+        inertia[i] = client.calculateMassMatrix(body, positions)
     return forces / _MASS_SCALE, inertia / _MASS_SCALE
 
 
@@ -265,7 +252,7 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
         try:
             model = pinocchio.buildModelFromUrdf(str(folder / URDF))
         except (ValueError, RuntimeError) as error:
-            raise FormatError("Pinocchio: " + " ".join(str(error).split())) from error
+            raise FormatError(f"Pinocchio: {one_line(str(error))}") from error
     model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
     kind = pinocchio.FrameType.BODY
     if frame and not model.existFrame(frame, kind):
@@ -333,6 +320,16 @@ def _pinocchio_joint(model: pinocchio.Model, k: int) -> JointReading:
     )
 
 
+def load_model(path: Path) -> mujoco.MjModel:
+    """Compile a URDF or MJCF with MuJoCo."""
+    import mujoco
+
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise FormatError(f"MuJoCo: {one_line(str(error))}") from error
+
+
 def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
     """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo.
 
@@ -340,10 +337,7 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
     """
     import mujoco
 
-    try:
-        model = mujoco.MjModel.from_xml_path(str(folder / file))
-    except ValueError as error:
-        raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
+    model = load_model(folder / file)
     movable = [i for i in range(model.njnt) if model.jnt_type[i] in (_SLIDE, _HINGE)]
     # A joint without a name is called after its body, as morphgen's reader does.
     names = [
@@ -440,37 +434,17 @@ def _mujoco_mimics(model: mujoco.MjModel) -> Iterator[tuple[str, Mimic]]:
 
 
 def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the USD that urdf-usd-converter makes of the URDF with OpenUSD."""
-    return read_stage(folder / URDF, frame, q, n)
-
-
-LOADERS = (
-    Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF, YOURDFPY_QUIRKS),
-    Loader("pybullet", "pybullet", read_pybullet, URDF, PYBULLET_QUIRKS),
-    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF, MUJOCO_QUIRKS),
-    Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF), MJCF),
-    Loader("pinocchio", "pinocchio", read_pinocchio, URDF, PINOCCHIO_QUIRKS),
-    Loader("usd", "urdf_usd_converter", read_usd, URDF, USD_QUIRKS),
-)
-"""Loaders of a bundle. Those of the URDF also read a URDF of others, that of the MJCF an MJCF."""
-
-
-def read_stage(urdf: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Convert a URDF to USD, open the stage and move its physics joints.
+    """Convert the URDF to USD, open the stage and move its physics joints.
 
     The joints of ``UsdPhysics`` are followed from the root link to the frame, with the local poses
     that they have on their two bodies: the nested transforms of the prims are only the pose in
-    which all joints are at zero.
-
-    q: Positions of every movable joint, shape (n,) [rad or m].
-
-    Returns:
-        The robot. Of its joints only the position limits are read: ``UsdPhysics`` has no others.
+    which all joints are at zero. Of the joints only the position limits are read: ``UsdPhysics``
+    has no others.
     """
     from pxr import Usd, UsdPhysics
 
     with TemporaryDirectory() as scratch:
-        stage = Usd.Stage.Open(str(convert_urdf(urdf, Path(scratch))))
+        stage = Usd.Stage.Open(str(convert_urdf(folder / URDF, Path(scratch))))
         prims = list(stage.Traverse())
         joints = {
             str(body): joint
@@ -549,3 +523,14 @@ def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
     px, py, pz = map(float, position)
     return Pose((px, py, pz), (w, x, y, z)).matrix
+
+
+LOADERS = (
+    Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF, YOURDFPY_QUIRKS),
+    Loader("pybullet", "pybullet", read_pybullet, URDF, PYBULLET_QUIRKS),
+    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF, MUJOCO_QUIRKS),
+    Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF), MJCF),
+    Loader("pinocchio", "pinocchio", read_pinocchio, URDF, PINOCCHIO_QUIRKS),
+    Loader("usd", "urdf_usd_converter", read_usd, URDF, USD_QUIRKS),
+)
+"""Loaders of a bundle. Those of the URDF also read a URDF of others, that of the MJCF an MJCF."""

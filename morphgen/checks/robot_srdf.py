@@ -28,7 +28,6 @@ from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
 REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
 """Reasons in the order in which they apply; a pair gets the first one."""
-_ANY_AXIS = (1.0, 0.0, 0.0)
 MATRIX_SAMPLES = 10_000
 """Number of sampled configurations, the default of MoveIt's setup assistant."""
 
@@ -47,12 +46,6 @@ class CollisionMatrix:
     """Number of sampled configurations."""
     seed: int
     """Seed of the configurations."""
-
-    @property
-    def counts(self) -> dict[Reason, int]:
-        """Number of pairs by reason."""
-        count = Counter(self.reasons.values())
-        return {reason: count[reason] for reason in REASONS}
 
 
 def collision_matrix(
@@ -119,24 +112,12 @@ def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
         independent joints of the original.
     """
     joints = tuple(
-        joint if joint.is_movable else replace(joint, kind="prismatic", axis=_ANY_AXIS, mimic=None)
+        joint if joint.is_movable else replace(joint, kind="prismatic", axis=(1, 0, 0), mimic=None)
         for joint in robot.joints
     )
     independent = [k for k, joint in enumerate(joints) if joint.is_independent]
     loose = replace(robot, joints=joints, home=(0.0,) * len(independent))
     return loose, [independent.index(k) for k in robot.independent_joints]
-
-
-HOME = "home"
-"""Name of the group states that hold the home configuration."""
-
-
-@dataclass(frozen=True)
-class _Limb:
-    """The groups of an arm, and of its end-effector if it has one."""
-
-    arm: Group
-    end_effector: Group | None
 
 
 def robot_srdf_text(
@@ -164,13 +145,11 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
     require_tool(robot)
     groups: list[Group] = []
     end_effectors = []
-    for limb in _limbs(robot):
-        groups.append(limb.arm)
-        if limb.end_effector is not None:
-            groups.append(limb.end_effector)
-            parent = robot.parents[robot.link_index[limb.end_effector.links[0]]]
-            name, carrier = limb.end_effector.name, robot.links[parent].name
-            end_effectors.append(EndEffector(name, carrier, name, limb.arm.name))
+    for arm, hand in _limbs(robot):
+        groups += (arm, hand) if hand else (arm,)
+        if hand:
+            carrier = robot.links[robot.parents[robot.link_index[hand.links[0]]]].name
+            end_effectors.append(EndEffector(hand.name, carrier, hand.name, arm.name))
     return Srdf(
         robot.name,
         groups=tuple(groups),
@@ -182,7 +161,8 @@ def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
 
 def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
     """Return sentences about how pairs that need no test were found, and how many."""
-    counts = ", ".join(f"{count} {reason}" for reason, count in matrix.counts.items())
+    count = Counter(matrix.reasons.values())
+    counts = ", ".join(f"{count[reason]} {reason}" for reason in REASONS)
     shapes = (shape.geometry for link in robot.links for shape in link.collisions)
     has_mesh = any(isinstance(shape, Mesh) for shape in shapes)
     about_meshes = " Meshes count as their convex hulls." if has_mesh else ""
@@ -195,15 +175,18 @@ def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
     )
 
 
-def _limbs(robot: Robot) -> Iterator[_Limb]:
-    """Yield the limbs; ``tool`` of a robot with several is the tool of the last and left out."""
+def _limbs(robot: Robot) -> Iterator[tuple[Group, Group | None]]:
+    """Yield the groups of every arm and its end-effector, if it has one.
+
+    ``tool`` of a robot with several is the tool of the last and left out.
+    """
     tools = [frame for frame in robot.frames if frame.name.endswith(f"_{TOOL}")]
     for tool in tools or [robot.frame(TOOL)]:
         prefix = tool.name.removesuffix(TOOL).removesuffix("arm_")
         arm = Group(f"{prefix}arm", chains=(Chain(robot.root.name, tool.name),))
         names = _part_links(robot, f"{prefix}ee") or _gripper_links(robot, tool)
         has_parent = bool(names) and names[0] != robot.root.name
-        yield _Limb(arm, Group(f"{prefix}ee", tuple(names)) if has_parent else None)
+        yield arm, Group(f"{prefix}ee", tuple(names)) if has_parent else None
 
 
 def _part_links(robot: Robot, label: str) -> list[str]:
@@ -259,4 +242,4 @@ def _home_states(robot: Robot, groups: Iterable[Group]) -> Iterator[GroupState]:
             names += (robot.joints[k].name for k in indices)
         positions = tuple((name, home[name]) for name in names if name in home)
         if positions:
-            yield GroupState(HOME, group.name, positions)
+            yield GroupState("home", group.name, positions)
