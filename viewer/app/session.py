@@ -257,7 +257,7 @@ class Session:
         gui.set_panel_label("morphgen")
         (gui.main_panel.dock_left if left else gui.main_panel.dock_right)()
         gui.main_panel.set_width(width)
-        gui.add_html(f"{markup.STYLE}{header}")
+        gui.add_html(header)
         self.status = gui.add_html(markup.status(status))
         if status:  # the page says what it does, so there is something to see
             self.reveal()

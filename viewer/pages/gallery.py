@@ -1,23 +1,32 @@
-"""The pages that are galleries: a folder of robots, all parts (the first page), chosen robots."""
+"""The pages that are galleries: all parts (the first page), a folder, chosen robots; indexes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import viser
 
 from morphgen.benchmark.split import SIDES
+from morphgen.benchmark.split_file import split_names
 from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.grammar.grammar_file import grammar_names
 from morphgen.grammar.robot_set import INDEX
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.gallery import Gallery, add_controls, open_panels, passing_rows, show_page
-from morphgen.viewer.pages.index import library_sections, section_links, show_index
-from morphgen.viewer.robot_rows import Row, folder_rows, part_rows, robot_subfolders, uri_rows
-from morphgen.viewer.robot_uri import DEFAULT_WORDS
-from morphgen.viewer.splits import ChooseSides, add_split_form
+from morphgen.viewer.robot_rows import (
+    Row,
+    folder_rows,
+    part_rows,
+    robot_folders,
+    robot_subfolders,
+    uri_rows,
+)
+from morphgen.viewer.robot_uri import DEFAULT_WORDS, FileAccess
+from morphgen.viewer.splits import SPLITS, ChooseSides, add_split_form
 
 _COMPOSE = Address("compose", (DEFAULT_WORDS,))
 INTRODUCTION = (
@@ -129,3 +138,72 @@ def show_chosen(session: Session) -> None:
 def _set_sides(rows: list[Row], num_train: int) -> None:
     """Give rows their sides: the first ones are to train on."""
     rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
+
+
+INDEX_WIDTH = 620.0
+"""Width of the panel [pixels]."""
+Sections = Mapping[str, list[tuple[str, Address]]]
+"""Labels and addresses of links, by the title of their section."""
+_ROBOTS, _SPLITS, _GRAMMARS = "Robots in this folder", "Splits", "Grammars"
+_TITLES = {
+    "gallery": "Open the gallery of which robots?",
+    "population": "Show which robots on one ground?",
+    "split": "Open which split?",
+}
+_SECTIONS = {
+    "gallery": (_ROBOTS, _SPLITS),
+    "population": (_ROBOTS, _SPLITS, _GRAMMARS),
+    "split": (_SPLITS,),
+}
+"""Sections of each page's index."""
+_EMPTY = {
+    _ROBOTS: "none yet: compose a robot and write it to robots/, or run "
+    "<code>morphgen sample arm3</code>",
+    _SPLITS: "none yet: choose robots in a gallery, then split in the tray",
+}
+
+
+def show_index(session: Session) -> None:
+    """Build the page that asks for the subject of a gallery, a population or a split."""
+    page = session.address.page
+    session.open_panel(INDEX_WIDTH, markup.breadcrumbs((page, None)), left=True)
+    targets = _subjects(session.files)
+    sections = {
+        title: [
+            (name, Address("split" if page == "gallery" and title == _SPLITS else page, (name,)))
+            for name in targets[title]
+        ]
+        for title in _SECTIONS[page]
+    }
+    html = f"<h2>{_TITLES[page]}</h2>{section_links(sections)}"
+    session.client.gui.add_html(markup.framed(html))
+    session.show_address(page)
+
+
+def library_sections(files: FileAccess) -> Sections:
+    """Return links to the robots of the current folder, the splits and the grammars."""
+    pages = {_ROBOTS: "gallery", _SPLITS: "split", _GRAMMARS: "compose"}
+    return {
+        title: [(name, Address(pages[title], (name,))) for name in names]
+        for title, names in _subjects(files).items()
+    }
+
+
+def section_links(sections: Sections) -> str:
+    """Return sections of links as HTML; an empty section says what to do."""
+    html = ""
+    for title, links in sections.items():
+        text = " · ".join(markup.link(address, name) for name, address in links)
+        html += f"<h3>{title}</h3>{text or markup.dim(_EMPTY[title])}"
+    return html
+
+
+def _subjects(files: FileAccess) -> Mapping[str, list[str]]:
+    """Return what addresses can name: folders of robots, splits with the user's first, grammars."""
+    root = files.roots[0]
+    own = sorted(path.relative_to(root).as_posix() for path in (root / SPLITS).rglob("*.yaml"))
+    return {
+        _ROBOTS: robot_folders(root),
+        _SPLITS: [*own, *split_names()],
+        _GRAMMARS: grammar_names(),
+    }

@@ -71,11 +71,6 @@ class EpisodePlots:
     """Score after every step by robot, as far as it was computed."""
 
 
-def add_plots(session: Session) -> EpisodePlots:
-    """Add the folder of the charts."""
-    return EpisodePlots(session, session.client.gui.add_folder("Distance and score"))
-
-
 def start_plots(plots: EpisodePlots, episode: Episode) -> None:
     """Replace the charts by those of a new episode."""
     clear_plots(plots)
@@ -318,8 +313,6 @@ PANEL_WIDTH = 400.0
 """Width of the panel [pixels]."""
 PLANNERS = ("ik", "scripted")
 """Policies whose first step takes seconds, because they plan a path."""
-ADDRESS_DELAY = 0.5
-"""Delay of URL updates after a move of the time slider [s]."""
 
 
 @dataclass(eq=False)
@@ -383,13 +376,13 @@ class PlayPage:
     def show_position(self, step: int | None) -> None:
         """Show in the address where the user paused."""
         self.position = step
-        self.session.call_later(ADDRESS_DELAY, self._show_in_address, "address")
+        self.session.show_state_later()
 
-    def _show_in_address(self) -> None:
-        step, source = self.position, self.source
-        text = "" if step is None or source is None else f"{step * source.episode.period:.4g}"
-        if text != self.session.address.state.get("t", ""):
-            self.session.update_address(self.session.title, t=text)
+    def state(self) -> dict[str, str]:
+        """Return the time at which the episode is paused, for the address."""
+        if self.position is None or self.source is None:
+            return {"t": ""}
+        return {"t": f"{self.position * self.source.episode.period:.4g}"}
 
     def show_failure(self, reason: str) -> None:
         """Show why there is no episode."""
@@ -475,9 +468,11 @@ def _add_player(session: Session) -> tuple[PlayPage, Player]:
     speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
     speed = gui.add_dropdown("speed", speeds, initial_value="1x")
     time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint="as far as it was simulated")
-    page = PlayPage(session, time, fault, gui.add_html(""), add_plots(session))
+    score, plots = gui.add_html(""), EpisodePlots(session, gui.add_folder("Distance and score"))
+    page = PlayPage(session, time, fault, score, plots)
     player = Player(page)
     session.on_close(player.stop)
+    session.state = page.state
     commands: dict[str, Callable[[], None]] = {
         "play": player.play,
         "pause": player.pause,

@@ -17,7 +17,7 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.comparison import format_moves, parse_moves
-from morphgen.viewer.pages.index import show_index
+from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.population import (
     NUM_SAMPLED,
     Population,

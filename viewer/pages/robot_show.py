@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,8 +28,9 @@ from morphgen.model.kinematics import (
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables
+from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.app.viser_internals import control_id, run_javascript
+from morphgen.viewer.app.viser_internals import control_id
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
 from morphgen.viewer.scene import overlays as scene_overlays
@@ -199,28 +199,6 @@ _DRAG_ROUNDS = 4
 """Newton steps by which a joint follows the pointer, per event."""
 _MAX_TURN = 0.4
 """Largest such step [rad or m]."""
-_WATCH = """
-const field = %(field)s, rows = %(rows)s;
-const report = (row) => {
-  const label = document.querySelector(`label[for="${field}"]`);
-  const input = label?.closest(".mantine-Flex-root").querySelector("input");
-  if (!input || input.value === row) return;
-  Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, row);
-  input.dispatchEvent(new Event("input", { bubbles: true }));
-};
-const joint = (event) => {
-  for (let at = event.target; at instanceof Element; at = at.parentElement) {
-    const label = at.querySelector(":scope > * > * > label[for]");
-    if (label) return rows[label.htmlFor] ?? "";
-  }
-  return "";
-};
-window.morphgenWatch?.abort();
-window.morphgenWatch = new AbortController();
-const options = { signal: window.morphgenWatch.signal };
-document.addEventListener("pointerover", (e) => { if (!e.buttons) report(joint(e)); }, options);
-document.addEventListener("focusin", (e) => report(joint(e)), options);
-"""
 
 
 def select_link(page: RobotPage, name: str) -> None:
@@ -284,8 +262,7 @@ def watch_sliders(page: RobotPage) -> None:
         gui.add_html(style)
         session.on_change(channel, lambda: show_range(page, _row(channel.value, page)), "range")
     rows = {control_id(slider): str(row) for row, slider in enumerate(page.sliders)}
-    script = _WATCH % {"field": json.dumps(control_id(channel)), "rows": json.dumps(rows)}
-    run_javascript(page.session.client, script)
+    page.session.run_script(call("watch", control_id(channel), rows))
 
 
 def _row(text: str, page: RobotPage) -> int | None:

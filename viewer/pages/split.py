@@ -22,7 +22,7 @@ from morphgen.viewer.gallery import (
     open_panels,
     passing_rows,
 )
-from morphgen.viewer.pages.index import show_index
+from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
