@@ -48,7 +48,7 @@ def breadcrumbs(*steps: tuple[str, Address | None]) -> str:
 
 
 def tag(text: str, style: str = "") -> str:
-    """Return a word in a coloured box; the style is a class of ``frame.html``, such as ``error``."""
+    """Return a word in a coloured box; its style is one of the frame, such as ``error``."""
     return f'<span class="tag {escape(style)}">{escape(text)}</span>'
 
 

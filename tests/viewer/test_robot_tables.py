@@ -1,22 +1,37 @@
-"""Texts, tables and joint configurations of the robot page."""
+"""The robot page: texts and tables, selection, drags, and marks of joints."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.robots import arm
+from helpers.robots import arm, finger
+from helpers.viser_client import PlainClient
+from morphgen.model.findings import Finding
+from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Inertial
-from morphgen.viewer.pages.robot_show import format_joints, free_configuration, parse_joints
+from morphgen.model.rotation import to_matrix
+from morphgen.viewer.pages.robot_show import (
+    format_joints,
+    free_configuration,
+    joint_of_link,
+    parse_joints,
+    turn_towards,
+)
 from morphgen.viewer.robot_tables import (
+    is_about,
     joint_groups,
     joint_hint,
+    link_card,
     link_details,
     link_table,
     slider_step,
     summary,
 )
-from morphgen.viewer.scene.stage import inertia_box
+from morphgen.viewer.scene.overlays import range_lines
+from morphgen.viewer.scene.robot import RED
+from morphgen.viewer.scene.stage import View, inertia_box, project_points
 
 
 def test_joints_are_grouped_by_their_part():
@@ -96,3 +111,181 @@ def test_random_free_configuration_is_collision_free():
     q = free_configuration(checker, robot, np.random.default_rng(0))
     assert q is not None
     assert list(checker.penetrations([q])) == [{}]
+
+
+ARM = "?robot=robots/some-arm"
+
+
+def poses(q):
+    return forward_kinematics(arm(), q)
+
+
+def on_screen(page, camera, point):
+    """Return where a point of the world is in the window [pixels]."""
+    box = page.locator("canvas").first.bounding_box()
+    rotation = np.array(to_matrix(tuple(camera.wxyz)))
+    view = View(np.array(camera.position), rotation, camera.fov, camera.aspect)
+    x, y = project_points(view, point)[0] * box["height"]
+    return box["x"] + x, box["y"] + y
+
+
+def test_a_dragged_joint_takes_the_gripped_point_to_the_pointer():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    point, link = np.array([0.0, 0.0, 0.3]), robot.link_index["upper"]
+    goal = poses([1.3, 0.5, 0.01, 0.02])[link] @ [*point, 1]
+    turned = turn_towards(robot, q, 0, link, point, goal[:3])
+    assert turned == pytest.approx([1.3, 0.5, 0.01, 0.02], abs=1e-3)
+
+
+def test_a_dragged_joint_keeps_its_limits_and_mimics_are_dragged_by_their_leader():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    right = robot.link_index["right"]
+    row = joint_of_link(robot, right)
+    assert row == 3
+    away = poses(q)[right, :3, 3] + 10 * poses(q)[right, :3, 1]
+    assert turn_towards(robot, q, row, right, np.zeros(3), away)[3] == 0
+    assert turn_towards(robot, q, row, right, np.zeros(3), -away)[3] == 0.04
+
+
+def test_a_point_on_the_axis_does_not_turn_the_joint():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    link = robot.link_index["upper"]
+    assert turn_towards(robot, q, 0, link, np.zeros(3), np.ones(3)) == pytest.approx(q)
+
+
+def test_the_range_of_a_hinge_is_an_arc_between_its_limits():
+    joint = arm().joints[0]
+    needle, track, axis = range_lines(joint, 0.2, (0.0, 0.0, 1.0))
+    assert np.linalg.norm(track[:-2], axis=-1) == pytest.approx(0.2, abs=1e-9)
+    angles = [np.arctan2(p[0], p[2]) for p in (track[0, 0], track[-3, 1])]
+    assert angles == pytest.approx(joint.limits)
+    assert np.cross(axis[0, 1] - axis[0, 0], joint.axis) == pytest.approx(0)
+    assert needle @ joint.axis == pytest.approx(0)
+
+
+def test_the_range_of_a_slide_is_a_line_between_its_limits():
+    joint = finger().joints[0]
+    _, track, _ = range_lines(joint, 0.2, (1.0, 0.0, 0.0))
+    assert track[0] == pytest.approx(np.array([[0, -3, 0], [0, 3, 0]]))
+
+
+def test_a_card_shows_mass_limits_in_both_units_and_the_findings_of_its_link():
+    robot = arm()
+    findings = [
+        Finding("a", "warning", "link upper", "too heavy", "make it lighter"),
+        Finding("b", "error", "joint shoulder", "too weak", "make it stronger"),
+        Finding("c", "info", "link lower", "something else", "nothing"),
+    ]
+    card = link_card(robot, "upper", findings)
+    assert f"{robot.link('upper').inertial.mass:.4g} kg" in card
+    assert "-2 to 2 rad (-115 to 115°)" in card
+    assert "too heavy" in card
+    assert "too weak" in card
+    assert "something else" not in card
+    assert "none, it is the root" in link_card(robot, "base", ())
+
+
+def test_a_finding_is_about_the_links_and_joints_that_it_names():
+    pair = Finding("x", "warning", "links upper, lower", "", "")
+    assert is_about(pair, "upper", "")
+    assert is_about(pair, "lower", "")
+    assert not is_about(pair, "low", "")
+    assert not is_about(Finding("x", "info", "joint ", "", ""), "base", "")
+
+
+def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):
+    on = viewer()
+    with PlainClient(on.port, ARM) as client:
+        client.shows("no self-collision")
+        frame = client.until(
+            lambda: next((m for m in client.messages if m.get("name") == "/robot/1"), None)
+        )
+        (session,) = on.sessions.values()
+        view = session.client.scene._handle_from_node_name
+        click = {
+            "type": "SceneNodeClickMessage",
+            "name": "/robot/1",
+            "instance_index": None,
+            "ray_origin": [1.0, 0.0, 0.0],
+            "ray_direction": [-1.0, 0.0, 0.0],
+            "screen_pos": [0.5, 0.5],
+            "modifier": None,
+            "owner": frame["owner"],
+        }
+        client.send(click)
+        client.shows("link=upper")
+        client.until(lambda: "/robot/1/outline0" in view)
+        robot = arm()
+        grip = poses(robot.home)[1] @ [0, 0, 0.3, 1]
+        drag = {
+            "type": "SceneNodeDragMessage",
+            "phase": "start",
+            "name": "/robot/1",
+            "instance_index": None,
+            "start_position": grip[:3].tolist(),
+            "start_screen_pos": [0.5, 0.5],
+            "end_position": grip[:3].tolist(),
+            "end_screen_pos": [0.5, 0.5],
+            "button": "left",
+            "modifier": None,
+            "owner": frame["owner"],
+        }
+        client.send(drag)
+        goal = poses([1.0, *robot.home[1:]])[1] @ [0, 0, 0.3, 1]
+        client.send({**drag, "phase": "update", "end_position": goal[:3].tolist()})
+        client.until(lambda: "/robot/0/range" in view)
+        client.shows("q=1,0.5,0.01,0.02")
+        client.send({**drag, "phase": "end", "end_position": goal[:3].tolist()})
+        client.until(lambda: "/robot/0/range" not in view)
+        client.send(click)
+        client.until(lambda: "/robot/1/outline0" not in view)
+
+
+@pytest.mark.slow
+def test_pointer_selects_drags_and_shows_ranges(see, viewer, picture):
+    on = viewer()
+    page = see(f"{ARM}&link=lower&angles=deg", on=on)
+    page.get_by_text("no self-collision").wait_for()
+    (session,) = on.sessions.values()
+    nodes = session.client.scene._handle_from_node_name
+    assert "/robot/2/outline0" in nodes
+    shoulder = page.get_by_text("shoulder", exact=True)
+    row = shoulder.locator("xpath=ancestor::*[.//input][1]")
+    assert row.locator("input").last.input_value() == "23"
+    shoulder.hover()
+    page.wait_for_timeout(1500)
+    assert "/robot/0/range" in nodes
+    picture(page, "robot-selection")
+    page.mouse.move(300, 100)
+    page.wait_for_timeout(1500)
+    assert "/robot/0/range" not in nodes
+    middle = (poses(arm().home)[1] @ [0, 0, 0.15, 1])[:3]
+    x, y = on_screen(page, session.client.camera, middle)
+    page.mouse.click(x, y)
+    page.wait_for_url(re.compile("link=upper"))
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for i in range(8):
+        page.mouse.move(x + 8 * i, y)
+        page.wait_for_timeout(100)
+    page.mouse.up()
+    page.wait_for_url(re.compile("q="))
+    assert "link=upper" in page.url
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_collisions_stay_red_when_a_link_is_selected(see, viewer):
+    on = viewer()
+    query = "?robot=words:arm=ur5 ee=plane&q=0,-1,2.6,2.5,0,0&link=arm_wrist_3_link"
+    page = see(query, on=on)
+    page.get_by_text("collision", exact=True).wait_for()
+    (session,) = on.sessions.values()
+    nodes = session.client.scene._handle_from_node_name
+    red = [n for n, node in nodes.items() if "visual" in n and tuple(node.color) == RED]
+    assert red
+    page.get_by_role("tab", name="Links").click()
+    page.get_by_role("combobox", name="Link").click()
+    page.get_by_role("option", name="arm_forearm_link").click()
+    page.wait_for_url(re.compile("link=arm_forearm_link"))
+    assert all(tuple(nodes[name].color) == RED for name in red)
