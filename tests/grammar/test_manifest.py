@@ -53,11 +53,8 @@ def test_a_real_part_manifest_has_a_package_and_xacro_arguments(tmp_path):
 
 def test_optional_keys_default_to_empty(tmp_path):
     manifest = read_manifest(write_part(tmp_path, mount=None, tool=None, home=None))
-    assert manifest.mount is None
-    assert manifest.tool is None
-    assert not manifest.home
-    assert not manifest.ports
-    assert manifest.without == ()
+    assert (manifest.mount, manifest.tool, manifest.without) == (None, None, ())
+    assert not {**manifest.home, **manifest.ports}
 
 
 def test_an_unknown_key_suggests_the_nearest(tmp_path):
@@ -65,14 +62,15 @@ def test_an_unknown_key_suggests_the_nearest(tmp_path):
     assert message.startswith(": unknown key 'paramters'; did you mean 'parameters'? valid: ")
 
 
-@pytest.mark.parametrize(("key", "of"), [("mass", {}), ("drop", {}), ("citation", "x")])
-def test_templates_reject_keys_of_real_parts(tmp_path, key, of):
-    assert f"unknown key {key!r}" in refusal(write_part(tmp_path, **{key: of}))
-
-
-@pytest.mark.parametrize("key", ["density"])
-def test_real_parts_reject_keys_of_templates(tmp_path, key):
-    changes = REAL | {key: MANIFEST[key]}
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"mass": {}}, "mass"),
+        ({"citation": "x"}, "citation"),
+        (REAL | {"density": MANIFEST["density"]}, "density"),
+    ],
+)
+def test_templates_and_real_parts_have_keys_of_their_own(tmp_path, changes, key):
     assert f"unknown key {key!r}" in refusal(write_part(tmp_path, **changes))
 
 
@@ -88,7 +86,6 @@ def test_a_missing_key_is_an_error(tmp_path, key):
         ({"kind": ["ee"]}, "kind: unknown value ['ee']"),
         ({"file": None}, "needs 'source' (a data package) or 'file' (a template)"),
         ({"mount": "palm"}, "6: mount: invalid value 'palm'; expected keys and values"),
-        ({"mount": {"xyz": [0, 0, 0]}}, "7: mount: missing key 'link'"),
         ({"mount": {"link": "palm", "xzy": [0, 0, 0]}}, "mount: unknown key 'xzy'; did you mean"),
         (
             {"tool": {"link": "palm", "xyz": [0, 1]}},
@@ -102,70 +99,28 @@ def test_a_missing_key_is_an_error(tmp_path, key):
             {"tool": {"link": "palm", "xyz": [0, 0, float("inf")]}},
             "tool.xyz[2]: invalid value inf; expected a finite number",
         ),
-        ({"ports": ["flange"]}, "ports: invalid value ['flange']; expected keys and values"),
         ({"ports": {"flange": {"link": "palm", "at": 1}}}, "ports.flange: unknown key 'at'"),
         ({"ports": {5: {"link": "palm"}}}, "ports: key 5 is not text; quote it"),
-        ({"home": {"wheel": None}}, "home.wheel: invalid value None; expected a number"),
         (
             {"home": {"wheel": float("nan")}},
             "home.wheel: invalid value nan; expected a finite number",
         ),
-        (
-            {"effort": {"wheel": "strong"}},
-            "effort.wheel: invalid value 'strong'; expected a number",
-        ),
-        ({"velocity": [1]}, "velocity: invalid value [1]; expected keys and values"),
-        ({"density": "water"}, "density: invalid value 'water'; expected a number"),
         ({"density": 0}, "density: invalid value 0; expected a number > 0"),
         ({"without": "disc"}, "without: invalid value 'disc'; expected a list"),
-        ({"without": [1]}, "without[0]: invalid value 1; expected text"),
-        (
-            {"accepted": {"palm": "as is"}},
-            "accepted.palm: invalid value 'as is'; expected keys and values",
-        ),
-        (
-            {"parameters": {"length": 0.2}},
-            "parameters.length: invalid value 0.2; expected keys and values",
-        ),
         ({"parameters": {"length": {"min": 0, "max": 1}}}, "length: missing key 'default'"),
         (
             {"parameters": {"length": {"default": 0, "min": 0, "mx": 1}}},
             "parameters.length: unknown key 'mx'; did you mean 'max'?",
         ),
-        (
-            {"parameters": {"length": {"default": "wide", "min": 0, "max": 1}}},
-            "parameters.length.default: invalid value 'wide'; expected a number",
-        ),
         (REAL | {"source": {"package": "rtb-data"}}, "source: missing key 'file'"),
-        (
-            REAL | {"source": "rtb-data"},
-            "source: invalid value 'rtb-data'; expected keys and values",
-        ),
-        (REAL | {"mass": {"palm": "heavy"}}, "mass.palm: invalid value 'heavy'; expected a number"),
-        (
-            REAL | {"drop": {"palm": "hand.dae"}},
-            "drop.palm: invalid value 'hand.dae'; expected a list",
-        ),
         (
             REAL | {"scaling": {"palm": 2}},
             "scaling.palm: invalid value 2; expected text or keys and values",
         ),
         (REAL | {"scaling": {"palm": {"bye": "s"}}}, "scaling.palm: unknown key 'bye'; did you"),
         (
-            REAL | {"scaling": {"palm": {"by": 2}}},
-            "scaling.palm.by: invalid value 2; expected text",
-        ),
-        (
-            REAL | {"scaling": {"palm": {"face": [0]}}},
-            "scaling.palm.face: invalid value [0]; expected a list of length 3",
-        ),
-        (
             REAL | {"scaling": {"palm": {"face": [0, 0, "z"]}}},
             "palm.face[2]: invalid value 'z'; expected a number",
-        ),
-        (
-            REAL | {"collision_from_visual": "palm"},
-            "collision_from_visual: invalid value 'palm'; expected a list",
         ),
     ],
 )
@@ -182,18 +137,11 @@ def test_the_name_must_equal_the_file_name(tmp_path):
     ("text", "message"),
     [
         ("name: pincer\nkind: [ee\nroot: palm\n", ":3:5: invalid YAML: "),
-        ("name: pincer\n\tkind: ee\n", ":2:1: invalid YAML: "),
         (
             "name: pincer\nkind: ee\nname: pincer\n",
             ":3:1: invalid YAML: key 'name' is given twice",
         ),
-        (
-            "name: pincer\nhome:\n  a: 1\n  a: 2\n",
-            ":4:3: invalid YAML: key 'a' is given twice",
-        ),
-        ("name: pincer\n? [a]\n: 5\n", ":2:3: invalid YAML: "),
         ("name: !!python/object/apply:os.getcwd []\n", ":1:7: invalid YAML: "),
-        ("name: pin\x00cer\n", ": invalid YAML: "),
         ("name: 2020-13-45\n", ": invalid YAML: "),
         ("- name\n- kind\n", ":1: invalid value ['name', 'kind']; expected keys and values"),
         ("", ":1: missing key 'name'"),

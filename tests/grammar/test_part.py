@@ -16,6 +16,9 @@ from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, scale_shape
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
+GONE = {"file": None, "density": None, "parameters": None}
+"""Keys of templates, which a real part has not."""
+SIZE = {"size": {"default": 1, "min": 0.5, "max": 2}}
 
 
 def template(folder, values=None, **changes):
@@ -32,8 +35,7 @@ def real(tmp_path, monkeypatch):
         monkeypatch.setattr(module, "distribution_file", lambda package, file: tmp_path / file)
         source = {"source": {"package": "rtb-data", "file": "pincer.urdf"}}
         tool = {"link": "palm", "xyz": [0, 0, 0.25]}
-        gone = {"file": None, "density": None, "parameters": None}
-        manifest = write_part(tmp_path, **gone | source | {"tool": tool} | changes)
+        manifest = write_part(tmp_path, **GONE | source | {"tool": tool} | changes)
         return load_part(read_manifest(manifest))
 
     return make
@@ -84,12 +86,8 @@ def test_home_effort_and_velocity_of_the_manifest_take_precedence(tmp_path):
     left, right, wheel = body.joints
     assert body.home == (0.01, 0.5)
     assert (left.effort, left.velocity) == (10, 0.3)
-    assert (wheel.effort, wheel.velocity) == (7, 2)
+    assert (wheel.effort, wheel.velocity, wheel.limits) == (7, 2, None)  # it is continuous
     assert (right.effort, right.limits, right.mimic.joint) == (10, (-0.04, 0), "left_slide")
-
-
-def test_a_continuous_joint_has_no_limits(tmp_path):
-    assert template(tmp_path).fragment.joints[2].limits is None
 
 
 def test_unsafe_names_are_replaced_in_every_reference(tmp_path):
@@ -169,13 +167,6 @@ def test_a_manifest_that_contradicts_its_source_is_an_error(tmp_path, changes, m
     assert "pincer" in str(caught.value)
 
 
-@pytest.mark.parametrize("key", ["mass", "drop"])
-def test_keys_of_real_parts_with_unknown_links_are_errors(real, key):
-    value = 1 if key == "mass" else ["x.dae"]
-    with pytest.raises(PartError, match=f"{key}: no link 'pam'; did you mean 'palm'"):
-        real(**{key: {"pam": value}})
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -203,16 +194,14 @@ def test_a_missing_data_package_error_has_the_install_command(
 
     monkeypatch.setattr(importlib.metadata, "distribution", absent)
     source = {"package": package, "file": "robots/x.urdf"}
-    gone = {"file": None, "density": None, "parameters": None}
-    manifest = read_manifest(write_part(tmp_path, source=source, **gone))
+    manifest = read_manifest(write_part(tmp_path, source=source, **GONE))
     with pytest.raises(PartError, match="not installed: " + install):
         load_part(manifest)
 
 
 def test_a_file_missing_in_the_data_package_is_named(tmp_path):
     source = {"package": "rtb-data", "file": "rtbdata/xacro/nowhere.urdf"}
-    gone = {"file": None, "density": None, "parameters": None}
-    manifest = read_manifest(write_part(tmp_path, source=source, **gone))
+    manifest = read_manifest(write_part(tmp_path, source=source, **GONE))
     with pytest.raises(PartError, match=r"rtb-data 1\.1\.0 has no file .*nowhere\.urdf"):
         load_part(manifest)
 
@@ -227,25 +216,23 @@ def test_an_edited_part_is_reloaded(tmp_path):
 
 
 def test_a_link_scaled_by_a_parameter_stays_in_contact_with_its_parent(real):
-    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
-    plain = real(parameters=size, scaling={"disc": "size"})
+    plain = real(parameters=SIZE, scaling={"disc": "size"})
     assert plain.fragment.joints == real().fragment.joints
     for scaling in ({"disc": "size"}, {"disc": {"by": "size"}}):
-        manifest = real(parameters=size, scaling=scaling).manifest
+        manifest = real(parameters=SIZE, scaling=scaling).manifest
         larger = load_part(manifest, {"size": 2}).fragment
         shapes = plain.fragment.link("disc").collisions
         assert larger.link("disc").collisions == tuple(scale_shape(s, 2) for s in shapes)
         assert larger.joints == plain.fragment.joints
     face = {"disc": {"by": "size", "face": [0, 0, -0.01]}}
-    held = load_part(real(parameters=size, scaling=face).manifest, {"size": 2}).fragment
+    held = load_part(real(parameters=SIZE, scaling=face).manifest, {"size": 2}).fragment
     moved = held.joints[-1].T_parent_joint.inverse() @ plain.fragment.joints[-1].T_parent_joint
     assert moved.position == pytest.approx((0, 0, -0.01))
 
 
 def test_an_unscaled_link_may_follow_the_face_of_its_parent(real):
-    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     scaling = {"palm": {"by": "size"}, "disc": {"face": [0, 0, 0.01]}}
-    part = real(parameters=size, scaling=scaling)
+    part = real(parameters=SIZE, scaling=scaling)
     larger = load_part(part.manifest, {"size": 2}).fragment
     assert larger.link("disc") == part.fragment.link("disc")
     face_before, face_after = (
@@ -255,14 +242,14 @@ def test_an_unscaled_link_may_follow_the_face_of_its_parent(real):
 
 
 @pytest.mark.parametrize(
-    ("scaling", "message"),
+    ("changes", "message"),
     [
-        ({"disk": {"by": "size"}}, "scaling: no link 'disk'; did you mean 'disc'?"),
-        ({"disc": {"by": "sise"}}, "scaling: no parameter 'sise'; did you mean 'size'?"),
+        ({"mass": {"pam": 1}}, "mass: no link 'pam'; did you mean 'palm'"),
+        ({"drop": {"pam": ["x.dae"]}}, "drop: no link 'pam'"),
+        ({"scaling": {"disk": {"by": "size"}}}, "scaling: no link 'disk'; did you mean 'disc'"),
+        ({"scaling": {"disc": {"by": "sise"}}}, "scaling: no parameter 'sise'; did you mean"),
     ],
 )
-def test_scaling_of_unknown_links_or_parameters_is_an_error(real, scaling, message):
-    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
-    with pytest.raises(PartError) as caught:
-        real(parameters=size, scaling=scaling)
-    assert message in str(caught.value)
+def test_unknown_links_or_parameters_of_real_parts_are_errors(real, changes, message):
+    with pytest.raises(PartError, match=message):
+        real(parameters=SIZE, **changes)
