@@ -106,15 +106,14 @@ def test_existing_primitives_are_unchanged():
     assert len(fit_shapes(shapes, FitOptions(max_primitives=1)).primitives) == 1
 
 
-def test_enclosing_primitives_contain_every_vertex(tmp_path, wedge):
-    bent = trimesh.util.concatenate(
-        [
-            trimesh.creation.box((0.4, 0.1, 0.1)),
-            trimesh.creation.box(
-                (0.1, 0.1, 0.4), trimesh.transformations.translation_matrix([0.15, 0, 0.15])
-            ),
-        ]
-    )
+def with_bar(mesh, size, at):
+    """Return a mesh with a box beside it."""
+    bar = trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+    return trimesh.util.concatenate([mesh, bar])
+
+
+def test_enclosing_primitives_contain_every_vertex(tmp_path):
+    bent = with_bar(trimesh.creation.box((0.4, 0.1, 0.1)), (0.1, 0.1, 0.4), (0.15, 0, 0.15))
     shape = mesh_shape(tmp_path, bent)
     one, three = (
         fit_shapes([shape], FitOptions(max_primitives=k, iou=0.95, enclose=True)) for k in (1, 3)
@@ -128,14 +127,7 @@ def test_enclosing_primitives_contain_every_vertex(tmp_path, wedge):
 
 @pytest.mark.slow
 def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
-    bent = trimesh.util.concatenate(
-        [
-            trimesh.creation.cylinder(0.05, 0.4),
-            trimesh.creation.box(
-                (0.3, 0.08, 0.08), trimesh.transformations.translation_matrix([0.15, 0, 0.2])
-            ),
-        ]
-    )
+    bent = with_bar(trimesh.creation.cylinder(0.05, 0.4), (0.3, 0.08, 0.08), (0.15, 0, 0.2))
     shape = mesh_shape(tmp_path, bent)
     fits = [fit_shapes([shape], FitOptions(max_primitives=k)) for k in (1, 2, 8)]
     scores = [fit.quality.iou for fit in fits]
@@ -162,16 +154,12 @@ def test_replacing_collisions_preserves_masses_and_joints():
     primitive_robot = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
     written = as_written(meshes)
     assert primitive_robot.joints == written.joints
-    assert [link.inertial for link in primitive_robot.links] == [
-        link.inertial for link in written.links
-    ]
-    assert [link.visuals for link in primitive_robot.links] == [
-        link.visuals for link in meshes.links
-    ]
-    assert not any(
-        isinstance(s.geometry, Mesh) for link in primitive_robot.links for s in link.collisions
-    )
-    assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
+    for link, before, original in zip(
+        primitive_robot.links, written.links, meshes.links, strict=True
+    ):
+        assert (link.inertial, link.visuals) == (before.inertial, original.visuals)
+    collisions = [s for link in primitive_robot.links for s in link.collisions]
+    assert not any(isinstance(shape.geometry, Mesh) for shape in collisions)
     assert list(SelfCollisionChecker(primitive_robot).penetrations([primitive_robot.home])) == [{}]
     assert morphgen.check(primitive_robot) == morphgen.check(meshes)
 
@@ -189,9 +177,8 @@ def test_fitted_capsules_survive_a_bundle(tmp_path, wedge):
 def test_visuals_are_replaced_on_request(tmp_path, wedge):
     shape = mesh_shape(tmp_path, wedge)
     robot = arm([shape])
-    seen = dataclasses.replace(
-        robot.links[0], visuals=(dataclasses.replace(shape, rgba=(1, 0, 0, 1)),)
-    )
+    visuals = (dataclasses.replace(shape, rgba=(1, 0, 0, 1)),)
+    seen = dataclasses.replace(robot.links[0], visuals=visuals)
     robot = dataclasses.replace(robot, links=(seen,))
     box = (Shape(Box((0.1, 0.1, 0.1))),)
     assert with_primitives(robot, {"l0": box}).links[0].visuals == seen.visuals

@@ -156,22 +156,15 @@ def test_a_box_with_a_missing_face_is_closed(axis, side):
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
-def test_unmerged_vertices_are_welded(size):
+def test_unmerged_vertices_are_welded_and_oriented_outwards(size):
     rng = np.random.default_rng(0)
     corners = size * box().triangles
+    corners[::3] = corners[::3, ::-1]
     mesh = soup(corners + rng.uniform(-1e-7, 1e-7, corners.shape) * size)
     solid = solid_of_mesh(mesh)
     assert solid.method == "repaired"
     assert solid.mesh.is_watertight
     assert solid.mesh.volume == pytest.approx(BOX_VOLUME * size**3, rel=1e-5)
-
-
-def test_unmerged_randomly_oriented_triangles_are_oriented_outwards():
-    corners = box().triangles.copy()
-    corners[::3] = corners[::3, ::-1]
-    solid = solid_of_mesh(soup(corners))
-    assert solid.mesh.is_watertight
-    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
 @pytest.mark.parametrize("gap", [1e-5, 1e-4, 1e-3])
@@ -288,11 +281,6 @@ def test_shapes_of_all_kinds_form_one_solid_with_the_least_reliable_method(tmp_p
     assert solid_of([opened, ragged, *closed]).method == "winding"
 
 
-def test_a_duplicated_shape_is_counted_once():
-    shape = Shape(Box(SIZE))
-    assert counted(solid_of([shape, shape])) == pytest.approx(BOX_VOLUME, rel=1e-9)
-
-
 def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path):
     ball = trimesh.creation.icosphere(7, 0.2)
     assert len(ball.faces) > MAX_FACES
@@ -343,10 +331,8 @@ def test_the_surface_of_overlapping_boxes_is_that_of_their_union():
         for at, size in (((-0.05, 0, 0), (0.2, 0.2, 0.2)), ((0.1, 0, 0), (0.2, 0.1, 0.1)))
     )
     np.testing.assert_allclose(np.minimum(big, small), 0, atol=1e-9)
-    assert {"big": (big < small).any(), "small": (small < big).any()} == {
-        "big": True,
-        "small": True,
-    }
+    assert (big < small).any()
+    assert (small < big).any()
 
 
 def test_surface_samples_are_reproducible():
