@@ -190,9 +190,26 @@ DOES_NOT_APPLY = {
 }
 
 
-def require_package(name):
+@pytest.fixture
+def in_scratch(tmp_path, monkeypatch):
+    """Wrappers write videos to the working directory and open windows."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def run_wrapped(name, make_wrapped):
+    """Run episodes in a wrapper; those of torch return no observations of the space, by design."""
     if name in NEEDS and find_spec(NEEDS[name]) is None:
         pytest.skip(f"{name} needs {NEEDS[name]}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        wrapped = make_wrapped()
+        if name not in ("ArrayConversion", "NumpyToTorch"):
+            return run(wrapped)
+        with closing(wrapped):
+            seen, _ = wrapped.reset(seed=0)
+            seen, *_ = wrapped.step(torch.zeros(wrapped.action_space.shape))
+            assert isinstance(seen["tokens"], torch.Tensor)
 
 
 def test_each_wrapper_of_gymnasium_is_tried_or_has_a_reason():
@@ -202,42 +219,19 @@ def test_each_wrapper_of_gymnasium_is_tried_or_has_a_reason():
 
 
 @pytest.mark.parametrize("name", sorted(WRAPPERS))
-def test_wrapper(name, tmp_path, monkeypatch):
-    require_package(name)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        if name in ("ArrayConversion", "NumpyToTorch"):  # no observations of the space, by design
-            with closing(WRAPPERS[name]()) as env:
-                seen, _ = env.reset(seed=0)
-                seen, *_ = env.step(torch.zeros(env.action_space.shape))
-                assert isinstance(seen["tokens"], torch.Tensor)
-            return
-        run(WRAPPERS[name]())
+def test_wrapper(name, in_scratch):
+    run_wrapped(name, WRAPPERS[name])
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 @pytest.mark.parametrize("name", sorted(OF_VECTORS))
-def test_vector_wrapper(name, mode, tmp_path, monkeypatch):
-    require_package(name)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+def test_vector_wrapper(name, mode, in_scratch):
     envs = make_vec(autoreset_mode=mode, render_mode="rgb_array", size=FRAME)
     if mode == "SameStep" and name.endswith("Observation"):
         with closing(envs), pytest.raises(ValueError, match="Expected autoreset_mode to be NEXT"):
             OF_VECTORS[name](envs)  # Gymnasium has these for the other mode alone
         return
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        wrapped = OF_VECTORS[name](envs)
-        if name in ("ArrayConversion", "NumpyToTorch"):
-            with closing(wrapped):
-                seen, _ = wrapped.reset(seed=0)
-                seen, *_ = wrapped.step(torch.zeros(wrapped.action_space.shape))
-                assert isinstance(seen["tokens"], torch.Tensor)
-            return
-        run(wrapped)
+    run_wrapped(name, lambda: OF_VECTORS[name](envs))
 
 
 CHANNELS = ObservationConfig(velocity=True, previous_action=True, points=5, ik=True, tool=True)

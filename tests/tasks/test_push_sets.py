@@ -29,11 +29,6 @@ SWEEPS = ("stick", "nlink")
 SHORT = "stick beam.length=0.15"
 
 
-@pytest.fixture
-def cache(tmp_path):
-    return tmp_path / "pushes"
-
-
 def sample_starts(words, cache, *, config=CONFIG, obstacles=False, seed=0, ground=0.0):
     return draw_goals(
         robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
@@ -135,7 +130,8 @@ def test_block_positions_and_orientations_are_random(cache):
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
 
 
-def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
+def test_robot_that_cannot_push_is_rejected_with_the_reason(tmp_path):
+    cache = tmp_path / "pushes"
     with pytest.raises(
         TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
     ):
@@ -152,7 +148,7 @@ def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
     assert not cache.exists()
 
 
-def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
+def test_obstacles_that_block_every_push_are_an_error(tmp_path, monkeypatch):
     def wall(*_):
         return (Block((9.0, 0.1, 0.1)),)
 
@@ -162,7 +158,7 @@ def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
     monkeypatch.setattr(obstacles, "draw_boxes", wall)
     monkeypatch.setattr(obstacles, "_draw_poses", across_the_way)
     with pytest.raises(BenchmarkError, match="of its first 20 goals only 0 or fewer: take"):
-        sample_starts("prims", cache, obstacles=True)
+        sample_starts("prims", tmp_path, obstacles=True)
 
 
 @pytest.mark.parametrize(

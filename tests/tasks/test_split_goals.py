@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from contextlib import closing
 from dataclasses import fields, replace
 
@@ -51,11 +52,6 @@ def test_unknown_sides_are_refused(side, tmp_path):
 def test_a_batch_is_of_a_split_and_not_of_its_name():
     with pytest.raises(TaskError, match="split 'interpolation/arm3/reach': expected a Split, as"):
         make_split_batch("interpolation/arm3/reach", "train", 10)
-
-
-@pytest.fixture
-def cache(tmp_path):
-    return tmp_path / "cache"
 
 
 def reaching(train=TRAIN, test=TEST, **more):
@@ -109,12 +105,12 @@ def test_every_member_has_a_set_in_train_test_order(cache):
     assert [one.certificate_errors for one in sample_sets(mixed(), cache)] == [None] * 3
 
 
-def test_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
+def test_robot_without_goals_does_not_stop_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 1)
     words = ("arm=arm3 ee=claw", TRAIN[1], TRAIN[0])
     few, part, fine = (member(each, task="reach") for each in words)
     part = replace(part, derivation="base=planar[top: ee=cubw]")
-    member_sets = sample_sets(split([few, part], [fine]), cache)
+    member_sets = sample_sets(split([few, part], [fine]), tmp_path)
     assert [one.goals is None for one in member_sets] == [True, True, False]
     assert [one.acceptance for one in member_sets] == [None, None, 1.0]
     few, part, fine = (one.error for one in member_sets)
@@ -127,12 +123,12 @@ def test_uncertified_set_reports_its_faults(cache, monkeypatch):
     line = "goal 3: its configuration is in collision"
     monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
     member_sets = sample_sets(reaching(), cache, certified=True)
-    assert {one.certificate_errors for one in member_sets} == {
-        ("goal 3: its configuration is in collision",)
-    }
+    assert {one.certificate_errors for one in member_sets} == {(line,)}
 
 
-def test_interrupted_run_reuses_completed_sets(cache, monkeypatch):
+def test_interrupted_run_reuses_completed_sets(tmp_path, monkeypatch):
+    cache = tmp_path / "cache"
+
     def interrupt(done, total):
         assert total == 4
         if done == 2:
@@ -176,9 +172,16 @@ def test_single_robot_has_the_same_set_as_in_a_split(cache):
     assert "no frame 'tool'" in wrong.error
 
 
+@pytest.fixture(scope="module")
+def built_once(tmp_path_factory):
+    return built(tmp_path_factory.mktemp("built"), mixed())
+
+
 @pytest.fixture
-def home(tmp_path):
-    return built(tmp_path / "here", mixed())
+def home(built_once, tmp_path):
+    """A built split without goals."""
+    shutil.copytree(built_once.parents[1], tmp_path / "here")
+    return tmp_path / "here" / built_once.relative_to(built_once.parents[1])
 
 
 def built(folder, which):
@@ -213,12 +216,8 @@ def test_builds_are_byte_identical(home, tmp_path):
     assert tree(home) == tree(other)
     write_goals(home, sample_sets(mixed(), tmp_path / "cache0"), RECIPE)
     assert tree(home) == tree(other)
-    assert sorted(path.name for path in (home / "goals").iterdir()) == [
-        "README.md",
-        "index.json",
-        "test",
-        "train",
-    ]
+    names = sorted(path.name for path in (home / "goals").iterdir())
+    assert names == ["README.md", "index.json", "test", "train"]
 
 
 def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
@@ -248,12 +247,9 @@ def test_index_describes_the_sets(home, cache):
     index = json.loads((home / "goals" / "index.json").read_text())
     assert (index["format"], index["seed"], index["reach"]["goals"]) == (2, 0, 12)
     for record, one in zip(index["sets"], member_sets, strict=True):
-        assert (record["robot"], record["side"], record["body"]) == (
-            one.robot,
-            one.side,
-            one.robot_hash,
-        )
-        assert (record["key"], record["seed"]) == (one.goals.key, one.goals.seed)
+        keys = ("robot", "side", "body", "key", "seed")
+        expected = [one.robot, one.side, one.robot_hash, one.goals.key, one.goals.seed]
+        assert [record[key] for key in keys] == expected
         assert record["acceptance"] == record["accepted"] / record["tried"] == one.acceptance
         assert (home / "goals" / record["file"]).is_file()
 
@@ -290,11 +286,9 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
 def test_missing_set_is_rejected_before_writing(home, cache):
     member_sets = sample_sets(mixed(), cache)
     before = tree(home)
-    without = [replace(one, goals=None, error="too few") for one in member_sets[:2]] + member_sets[
-        2:
-    ]
+    failed = [replace(one, goals=None, error="too few") for one in member_sets[:2]]
     with pytest.raises(BenchmarkError) as caught:
-        write_goals(home, without, RECIPE)
+        write_goals(home, [*failed, *member_sets[2:]], RECIPE)
     text = "train robot gantry-plane has no goal set: too few; nor has gantry-cylinder"
     assert str(caught.value) == text
     assert tree(home) == before
