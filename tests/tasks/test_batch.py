@@ -72,14 +72,6 @@ def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
     assert not step.terminated.any()
     assert not torch.equal(batch.field("goal"), goal)
     assert (batch.episode_step == 0).all()
-
-
-def test_final_observation_precedes_the_reset(build_batch):
-    batch = build_batch(config=replace(CONFIG, max_episode_steps=3))
-    batch.reset()
-    for _ in range(3):
-        goal = batch.field("goal").clone()
-        step = batch.step(Random(1).act(batch))
     assert torch.equal(step.final_observation["goal"], goal)
     assert torch.equal(step.observation["goal"], batch.field("goal"))
     assert not torch.equal(step.observation["tokens"], step.final_observation["tokens"])
