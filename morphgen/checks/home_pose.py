@@ -13,7 +13,7 @@ from morphgen.checks.joints import is_axis_valid
 from morphgen.checks.loaders import has_hull, is_readable
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Primitive, Shape, Sphere
+from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.mesh import load_mesh
@@ -132,15 +132,15 @@ def _are_primitives_near(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -
     import fcl  # here and below, because commands that check no robot should start quickly
 
     def objects(shapes: Sequence[Shape], T_a_link: Array) -> list[fcl.CollisionObject]:
-        poses = [
-            (shape.geometry, T_a_link @ shape.T_link_shape.matrix)
-            for shape in shapes
-            if not isinstance(shape.geometry, Mesh)
-        ]
-        return [
-            fcl.CollisionObject(_fcl_geometry(geometry), fcl.Transform(T[:3, :3], T[:3, 3]))
-            for geometry, T in poses
-        ]
+        found = []
+        for shape in shapes:
+            if not isinstance(shape.geometry, Mesh):
+                T = T_a_link @ shape.T_link_shape.matrix
+                # FCL has the same primitives, with the same names and dimensions.
+                make = getattr(fcl, type(shape.geometry).__name__)
+                geometry, T = make(*dimensions(shape.geometry)), fcl.Transform(T[:3, :3], T[:3, 3])
+                found.append(fcl.CollisionObject(geometry, T))
+        return found
 
     objects_b = objects(b, T_a_b)
     return any(
@@ -148,20 +148,6 @@ def _are_primitives_near(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -
         for object_a in objects(a, np.eye(4))
         for object_b in objects_b
     )
-
-
-def _fcl_geometry(primitive: Primitive) -> fcl.CollisionGeometry:
-    import fcl
-
-    match primitive:
-        case Box(size):
-            return fcl.Box(*size)
-        case Sphere(radius):
-            return fcl.Sphere(radius)
-        case Cylinder(radius, length):
-            return fcl.Cylinder(radius, length)
-        case Capsule(radius, length):
-            return fcl.Capsule(radius, length)
 
 
 def _triangles(shapes: Sequence[Shape], max_per_shape: int | None = None) -> _Triangles:

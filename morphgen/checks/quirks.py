@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -104,12 +105,8 @@ def _count_massless(root: etree._Element, urdf: Path) -> None:
             mass.set("value", repr(BOUND_MASS))
 
 
-def _zero_impossible(root: etree._Element, urdf: Path) -> None:
-    _set_inertias(root, lambda a, b, c: a < 0 or c > a + b, "0")
-
-
 def _set_inertias(
-    root: etree._Element, is_wrong: Callable[[float, float, float], bool], moment: str
+    root: etree._Element, urdf: Path, is_wrong: Callable[[float, float, float], bool], moment: str
 ) -> None:
     """Set the moments of inertia that are wrong; they are tested in ascending order."""
     for inertia in root.iterfind("link/inertial/inertia"):
@@ -150,22 +147,13 @@ def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
             mimic.set("joint", fixed)
 
 
-def _take_possible(root: etree._Element, urdf: Path) -> None:
-    # MuJoCo 4.0 wants a + b >= c, but rounding may have passed it already.
-    _set_inertias(root, lambda a, b, c: a + b <= c * (1 + 1e-9), "1")
-
-
-def _take_positive(root: etree._Element, urdf: Path) -> None:
-    _set_inertias(root, lambda a, b, c: a <= MIN_VALUE, "1")
-
-
 def _add_mass(root: etree._Element, urdf: Path) -> None:
     """Give mass and inertia to links that have none."""
     for link in root.iterfind("link"):
         mass = link.find("inertial/mass")
         if mass is None or float(mass.get("value") or 0) <= MIN_VALUE:
             _set_inertial(link, 1.0, np.eye(3))
-    _set_inertias(root, lambda a, b, c: c <= MIN_VALUE, "1")
+    _set_inertias(root, urdf, lambda a, b, c: c <= MIN_VALUE, "1")
 
 
 def _add_missing_inertia(root: etree._Element, urdf: Path) -> None:
@@ -217,6 +205,7 @@ def _drop_lost_mimics(root: etree._Element, urdf: Path) -> None:
                 joint.remove(mimic)
 
 
+_ZERO_IMPOSSIBLE = partial(_set_inertias, is_wrong=lambda a, b, c: a < 0 or c > a + b, moment="0")
 NO_QUATERNIONS = Quirk("reads no quat_xyzw", _drop_quaternions)
 COUNT_MASSLESS = Quirk("counts the inertia of links without mass", _count_massless)
 ZERO_RANGES = Quirk("reads a range that is missing as 0 to 0", _zero_ranges)
@@ -228,7 +217,7 @@ PYBULLET_QUIRKS = (
     NO_QUATERNIONS,
     COUNT_MASSLESS,
     Quirk("gives links without inertia 1 kg and 1 kg m^2", _add_inertia),
-    Quirk("sets inertia that no body has to zero", _zero_impossible),
+    Quirk("sets inertia that no body has to zero", _ZERO_IMPOSSIBLE),
     Quirk("limits continuous joints that name a range", _limit_continuous),
 )
 MUJOCO_QUIRKS = (
@@ -251,9 +240,16 @@ REFUSALS = (
         _add_mass,
         "mass and inertia of moving bodies",
     ),
-    Refusal("refuses inertia that no body has", _take_possible, r"A \+ B >= C"),
     Refusal(
-        "refuses inertia that is not positive", _take_positive, "must have positive eigenvalues"
+        "refuses inertia that no body has",
+        # Rounding may have passed a + b = c already.
+        partial(_set_inertias, is_wrong=lambda a, b, c: a + b <= c * (1 + 1e-9), moment="1"),
+        r"A \+ B >= C",
+    ),
+    Refusal(
+        "refuses inertia that is not positive",
+        partial(_set_inertias, is_wrong=lambda a, b, c: a <= MIN_VALUE, moment="1"),
+        "must have positive eigenvalues",
     ),
     Refusal(NO_INERTIA, _add_missing_inertia, "missing element: 'inertia'"),
     Refusal(NO_INERTIA, _add_missing_inertia, "Cannot load URDF file"),

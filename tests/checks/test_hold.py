@@ -35,15 +35,6 @@ def lever(effort):
 
 
 @needs_pybullet
-def test_an_arm_with_a_mimic_joint_holds_home(tmp_path):
-    rows = held(arm(), tmp_path)
-    assert list(rows) == ["mujoco (mjcf)", "pybullet (urdf)"]
-    assert all(row.passed and row.message == "" for row in rows.values())
-    assert rows["mujoco (mjcf)"].drift < 1e-6
-    assert rows["pybullet (urdf)"].drift < 1e-3
-
-
-@needs_pybullet
 @pytest.mark.parametrize(("effort", "holds"), [(9.0, False), (11.0, True)])
 def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path):
     rows = held(lever(effort), tmp_path)
@@ -56,22 +47,15 @@ def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path)
         assert row.causes == overloads(lever(effort), (0.0,)) == (cause,)
 
 
-@pytest.mark.parametrize("timestep", ["1e-9", "0.00001", "nan"])
-def test_a_tiny_time_step_is_not_simulated(timestep, tmp_path):
-    option = f'<option timestep="{timestep}"/></mujoco>'
-    row = held(lever(30.0), tmp_path, lambda text: text.replace("</mujoco>", option))[
-        "mujoco (mjcf)"
-    ]
-    assert row.passed is False
-    assert row.drift is None
-    assert re.search("timestep|time step", row.message)
-
-
 @needs_pybullet
 @pytest.mark.parametrize("make", [arm, lambda: lever(30.0), lambda: lever(None)])
-def test_joints_step_and_settle(make, tmp_path):
-    for row in held(make(), tmp_path).values():
+def test_joints_hold_step_and_settle(make, tmp_path):
+    rows = held(make(), tmp_path)
+    assert list(rows) == ["mujoco (mjcf)", "pybullet (urdf)"]
+    assert rows["mujoco (mjcf)"].drift < 1e-6
+    for row in rows.values():
         assert (row.passed, row.message) == (True, "")
+        assert row.drift < 1e-3
         assert row.follower_error < 0.002
         assert 0 < row.step_error <= 0.02
         assert 0 < row.settling_time < 0.5
@@ -141,28 +125,27 @@ def test_drift_is_the_distance_to_which_an_actuator_pulls(tmp_path):
     assert row.message == f"shoulder moves {row.drift:.3g} rad"
 
 
-def test_a_model_that_diverges_is_reported(tmp_path):
-    def stiffen(mjcf):
-        actuator = r'kp="[^"]*" kv="[^"]*"( ctrlrange="[^"]*") forcerange="[^"]*"'
-        return re.sub(actuator, r'kp="1e12" kv="0"\1', mjcf)
-
-    row = held(arm(), tmp_path, stiffen)
-    assert row["mujoco (mjcf)"].passed is False
-    assert row["mujoco (mjcf)"].message == "diverged"
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('"home"', '"start"', "no keyframe 'home'"),
         ('"elbow"', '"knee"', "lacks joints elbow"),
         ("<worldbody>", "<nonsense>", "MuJoCo: "),
+        (
+            r'kp="[^"]*" kv="[^"]*"( ctrlrange="[^"]*") forcerange="[^"]*"',
+            r'kp="1e12" kv="0"\1',
+            "div",
+        ),
+        *(
+            ("</mujoco>", f'<option timestep="{dt}"/></mujoco>', "(MuJoCo: .*|robot.xml: )time")
+            for dt in ("1e-9", "0.00001", "nan")
+        ),
     ],
 )
-def test_a_file_that_is_not_the_robots_fails(old, new, message, tmp_path):
-    row = held(arm(), tmp_path, lambda mjcf: mjcf.replace(old, new))["mujoco (mjcf)"]
+def test_a_file_that_cannot_be_simulated_fails(old, new, message, tmp_path):
+    row = held(arm(), tmp_path, lambda mjcf: re.sub(old, new, mjcf))["mujoco (mjcf)"]
     assert (row.passed, row.drift) == (False, None)
-    assert row.message.startswith(message)
+    assert re.match(message, row.message)
 
 
 def test_a_robot_without_joints_holds(tmp_path):
