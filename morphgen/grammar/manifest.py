@@ -64,11 +64,7 @@ MOUNT_YAW_PARAMETER = Parameter(
 
 
 def parse_value(text: str, parameter: Parameter, where: str) -> float:
-    """Parse a number with an optional unit, such as ``45deg`` or ``80mm``.
-
-    Returns:
-        The value in SI units.
-    """
+    """Return a number with an optional unit, such as ``45deg`` or ``80mm``, in SI units."""
     match = _VALUE.fullmatch(text.strip())
     if match is None:
         raise PartError(f"{where}={text}: not a number{_expected(parameter)}")

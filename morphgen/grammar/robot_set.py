@@ -41,7 +41,7 @@ from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.grammar_file import Grammar, grammar_from_text
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.sampling import Sample, sample_robot
-from morphgen.grammar.syntax import MAX_TEXT, parse_condition
+from morphgen.grammar.syntax import MAX_TEXT, Expression, parse_condition
 from morphgen.model.robot import Robot
 from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ray
 from morphgen.progress import own_progress
@@ -127,20 +127,21 @@ def make_serially(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]
 
 
 class RobotMaker:
-    """Draws and writes robots of a set."""
+    """Draws and writes robots of a set; every process that it is sent to loads the parts once."""
 
     def __init__(self, config: SetConfig) -> None:
         self._config = config
-        self._library: Library = default_library(config.library)
-        self._grammar: Grammar = grammar_from_text(config.grammar_text, config.grammar_name)
-        self._where = [parse_condition(text) for text in config.where]
+
+    @cached_property
+    def _inputs(self) -> tuple[Grammar, Library, list[Expression]]:
+        config = self._config
+        grammar = grammar_from_text(config.grammar_text, config.grammar_name)
+        return grammar, default_library(config.library), list(map(parse_condition, config.where))
 
     def make(self, index: int) -> Record:
         """Draw and write one robot; return its line of the index."""
-        config = self._config
-        sample = sample_robot(
-            self._grammar, self._library, index, seed=config.seed, where=self._where
-        )
+        config, (grammar, library, where) = self._config, self._inputs
+        sample = sample_robot(grammar, library, index, seed=config.seed, where=where)
         folder = config.folder / sample.robot.name
         if config.light:
             _write_light(sample, folder)
@@ -324,23 +325,9 @@ def make_in_processes(jobs: int) -> SetWorker:
     """Return a worker that makes robots in ``jobs`` processes of this machine."""
 
     def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-        return parallel_map(_LazyMaker(config), indices, jobs)
+        return parallel_map(RobotMaker(config).make, indices, jobs)
 
     return work
-
-
-class _LazyMaker:
-    """Makes robots of a set; it is sent to processes, which each load the parts once."""
-
-    def __init__(self, config: SetConfig) -> None:
-        self._config = config
-
-    @cached_property
-    def _maker(self) -> RobotMaker:
-        return RobotMaker(self._config)
-
-    def __call__(self, index: int) -> Record:
-        return self._maker.make(index)
 
 
 def make_on_ray(address: str | None) -> SetWorker:

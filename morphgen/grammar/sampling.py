@@ -85,14 +85,8 @@ def sample_robot(
     """Draw robot number ``index`` of a seed; see ``sample_robots``."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     choosers = (RecordedChooser(RandomChooser(rng)) for _ in range(MAX_ATTEMPTS))
-    result = _first_valid(
-        choosers,
-        grammar,
-        library,
-        (*grammar.wheres, *where),
-        name or robot_name(grammar, index),
-        index,
-    )
+    conditions, name = (*grammar.wheres, *where), name or robot_name(grammar, index)
+    result = _first_valid(choosers, grammar, library, conditions, name, index)
     if isinstance(result, Sample):
         return result
     reason, times = result.most_common(1)[0]
