@@ -42,12 +42,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from morphgen.benchmark.difficulty import DIGITS
-from morphgen.benchmark.robot_factory import ComposedRecipe, RobotFactory, members
+from morphgen.benchmark.generate import ComposedRecipe, RobotFactory, members
 from morphgen.benchmark.similarity import MEASURES, most_alike
 from morphgen.benchmark.split import Member, Split
 from morphgen.benchmark.split_file import read_split
-from morphgen.benchmark.survey import Fault, SplitSurvey, survey_split
+from morphgen.benchmark.survey import DIFFICULTY_DIGITS, Fault, SplitSurvey, survey_split
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
@@ -144,7 +143,7 @@ def compare(policies: list[Policy], survey: SplitSurvey) -> Iterator[Row]:
                 alike = survey.by_measure(name)[trained, tested]
                 best = most_alike(alike, name)
                 assert best is not None, f"no training robot of {policy.variant} has a workspace"
-                values[name] = round(float(alike[best]), DIGITS)
+                values[name] = round(float(alike[best]), DIFFICULTY_DIGITS)
             values |= {"joints": stats[tested].movable_to_tool, "reach": stats[tested].reach}
             robot = policy.test[key].name
             yield Row(policy.variant, policy.robots, policy.seed, robot, success, values)

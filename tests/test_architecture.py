@@ -169,7 +169,7 @@ def test_pybullet_processes_load_few_packages():
 @pytest.mark.parametrize(
     "module",
     [
-        "benchmark.split_build",
+        "benchmark.split_folder",
         "fitting.token_shapes",
         "model.kinematics",
         "tasks.scenes.env_specs",

@@ -14,12 +14,11 @@ from morphgen.arguments import checked_signature, path_argument, truth, whole_nu
 from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
-from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds
 from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
+from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds
 from morphgen.benchmark.split import HOLD_OUT, Regime, Split, compose_side
 from morphgen.benchmark.split_file import require_split_name, split_paths, write_new_splits
-from morphgen.benchmark.split_folder import BuildSettings
-from morphgen.benchmark.split_source import read_split_or_folder
+from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
 from morphgen.benchmark.survey import statistics
 from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.benchmark.verify import Difference, compare_robots, verify

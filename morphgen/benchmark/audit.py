@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
-from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.similarity import MEASURES, most_alike
+from morphgen.benchmark.similarity import (
+    MEASURES,
+    NEAR_THRESHOLDS,
+    NearThresholds,
+    is_same_reach,
+    most_alike,
+)
 from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError

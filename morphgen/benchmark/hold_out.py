@@ -20,21 +20,19 @@ import numpy as np
 from morphgen.benchmark.generate import (
     MAX_COMPOSED,
     MAX_DRAWS,
-    RobotStream,
-    SplitRequest,
-    assemble_drawn,
-    require_size,
-)
-from morphgen.benchmark.near_duplicates import is_near
-from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_robots
-from morphgen.benchmark.robot_factory import (
     Candidate,
     DerivedRecipe,
     RobotFactory,
+    RobotStream,
     SampledRecipe,
+    SplitRequest,
     UnfitRobotError,
+    assemble_drawn,
     category_of,
+    require_size,
 )
+from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_robots
+from morphgen.benchmark.similarity import is_near
 from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 from morphgen.errors import BenchmarkError, PartError, nearest
 from morphgen.formats.rounding import format_number

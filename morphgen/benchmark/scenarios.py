@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from morphgen.benchmark.robot_factory import (
+from morphgen.benchmark.generate import (
     Candidate,
     ComposedRecipe,
     RobotFactory,

@@ -1,4 +1,4 @@
-"""Read a split folder: a split with the files of all its robots, see ``split_build``.
+"""Build and read split folders: a split with the files of all its robots.
 
 split.yaml         the split
 robots.jsonl       one line per robot, train robots first
@@ -16,18 +16,31 @@ import io
 import json
 import math
 import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
+from os import PathLike
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import SIDES, Member, Side, Split, sided_members, split_id
+from morphgen.benchmark.split import (
+    SIDES,
+    Member,
+    Side,
+    Split,
+    compose_member,
+    sided_members,
+    split_id,
+)
+from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.benchmark.survey import robot_stats
-from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, tokens
+from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, require_max_links, tokens
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
@@ -35,6 +48,7 @@ from morphgen.formats.bundle import (
     CARD,
     PICTURE,
     URDF,
+    bundle_folder,
     card_text,
     file_findings,
     robot_card,
@@ -42,11 +56,20 @@ from morphgen.formats.bundle import (
     write_bundle,
 )
 from morphgen.formats.data_files import parse_json, read_json, read_text
-from morphgen.formats.files import replacing_folder
+from morphgen.formats.files import (
+    file_sha256,
+    folder_hashes,
+    locked_folder,
+    partial_path,
+    replacing_folder,
+    write_atomic,
+)
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_npz
+from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import DERIVATION, light_urdf
 from morphgen.model.robot import Robot
+from morphgen.processes import parallel_map
 from morphgen.typing import Array
 
 SPLIT_FILE = "split.yaml"
@@ -56,6 +79,8 @@ ROBOTS_DIR = "robots"
 README_FILE = "README.md"
 BUILD_FILE = "build.json"
 SUMS_FILE = "SHA256SUMS"
+ARCHIVE_SUFFIX = ".zip"
+"""Suffix of the archive of a release, see ``morphgen.benchmark.release``."""
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -477,3 +502,170 @@ def same(a: object, b: object) -> bool:
     if isinstance(a, float) and isinstance(b, float):
         return math.isclose(a, b, rel_tol=_REL_TOL, abs_tol=_ABS_TOL)
     return a == b
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """Result of a build."""
+
+    folder: Path
+    num_written: int
+    """Number of robots that were written."""
+    num_kept: int
+    """Number of robots that an earlier build had written."""
+
+
+def build_split(
+    split: Split,
+    folder: Path,
+    library: Library,
+    *,
+    jobs: int = 1,
+    settings: BuildSettings = BUNDLED,
+) -> BuildReport:
+    """Write a split and all its robots to ``folder / split.name``.
+
+    Robots that an interrupted build has written are kept if they are correct. The same split gives
+    the same bytes.
+    """
+    split_folder = split_folder_path(split, folder)
+    members = unique_robots(split)
+    with _writing(split_folder), _removed_if_empty(split_folder):
+        _prepare(split_folder, split, settings)
+        with locked_folder(split_folder):
+            (split_folder / SUMS_FILE).unlink(missing_ok=True)
+            for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
+                shutil.rmtree(leftover, ignore_errors=True)
+            writer = _RobotWriter(library.folders, split_folder, settings, split.max_links)
+            results = parallel_map(writer, members, jobs)
+            robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
+            _finish(split_folder, split, settings, robots)
+    num_written = sum(robot.is_new for robot in robots.values())
+    return BuildReport(split_folder, num_written, len(robots) - num_written)
+
+
+def split_folder_path(split: Split, folder: Path) -> Path:
+    """Return the folder of a split in a parent folder."""
+    for name in split.name.split("/"):
+        folder = bundle_folder(folder, name)
+    return folder
+
+
+@dataclass(frozen=True, eq=False)
+class _WrittenRobot:
+    """A robot that was written or kept."""
+
+    is_new: bool
+    data: RobotData
+    hashes: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _RobotWriter:
+    """Write the folder of a member; sent to worker processes."""
+
+    folders: tuple[Path, ...]
+    split_folder: Path
+    settings: BuildSettings
+    max_links: int
+
+    @cached_property
+    def library(self) -> Library:
+        return Library(self.folders)
+
+    def __call__(self, member: Member) -> _WrittenRobot:
+        robot = compose_member(member, self.library)
+        require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
+        folder = bundle_folder(self.split_folder / ROBOTS_DIR, member.name)
+        light, picture = self.settings.light, self.settings.picture
+        is_kept = not differences(folder, robot, light=light) and is_current(
+            folder, light=light, picture=picture
+        )
+        if not is_kept:
+            write_robot(robot, folder, light=light, picture=picture)
+        return _WrittenRobot(
+            not is_kept, robot_data(robot, self.folders, self.max_links), folder_hashes(folder)
+        )
+
+
+def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
+    """Create the folder, or check that it has the same split with the same settings."""
+    texts = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
+    if not (split_folder / BUILD_FILE).is_file():
+        leftover = {partial_path(split_folder / BUILD_FILE)}
+        if split_folder.exists() and not (
+            split_folder.is_dir() and leftover >= set(split_folder.iterdir())
+        ):
+            raise BenchmarkError(
+                f"{split_folder} exists and is no built split (no {BUILD_FILE}); name another "
+                "folder"
+            )
+        split_folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(split_folder / BUILD_FILE, texts[BUILD_FILE])
+    existing = read_json(split_folder / BUILD_FILE)
+    if not isinstance(existing, dict):
+        raise BenchmarkError(
+            f"{split_folder / BUILD_FILE}: expected an object, not {type(existing).__name__}"
+        )
+    for key, value in json.loads(texts[BUILD_FILE]).items():
+        if existing.get(key) != value:
+            raise BenchmarkError(
+                f"{split_folder} holds another build: its {key} is {existing.get(key)!r}, not "
+                f"{value!r}; name another folder"
+            )
+    write_atomic(split_folder / SPLIT_FILE, texts[SPLIT_FILE])
+
+
+def _finish(
+    split_folder: Path, split: Split, settings: BuildSettings, robots: Mapping[str, _WrittenRobot]
+) -> None:
+    """Write the files of the whole split, the hashes last."""
+    known = {robot_hash: robot.data for robot_hash, robot in robots.items()}
+    write_atomic(split_folder / ROBOTS_FILE, records_text(split, known))
+    write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
+    write_atomic(split_folder / README_FILE, readme_text(split, settings))
+    single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
+    sums = {name: file_sha256(split_folder / name) for name in single}
+    paths = robot_paths(split)
+    for robot_hash, robot in robots.items():
+        sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}
+    write_atomic(split_folder / SUMS_FILE, sums_text(sums))
+
+
+@contextmanager
+def _removed_if_empty(split_folder: Path) -> Iterator[None]:
+    """If a new folder gets no robot, delete it: it would block a build of the corrected split."""
+    is_new = not split_folder.exists()
+    try:
+        yield
+    except BaseException:
+        robots = split_folder / ROBOTS_DIR
+        if is_new and not any(path.name[0] != "." for path in robots.glob("*")):
+            shutil.rmtree(split_folder, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def _writing(split_folder: Path) -> Iterator[None]:
+    """Convert an ``OSError`` to an error of one line."""
+    try:
+        yield
+    except OSError as error:
+        path = error.filename or split_folder
+        raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
+
+
+def is_archive(path: Path) -> bool:
+    """Return whether a path is named as an archive and is not a folder."""
+    return path.suffix == ARCHIVE_SUFFIX and not path.is_dir()
+
+
+def read_split_or_folder(name: str | PathLike[str]) -> tuple[Split, Path | None]:
+    """Return a split by its name, its file or its built folder; and that folder."""
+    folder = Path(name)
+    if is_archive(folder):
+        raise BenchmarkError(f"{folder}: the archive of a release; unpack it, and name the folder")
+    if not folder.is_dir():
+        return read_split(str(name)), None
+    require_split_folder(folder)
+    return read_split(folder / SPLIT_FILE), folder

@@ -12,20 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.difficulty import (
-    STRUCTURAL,
-    RobotDifficulty,
-    nearest_column,
-    structural_cells,
-    survey_difficulty,
-    train_similarity,
-)
 from morphgen.benchmark.licences import licenced_parts
-from morphgen.benchmark.release_file import (
+from morphgen.benchmark.release import (
     DIFFICULTY_FILE,
     LICENCES_FILE,
     RELEASE_FILE,
-    is_archive,
     is_release,
     opened_folder,
     read_release,
@@ -42,6 +33,7 @@ from morphgen.benchmark.split_folder import (
     TOKENS_FILE,
     RobotData,
     differences,
+    is_archive,
     read_records,
     read_settings,
     read_sums,
@@ -53,7 +45,17 @@ from morphgen.benchmark.split_folder import (
     same,
     token_tables,
 )
-from morphgen.benchmark.survey import Fault, SplitSurvey, survey_split
+from morphgen.benchmark.survey import (
+    STRUCTURAL,
+    Fault,
+    RobotDifficulty,
+    SplitSurvey,
+    nearest_column,
+    structural_cells,
+    survey_difficulty,
+    survey_split,
+    train_similarity,
+)
 from morphgen.benchmark.tokens import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_json, read_text

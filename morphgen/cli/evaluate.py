@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 def rules_of(words: Sequence[str]) -> EvalProtocol:
     """Return the rules of the release that ``--split`` names, else the default ones."""
-    from morphgen.benchmark.release_file import is_release, read_release
+    from morphgen.benchmark.release import is_release, read_release
     from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
 
     folder = Path(words[0]) if len(words) == 1 else None

@@ -22,10 +22,9 @@ from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit
-    from morphgen.benchmark.difficulty import BaselineResults, RobotDifficulty
-    from morphgen.benchmark.near_duplicates import NearThresholds
+    from morphgen.benchmark.similarity import NearThresholds
     from morphgen.benchmark.split import Member, Split
-    from morphgen.benchmark.survey import PaperRow
+    from morphgen.benchmark.survey import BaselineResults, PaperRow, RobotDifficulty
     from morphgen.benchmark.verify import Difference
     from morphgen.model.findings import Finding
     from morphgen.tasks.goals.split_goals import GoalResult, SplitGoals
@@ -68,7 +67,7 @@ def goals(args: argparse.Namespace) -> int:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
-        from morphgen.benchmark.split_source import read_split_or_folder
+        from morphgen.benchmark.split_folder import read_split_or_folder
 
         split, _ = read_split_or_folder(args.words[0])
         results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
@@ -191,7 +190,7 @@ def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
     from morphgen.benchmark.audit import audit
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
-    from morphgen.benchmark.split_source import read_split_or_folder
+    from morphgen.benchmark.split_folder import read_split_or_folder
 
     near = _near(args.near)
     split, folder = read_split_or_folder(args.split)
@@ -213,7 +212,7 @@ def audit(args: argparse.Namespace) -> int:
 
 
 def _near(text: str | None) -> NearThresholds:
-    from morphgen.benchmark.near_duplicates import NEAR_THRESHOLDS, NearThresholds
+    from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds
 
     if text is None:
         return NEAR_THRESHOLDS
@@ -411,7 +410,7 @@ def verify(args: argparse.Namespace) -> int:
 )
 def difficulty(args: argparse.Namespace) -> None:
     """Measure the robots of splits, print a table per split and write the file."""
-    from morphgen.benchmark.difficulty import difficulty_csv, split_difficulty
+    from morphgen.benchmark.survey import difficulty_csv, split_difficulty
     from morphgen.formats.files import require_writable_file, write_file
 
     if args.csv is not None:
@@ -433,7 +432,7 @@ def difficulty(args: argparse.Namespace) -> None:
 
 def _splits(names: Sequence[str]) -> list[Split]:
     """Return the splits; two of one name could not be told apart in the rows."""
-    from morphgen.benchmark.split_source import read_split_or_folder
+    from morphgen.benchmark.split_folder import read_split_or_folder
 
     words: dict[str, str] = {}
     splits = []
@@ -467,7 +466,7 @@ def _difficulty_text(
     files: Sequence[str],
 ) -> str:
     """Return a table per split, each with the baselines of its tasks, and the written files."""
-    from morphgen.benchmark.difficulty import difficulty_table
+    from morphgen.benchmark.survey import difficulty_table
 
     parts = []
     for split in splits:

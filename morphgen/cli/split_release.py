@@ -15,8 +15,8 @@ from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.difficulty import BaselineResults
     from morphgen.benchmark.split import Split
+    from morphgen.benchmark.survey import BaselineResults
     from morphgen.rl.scores.leaderboard import References
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
@@ -130,7 +130,7 @@ def release(args: argparse.Namespace) -> None:
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
     """Return what the release lacks that its users may expect."""
-    from morphgen.benchmark.release_file import SUBMISSIONS_DIR
+    from morphgen.benchmark.release import SUBMISSIONS_DIR
     from morphgen.tasks.goals.eval_protocol import tasks_of_split
     from morphgen.tasks.registry import TASKS
 
@@ -247,14 +247,13 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
     from importlib.metadata import version
 
-    from morphgen.benchmark.release_file import (
-        is_archive,
+    from morphgen.benchmark.release import (
         is_release,
         opened_folder,
         read_release,
     )
     from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.split_folder import SPLIT_FILE
+    from morphgen.benchmark.split_folder import SPLIT_FILE, is_archive
     from morphgen.benchmark.verify import require_unchanged
     from morphgen.rl.scores.leaderboard import References, read_references
     from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from

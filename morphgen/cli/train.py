@@ -142,7 +142,7 @@ def split_option(purpose: str) -> Option:
 
 def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
     """Return the robots that a split, or a robot and ``task=NAME``, describe."""
-    from morphgen.benchmark.split_source import read_split_or_folder
+    from morphgen.benchmark.split_folder import read_split_or_folder
     from morphgen.rl.runs.robot_source import robot_source, split_source
     from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.robot_factory import RobotFactory, SampledRecipe, numbered_name
-from morphgen.benchmark.robot_factory import members as factory_members
+from morphgen.benchmark.generate import RobotFactory, SampledRecipe, numbered_name
+from morphgen.benchmark.generate import members as factory_members
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import Member, Side, Split, compose_member, split_id
 from morphgen.benchmark.split_file import parse_split, read_split, split_names, split_text

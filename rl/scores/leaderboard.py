@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 from tabulate import tabulate
 
-from morphgen.benchmark.difficulty import BaselineResult, BaselineResults
-from morphgen.benchmark.release_file import SCORES_FILE, SUBMISSIONS_DIR
+from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
 from morphgen.benchmark.split import SIDES, Side, Split, split_id
+from morphgen.benchmark.survey import BaselineResult, BaselineResults
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.library import Library
 from morphgen.rl.baselines import BASELINES

@@ -1,6 +1,6 @@
 """Make a release of a split: its folder with goal sets, licences, scores and descriptions, zipped.
 
-See ``morphgen.benchmark.release_file`` for the files. The same inputs give the same bytes.
+See ``morphgen.benchmark.release`` for the files. The same inputs give the same bytes.
 """
 
 from __future__ import annotations
@@ -14,29 +14,41 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.difficulty import BaselineResults, difficulty_csv, survey_difficulty
 from morphgen.benchmark.licences import licence_ids, licenced_parts, require_allowed
-from morphgen.benchmark.release_file import (
+from morphgen.benchmark.release import (
     CROISSANT_FILE,
     DIFFICULTY_FILE,
     LICENCES_FILE,
     LICENCES_TEXT,
     RELEASE_FILE,
     Release,
+    card_text,
+    croissant_text,
+    licences_json,
+    licences_text,
     release_text,
 )
-from morphgen.benchmark.release_texts import card_text, croissant_text, licences_json, licences_text
 from morphgen.benchmark.split import Split, split_id
-from morphgen.benchmark.split_build import BuildReport, build_split, split_folder_path
 from morphgen.benchmark.split_folder import (
     BUNDLED,
     README_FILE,
     SUMS_FILE,
+    BuildReport,
     BuildSettings,
+    build_split,
     read_sums,
+    split_folder_path,
     sums_text,
 )
-from morphgen.benchmark.survey import DIGITS, SplitSurvey, summarize_survey, survey_split
+from morphgen.benchmark.survey import (
+    DIGITS,
+    BaselineResults,
+    SplitSurvey,
+    difficulty_csv,
+    summarize_survey,
+    survey_difficulty,
+    survey_split,
+)
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.files import file_sha256, write_atomic
 from morphgen.formats.records import read_record

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.workspace import tool_reach
+from morphgen.benchmark.similarity import tool_reach
 from morphgen.errors import TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose

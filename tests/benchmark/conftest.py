@@ -3,7 +3,7 @@
 import pytest
 
 from helpers.splits import LIBRARY, combined
-from morphgen.benchmark.split_build import build_split
+from morphgen.benchmark.split_folder import build_split
 
 
 @pytest.fixture

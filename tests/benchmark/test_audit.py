@@ -7,8 +7,7 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.near_duplicates import NearThresholds, is_near
-from morphgen.benchmark.similarity import MEASURES, features
+from morphgen.benchmark.similarity import MEASURES, NearThresholds, features, is_near
 from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.survey import survey_split
 from morphgen.errors import BenchmarkError

@@ -7,19 +7,20 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.difficulty import (
+from morphgen.benchmark.similarity import MEASURES, features
+from morphgen.benchmark.split import SIDES, compose_member
+from morphgen.benchmark.survey import (
     STRUCTURAL,
     BaselineResult,
     NearestTrain,
     RobotDifficulty,
     difficulty_csv,
     difficulty_table,
+    robot_stats,
     split_difficulty,
     survey_difficulty,
+    survey_split,
 )
-from morphgen.benchmark.similarity import MEASURES, features
-from morphgen.benchmark.split import SIDES, compose_member
-from morphgen.benchmark.survey import robot_stats, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 

@@ -9,22 +9,20 @@ from scipy.spatial import Delaunay
 import morphgen
 from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
 from helpers.grammars import grammar, shipped
-from morphgen.benchmark import generate, robot_factory
+from morphgen.benchmark import generate
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import (
     Bound,
-    composition,
-    extrapolation,
-    interpolation,
-    parse_bound,
-)
-from morphgen.benchmark.regimes import parameters, regime_findings, structure
-from morphgen.benchmark.robot_factory import (
     ComposedRecipe,
     RobotFactory,
     SampledRecipe,
+    composition,
+    extrapolation,
+    interpolation,
     make_robots,
+    parse_bound,
 )
+from morphgen.benchmark.regimes import parameters, regime_findings, structure
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import cosine, features
 from morphgen.benchmark.split import compose_member
@@ -316,6 +314,6 @@ def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
 
 def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
-    monkeypatch.setattr(robot_factory, "check", lambda robot: findings)
+    monkeypatch.setattr(generate, "check", lambda robot: findings)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
         make_robots([ComposedRecipe(("base=gantry", "ee=cube"))], RobotFactory(LIBRARY.folders))

@@ -14,9 +14,8 @@ import pytest
 from helpers.commands import start, tree
 from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.split import compose_member
-from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import read_split, write_split
-from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, load_split_folder
+from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split, load_split_folder
 from morphgen.benchmark.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes

@@ -10,12 +10,11 @@ import pytest
 
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
 from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_names, split_text
-from morphgen.benchmark.split_folder import BuildSettings
+from morphgen.benchmark.split_folder import BuildSettings, build_split
 from morphgen.benchmark.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.progress import show_progress
 
 LIGHT = BuildSettings(light=True)
@@ -292,7 +291,7 @@ def test_an_exchanged_split_file_is_reported(whole):
         ("SHA256SUMS", None, "is not finished"),
         ("SHA256SUMS", b"abc\n", "SHA256SUMS:1: expected a hash, two spaces and a path"),
         ("split.yaml", None, "split.yaml: no such file"),
-        ("split.yaml", b"format: 1\n", "split.yaml:1: a split lacks"),
+        ("split.yaml", b"format: 1\n", "split.yaml:1: missing key"),
     ],
 )
 def test_unreadable_folders_are_errors(bundles, path, content, message):
@@ -300,7 +299,7 @@ def test_unreadable_folders_are_errors(bundles, path, content, message):
         (bundles / path).unlink()
     else:
         (bundles / path).write_bytes(content)
-    with pytest.raises(BenchmarkError, match=message):
+    with pytest.raises(MorphgenError, match=message):
         verify(bundles, LIBRARY)
 
 

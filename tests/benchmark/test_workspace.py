@@ -8,7 +8,7 @@ import pytest
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.workspace import density_overlap, shoulder, workspace
+from morphgen.benchmark.similarity import density_overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (

@@ -8,9 +8,8 @@ import pytest
 
 from helpers.commands import start
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_text
-from morphgen.benchmark.split_folder import BuildSettings
+from morphgen.benchmark.split_folder import BuildSettings, build_split
 from morphgen.tasks import free_space
 from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.registry import TASKS

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morphgen.benchmark import release_file, split, split_folder
+from morphgen.benchmark import release, split, split_folder
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
@@ -100,7 +100,7 @@ FORMATS = {
     runs.CHECKPOINT: runs.FORMAT,
     robot_source.FILE: robot_source.FORMAT,
     "episodes.csv.gz": "",
-    "release.json": release_file.FORMAT,
+    "release.json": release.FORMAT,
     "eval --submission": submission.FORMAT,
     ".npz": f"{episode.FORMAT}; 1 is read",
 }

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from helpers.submissions import EXPECTED, SPLIT, data
-from morphgen.benchmark.difficulty import BaselineResult
+from morphgen.benchmark.survey import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.rl.scores.episode_table import EPISODES, append_submission
 from morphgen.rl.scores.leaderboard import References, study_results

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.goal_sets import draw_goals
 from helpers.scenes import robot
-from morphgen.benchmark.workspace import workspace
+from morphgen.benchmark.similarity import workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits

@@ -12,8 +12,7 @@ import pytest
 from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.split_build import build_split
-from morphgen.benchmark.split_folder import BuildSettings, load_split_folder
+from morphgen.benchmark.split_folder import BuildSettings, build_split, load_split_folder
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.progress import show_progress

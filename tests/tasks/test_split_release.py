@@ -11,10 +11,10 @@ import yaml
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
-from morphgen.benchmark import release_file, release_texts
+from morphgen.benchmark import release as release_module
 from morphgen.benchmark import verify as release_checks
-from morphgen.benchmark.difficulty import BaselineResult, difficulty_csv, split_difficulty
-from morphgen.benchmark.release_file import (
+from morphgen.benchmark.release import (
+    CONFORMS_TO,
     CROISSANT_FILE,
     DIFFICULTY_FILE,
     LICENCES_FILE,
@@ -22,10 +22,15 @@ from morphgen.benchmark.release_file import (
     opened_folder,
     read_release,
 )
-from morphgen.benchmark.release_texts import CONFORMS_TO
 from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_folder import SUMS_FILE, BuildSettings, read_sums, sums_text
-from morphgen.benchmark.split_source import read_split_or_folder
+from morphgen.benchmark.split_folder import (
+    SUMS_FILE,
+    BuildSettings,
+    read_split_or_folder,
+    read_sums,
+    sums_text,
+)
+from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
@@ -118,10 +123,10 @@ def test_a_release_has_the_difficulty_of_every_robot(tmp_path, report, folder):
 
 
 def test_the_card_lists_a_bounded_number_of_test_robots(report, folder, monkeypatch):
-    monkeypatch.setattr(release_texts, "MAX_ROWS", 1)
+    monkeypatch.setattr(release_module, "MAX_ROWS", 1)
     rows = split_difficulty(combined(), LIBRARY)
     more = (*rows, replace(rows[-1], robot="another"))
-    text = release_texts.card_text(combined(), read_release(folder), [], [], more)
+    text = release_module.card_text(combined(), read_release(folder), [], [], more)
     assert "The table has 1 of 2 test robots." in text
     assert "another" not in text
 
@@ -273,7 +278,7 @@ def test_archives_that_are_no_release_are_refused(tmp_path, monkeypatch):
         with pytest.raises(BenchmarkError, match=rf"{name}.zip: ") as caught:
             verify(path, LIBRARY)
         assert "morphgen-" not in str(caught.value)  # the temporary folder
-    monkeypatch.setattr(release_file, "LIMITS", ZipLimits(10, 10))
+    monkeypatch.setattr(release_module, "LIMITS", ZipLimits(10, 10))
     with pytest.raises(BenchmarkError, match="more than 0 MB"), opened_folder(tmp_path / "two.zip"):
         raise AssertionError
 
