@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from morphgen.benchmark.tokens import MAX_LINKS
-from morphgen.errors import FormatError, TaskError, nearest, shortened
+from morphgen.errors import FormatError, MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic
 from morphgen.formats.records import Record, read_record
@@ -462,11 +462,8 @@ def read_config(folder: Path) -> RunConfig:
     try:
         data = read_json(path)
         _require_format(path, data)
-    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise TaskError(f"{path} is not the config of a run: {error}") from error
-    try:
         return config_from(data)
-    except TaskError as error:
+    except (MorphgenError, KeyError, TypeError) as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
 
 

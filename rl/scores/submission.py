@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from morphgen.benchmark.split import Side, Split, split_id
-from morphgen.errors import BenchmarkError, FormatError
+from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
 from morphgen.formats.records import FiniteNumber, Record, read_record
@@ -200,11 +200,7 @@ def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
     else:
         raise BenchmarkError(f"{path}: no such file or folder")
     for file in files:
-        try:
-            data = read_json(file)
-        except FormatError as error:  # which names the file
-            raise BenchmarkError(str(error)) from error
-        yield file, data
+        yield file, read_json(file)
 
 
 def is_submission(data: object) -> bool:
@@ -214,10 +210,7 @@ def is_submission(data: object) -> bool:
 
 def read_submission(path: Path) -> Submission:
     """Read a submission and check its form, not what it claims."""
-    try:
-        data = read_json(path)
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
+    data = read_json(path)
     if not is_submission(data):
         raise BenchmarkError(
             f"{path}: no submission; expected an object with the kind {KIND!r}, as morphgen eval "

@@ -162,9 +162,9 @@ def test_numbers_must_be_finite(tmp_path, value):
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "s.json"
     path.write_bytes(content.encode("latin-1"))
-    with pytest.raises(BenchmarkError, match=r"s\.json"):
+    with pytest.raises(MorphgenError, match=r"s\.json"):
         read_submission(path)
-    with pytest.raises(BenchmarkError, match="no such file"):
+    with pytest.raises(MorphgenError, match="no such file"):
         read_submission(tmp_path / "other.json")
 
 
