@@ -49,13 +49,20 @@ def run_here(command, monkeypatch):
     return exit_.value.code
 
 
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    """Return a folder with a copy of results/, for all commands: each table is read once."""
+    folder = tmp_path_factory.mktemp("copied")
+    shutil.copytree(ROOT / "results", folder / "results")
+    return folder
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_docs_have_the_numbers_of_a_stored_study(command, tmp_path, monkeypatch):
-    study = Path(re.search(r"--out (\S+)", command).group(1))
-    shutil.copytree(ROOT / study, tmp_path / study)
-    monkeypatch.chdir(tmp_path)
+def test_the_docs_have_the_numbers_of_a_stored_study(command, copied, monkeypatch):
+    monkeypatch.chdir(copied)
     assert run_here(command, monkeypatch) == 0
-    rows = json.loads((tmp_path / study / "results.json").read_text("utf-8"))["rows"]
+    study = re.search(r"--out (\S+)", command).group(1)
+    rows = json.loads((copied / study / "results.json").read_text("utf-8"))["rows"]
     means = {
         (row["split"], row["task"], row["method"]): {
             f"{side['mean']:{'.0%' if row['task'] == 'push' else '.1f'}}"
