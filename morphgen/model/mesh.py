@@ -55,6 +55,10 @@ class _Group:
     faces: NDArray[np.int64]
 
 
+_Content: TypeAlias = tuple[tuple[_Group, ...], tuple[str, ...], int]
+"""A file's triangles by colour, what is left out, and the number of pixels of its textures."""
+
+
 def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
     """Return the triangles of a mesh in the frame of its URDF ``<mesh>`` [m], scale applied.
 
@@ -152,15 +156,26 @@ def _scaled(
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-@lru_cache(maxsize=128)
-def _content(path: str, stamp: tuple[int, int]) -> tuple[tuple[_Group, ...], tuple[str, ...], int]:
-    """Return a file's triangles by colour, what is left out, and the pixels of its textures.
+def _content(path: str, stamp: tuple[int, int]) -> _Content:
+    """Return what a file holds; ``stamp`` voids the cache."""
+    content = _content_or_fault(path, stamp)
+    if isinstance(content, str):
+        raise MeshError(content)
+    return content
 
-    ``stamp`` voids the cache.
-    """
+
+@lru_cache(maxsize=128)
+def _content_or_fault(path: str, stamp: tuple[int, int]) -> _Content | str:
+    """Return what a file holds, or why it is refused: a large one is refused only once."""
+    try:
+        return _read_content(path)
+    except MeshError as error:
+        return str(error)
+
+
+def _read_content(path: str) -> _Content:
     from morphgen.model.mesh_files import read_mesh_file
 
-    del stamp
     content = read_mesh_file(Path(path))
     pieces: dict[Rgba | None, list[_Triangles]] = {}
     for rgba, triangles in content.pieces:

@@ -403,6 +403,21 @@ def many_links(count):
         ({"base": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         ({"bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         ({"base": " ", "bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
+        (
+            {"bar": " ", "tip": ""},
+            ('value="2"', 'value="0"'),
+            "refuses moving links without mass or inertia",
+            {"mujoco (urdf)"},
+        ),
+        *(
+            (
+                {},
+                (AXIS, f"{AXIS}<mimic {gone}/>"),
+                "refuses a joint that mimics a missing one",
+                {"usd"},
+            )
+            for gone in ('joint="gone"', 'joint="x" multiplier="2"', 'joint="y" offset="0.1"')
+        ),
         ({}, (AXIS, 2 * AXIS), REPEATED, {"mujoco (urdf)"}),
         ({}, (AXIS, AXIS + '<axis xyz="1 0 0"/>' + AXIS), REPEATED, {"mujoco (urdf)"}),
         ({}, (LIMIT, 2 * LIMIT), REPEATED, {"mujoco (urdf)"}),

@@ -10,9 +10,12 @@ import pytest
 import trimesh
 
 from helpers.collada import DAE
+from morphgen.checks import check
 from morphgen.errors import MeshError
-from morphgen.model.geometry import Mesh
+from morphgen.model import mesh_files
+from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.mesh import MeshPart, convex_hull, load_mesh, mesh_parts
+from morphgen.model.robot import Link, Robot
 
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
 
@@ -67,6 +70,20 @@ def test_a_mesh_is_read_once_until_its_file_changes(box: Path) -> None:
     trimesh.creation.box((1, 1, 1)).export(box)
     os.utime(box, ns=(1, 1))
     np.testing.assert_allclose(load_mesh(Mesh(box)).extents, (1, 1, 1))
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "dae"])
+def test_a_broken_mesh_is_read_once(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, reads = tmp_path / f"broken.{suffix}", []
+    path.write_text("v 0 0 nan\nf 1 1 1\n")
+    read = mesh_files.read_mesh_file
+    monkeypatch.setattr(mesh_files, "read_mesh_file", lambda file: reads.append(file) or read(file))
+    shape = Shape(Mesh(path))
+    robot = Robot("r", (Link("a", visuals=(shape,), collisions=(shape,)),))
+    assert "mesh-unreadable" in {finding.code for finding in check(robot)}
+    assert len(reads) == 1
 
 
 def test_relative_paths_follow_the_working_directory(
