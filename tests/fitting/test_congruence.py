@@ -1,4 +1,4 @@
-"""Congruence of the meshes of real links under motions, reflections and noise."""
+"""Poses of primitives that look alike, and congruence of meshes under motions and reflections."""
 
 import math
 
@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from morphgen.fitting.canonical import canonical
 from morphgen.fitting.congruence import congruence, moved, representatives
 from morphgen.fitting.quality import signed_distance
 from morphgen.grammar.library import default_library
@@ -238,3 +239,59 @@ def test_jaco_has_congruent_halves_and_wrists_and_ur5_has_no_congruent_wrists():
     wrists = links("ur5")
     assert wrists["wrist_1_link"].faces.shape == wrists["wrist_2_link"].faces.shape
     assert congruence(wrists["wrist_1_link"], wrists["wrist_2_link"], tolerance=2e-3) is None
+
+
+RNG = np.random.default_rng(0)
+POINTS = RNG.uniform(-0.5, 0.5, (500, 3))
+GEOMETRIES = (Box((0.1, 0.2, 0.4)), Cylinder(0.06, 0.3), Capsule(0.05, 0.2), Sphere(0.1))
+
+
+def turned(geometry, rotation, position=(0.1, -0.05, 0.02)):
+    w, x, y, z = rotation.as_quat(scalar_first=True, canonical=True).tolist()
+    return Shape(geometry, Pose(position, (w, x, y, z)))
+
+
+@pytest.mark.parametrize("geometry", GEOMETRIES, ids=lambda g: type(g).__name__)
+def test_canonicalization_preserves_the_solid_and_is_idempotent(geometry):
+    for rotation in Rotation.random(20, random_state=1):
+        shape = turned(geometry, rotation)
+        canonical_shape = canonical(shape)
+        assert signed_distance([canonical_shape], POINTS) == pytest.approx(
+            signed_distance([shape], POINTS), abs=1e-9
+        )
+        again = canonical(canonical_shape)
+        assert again.geometry == canonical_shape.geometry
+        assert again.T_link_shape.matrix == pytest.approx(
+            canonical_shape.T_link_shape.matrix, abs=1e-9
+        )
+
+
+def test_equivalent_boxes_have_one_canonical_form():
+    R = Rotation.from_rotvec((0.2, 0.1, -0.3))
+    shapes = []
+    for quarter in Rotation.create_group("O"):
+        edges = np.abs(quarter.inv().as_matrix()) @ (0.1, 0.2, 0.4)
+        shapes.append(canonical(turned(Box(tuple(edges.round(9).tolist())), R * quarter)))
+    for shape in shapes:
+        assert shape.geometry == Box((0.1, 0.2, 0.4))
+        assert shape.T_link_shape.matrix == pytest.approx(shapes[0].T_link_shape.matrix, abs=1e-9)
+
+
+def test_equivalent_cylinders_have_one_canonical_form():
+    R = Rotation.from_rotvec((0.4, -0.2, 0.3))
+    flip = Rotation.from_rotvec((np.pi, 0, 0))
+    poses = [
+        canonical(turned(Cylinder(0.1, 0.3), R * about * over)).T_link_shape
+        for about in Rotation.from_rotvec([(0, 0, a) for a in (0, 1, 2, 3)])
+        for over in (Rotation.identity(), flip)
+    ]
+    for pose in poses:
+        assert pose.matrix == pytest.approx(poses[0].matrix, abs=1e-8)
+    assert poses[0].quaternion[3] == 0
+
+
+def test_spheres_have_no_rotation_and_meshes_are_unchanged(tmp_path):
+    R = Rotation.from_rotvec((1.0, 2.0, 0.5))
+    assert canonical(turned(Sphere(0.1), R)).T_link_shape == Pose((0.1, -0.05, 0.02))
+    mesh = turned(Mesh(tmp_path / "m.stl"), R)
+    assert canonical(mesh) is mesh

@@ -1,16 +1,22 @@
-"""The primitive that represents each link in the tokens."""
+"""The primitive that represents each link in the tokens, and its fit to several primitives."""
 
 import json
+import math
+from dataclasses import replace
+from functools import lru_cache
 
+import numpy as np
 import pytest
 import trimesh
 
 import morphgen
 from morphgen.errors import FormatError
 from morphgen.fitting import token_shapes as module
-from morphgen.fitting.token_shapes import token_shapes
+from morphgen.fitting.quality import quality
+from morphgen.fitting.solid import solid_of
+from morphgen.fitting.token_shapes import fit_composite, token_shapes
 from morphgen.grammar.library import default_library
-from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import Joint, Link, Robot
 
 FOLDERS = default_library(()).folders
@@ -113,3 +119,97 @@ def test_a_cache_that_cannot_be_written_is_reported_once(cache, caplog):
     assert token_shapes(robot_of(*shapes))
     messages = [record.getMessage() for record in caplog.records]
     assert [f"cannot keep fits in {cache}/morphgen/" in text for text in messages] == [True]
+
+
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2, 3, 4, 5))]
+"""Links of two and of three primitives; more of the same are slow."""
+
+
+def drawn(seed, noise=0.0):
+    """Return two or three overlapping rotated primitives."""
+    rng = np.random.default_rng(seed)
+    shapes = []
+    for _ in range(2 + seed % 2):
+        a, b, c = rng.uniform(0.05, 0.2, 3).tolist()
+        geometry = [Box((a, b, c)), Cylinder(a / 2, 2 * b), Sphere(a)][rng.integers(3)]
+        xyz = rng.uniform(-0.08, 0.08, 3)
+        rpy = rng.uniform(-1, 1, 3)
+        xyz, rpy = (each * (1 + noise) for each in (xyz, rpy))
+        shapes.append(Shape(geometry, Pose.from_xyz_rpy(tuple(xyz), tuple(rpy))))
+    return shapes
+
+
+@lru_cache
+def fitted(seed):
+    return fit_composite(drawn(seed))
+
+
+def overlap(shapes, *found):
+    return quality(solid_of(shapes), found, volume_points=2**15).iou
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_fit_overlaps_at_least_as_well_as_any_primitive_of_the_link(seed):
+    shapes = drawn(seed)
+    best_overlap = max(overlap(shapes, shape) for shape in shapes)
+    assert overlap(shapes, fitted(seed)) > best_overlap - 0.01
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_last_bits_of_numbers_do_not_change_the_fit(seed):
+    assert fitted(seed) == fit_composite(drawn(seed, noise=3e-16))
+
+
+def test_two_rails_are_fitted_by_one_of_them():
+    rails = [Shape(Box((1.1, 0.03, 0.03)), Pose((0.0, y, 1.05))) for y in (0.6, -0.6)]
+    assert fit_composite(rails) == rails[0]
+
+
+def test_the_sides_of_the_fit_are_flush_with_the_link():
+    prongs = [Shape(Box((0.02, 0.01, 0.04)), Pose((0.0, y, 0.02))) for y in (0.02, -0.02)]
+    bridge = Shape(Box((0.02, 0.03, 0.01)), Pose((0.0, 0.0, 0.035)))
+    fit = fit_composite([*prongs, bridge])
+    assert fit == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
+
+
+@pytest.mark.slow
+def test_two_collinear_rods_are_fitted_by_one_rod():
+    turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
+    rod = Shape(Cylinder(0.02, 0.2), turned)
+    fit = fit_composite(
+        [rod, replace(rod, T_link_shape=replace(turned, position=(0.25, 0.0, 0.0)))]
+    )
+    assert fit.geometry == Cylinder(0.02, pytest.approx(0.35, abs=1e-5))
+    assert fit.T_link_shape.position == pytest.approx((0.175, 0.0, 0.0), abs=1e-5)
+    assert np.abs(fit.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_mirrored_fingers_have_mirrored_primitives():
+    def finger(side):
+        blocks = [((0.022, 0.015, 0.02), (0.0, 0.0185, 0.011), 0.0)]
+        blocks += [((0.0175, 0.007, 0.0235), (0.0, 0.0159, 0.02835), math.pi / 6)]
+        blocks += [((0.0175, 0.0152, 0.0185), (0.0, 0.00758, 0.04525), 0.0)]
+        return [
+            Shape(Box(size), Pose.from_xyz_rpy((x, side * y, z), (side * roll, 0.0, 0.0)))
+            for size, (x, y, z), roll in blocks
+        ]
+
+    left, right = (fit_composite(finger(side)) for side in (1, -1))
+    assert right.geometry.size == pytest.approx(left.geometry.size, abs=3e-4)
+    mirror = np.array([1, -1, 1])
+    assert mirror * right.T_link_shape.position == pytest.approx(
+        left.T_link_shape.position, abs=3e-4
+    )
+    assert overlap(finger(1), left) > 0.6
+
+
+def test_empty_and_flat_links_have_no_fit():
+    assert fit_composite([]) is None
+    assert fit_composite([Shape(Box((0.1, 0.1, 0.0)))]) is None
+
+
+def test_other_shapes_are_errors():
+    with pytest.raises(TypeError, match="Capsule"):
+        fit_composite([Shape(Capsule(0.1, 0.2))])

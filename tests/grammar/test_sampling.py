@@ -1,21 +1,24 @@
-"""Sampling is reproducible and yields only robots that pass the checks and conditions."""
+"""Sampling and mutation are reproducible and yield only robots that pass checks and conditions."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from helpers.grammars import LIBRARY, grammar, shipped, unphysical
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped, unphysical
 from morphgen.checks import check
-from morphgen.errors import MorphgenError
+from morphgen.errors import GrammarError, MorphgenError
+from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar import sampling
 from morphgen.grammar.analysis import check_grammar, count_structures
+from morphgen.grammar.derivation import difference
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
-from morphgen.grammar.sampling import SamplingError, robot_name, sample_robot, sample_robots
+from morphgen.grammar.sampling import SamplingError, mutate, robot_name, sample_robot, sample_robots
 from morphgen.grammar.syntax import parse_condition
 
 
@@ -174,3 +177,109 @@ def test_names_have_six_digits():
     assert robot_name(shipped("cubes"), 17) == "cubes-000017"
     (drawn,) = sample_robots(shipped("cubes"), LIBRARY, 1)
     assert 'robot name="cubes-000000"' in urdf_text(drawn.robot, str)
+
+
+def as_in_index(choices):
+    """Return choices as read back from a file."""
+    return json.loads(json.dumps({key: round_number(value) for key, value in choices.items()}))
+
+
+def neighbours(robot_grammar, origin, n, seed=0):
+    return list(
+        mutate(
+            robot_grammar,
+            LIBRARY,
+            as_in_index(origin.choices),
+            n,
+            seed=seed,
+            name=origin.robot.name,
+        )
+    )
+
+
+def assert_one_choice_differs(before, after):
+    changed = [key for key in before if key in after and before[key] != after[key]]
+    assert len(changed) == 1
+    opened = changed[0].rstrip("#")
+    assert all(key.startswith(opened) for key in before.keys() ^ after.keys())
+
+
+@pytest.mark.parametrize("category", [name for name in CATEGORIES if name != "panda_variations"])
+def test_a_neighbour_differs_in_one_choice_and_its_dependants(category):
+    grammar = shipped(category)
+    origin = sample_robot(grammar, LIBRARY, 3)
+    for neighbour in neighbours(grammar, origin, 5):
+        assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
+        assert neighbour.derivation != origin.derivation
+
+
+def test_all_other_values_are_unchanged_to_the_last_digit():
+    robot_grammar = grammar(
+        "let r = uniform(0.031234567, 0.04)",
+        "robot -> gantry(low=uniform(0.1, 0.2), stroke=r*17) plane(size=1.7*r/0.9)",
+    )
+    for index in range(10):
+        origin = sample_robot(robot_grammar, LIBRARY, index)
+        for neighbour in neighbours(robot_grammar, origin, 3, seed=index):
+            lines = difference(origin.derivation, neighbour.derivation)
+            names = {line[2:].split(" = ")[0] for line in lines}
+            assert names in ({"gantry.low"}, {"gantry.stroke", "plane.size"})
+
+
+def test_choices_rounded_in_a_file_are_kept():
+    robot_grammar = grammar(
+        "robot -> gantry plane(size=uniform(0.1, 0.2), mount_yaw=choice(60deg, 60deg, 30deg))"
+    )
+    turned = [
+        i for i in range(20) if max(sample_robot(robot_grammar, LIBRARY, i).choices.values()) > 1
+    ]
+    assert turned
+    for index in turned[:5]:
+        origin = sample_robot(robot_grammar, LIBRARY, index)
+        for neighbour in neighbours(robot_grammar, origin, 4):
+            assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
+
+
+def test_a_new_alternative_draws_its_own_parameters():
+    robot_grammar = grammar("robot -> gantry ee", "ee -> plane(size=uniform(0.1, 0.2)) | stick")
+    origin = next(
+        o
+        for o in (sample_robot(robot_grammar, LIBRARY, i) for i in range(9))
+        if "stick" in str(o.derivation)
+    )
+    for neighbour in neighbours(robot_grammar, origin, 3):
+        assert set(neighbour.choices) == {"robot/1.ee", "robot/1.ee/plane.size"}
+
+
+def test_neighbours_satisfy_the_conditions():
+    robot_grammar = grammar(
+        "robot -> post beam(length=uniform(0.1, 0.3)){2,5} jaw", "where 0.5 < reach < 0.9"
+    )
+    origin = sample_robot(robot_grammar, LIBRARY, 0)
+    drawn = neighbours(robot_grammar, origin, 10)
+    assert all(0.5 < neighbour.properties.reach < 0.9 for neighbour in drawn)
+    assert sum(len(neighbour.rejected) for neighbour in drawn) > 0
+
+
+def test_neighbours_depend_on_the_seed_not_on_their_number():
+    grammar = shipped("chain")
+    origin = sample_robot(grammar, LIBRARY, 0)
+    few, many = neighbours(grammar, origin, 2, seed=4), neighbours(grammar, origin, 5, seed=4)
+    assert [str(n.derivation) for n in few] == [str(n.derivation) for n in many[:2]]
+    assert [n.robot.name for n in few] == ["chain-000000-m0000", "chain-000000-m0001"]
+    other = neighbours(grammar, origin, 2, seed=5)
+    assert [str(n.derivation) for n in other] != [str(n.derivation) for n in few]
+
+
+def test_a_grammar_without_choices_has_no_neighbours():
+    with pytest.raises(GrammarError, match="leaves nothing to choose: no neighbours"):
+        neighbours(
+            grammar("robot -> cubes"), sample_robot(grammar("robot -> cubes"), LIBRARY, 0), 1
+        )
+
+
+def test_a_choice_without_effect_is_an_error(monkeypatch):
+    monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 20)
+    robot_grammar = grammar("robot -> cubes(size=choice(0.1, 0.1))")
+    with pytest.raises(SamplingError, match="in 20 draws: 20 x nothing changed"):
+        neighbours(robot_grammar, sample_robot(robot_grammar, LIBRARY, 0), 1)
