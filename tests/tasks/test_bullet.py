@@ -80,6 +80,17 @@ def test_robot_file_is_written_once(simulate, monkeypatch):
     assert len(written) == 3
 
 
+def test_a_diverged_environment_must_be_reset(simulate):
+    simulation = simulate(push_scene())
+    q, loaded = reset(simulation), client_of(simulation)
+    pybullet.resetJointState(loaded.robot, loaded.driven[0], np.nan, physicsClientId=loaded.id)
+    assert simulation.step(q).tolist() == [True]
+    with pytest.raises(
+        SimulationError, match=r"environment 0 \('prims.*diverged.*expected a reset"
+    ):
+        simulation.step(q)
+
+
 def test_client_limit_error_names_the_limit(monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda *_: -1)
     with pytest.raises(SimulationError, match="no client left: a process has 1024"):

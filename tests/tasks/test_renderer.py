@@ -128,7 +128,10 @@ def test_obstacles_are_drawn(on, reach):
     points = on(reach)._model.points
     drawing = on(bare)
     drawing._camera = renderer._camera(points, SIZE[0] / SIZE[1])
-    assert changed(on(reach).frame(RenderState(q)), drawing.frame(RenderState(q))).sum() > 50
+    frame = on(reach).frame(RenderState(q))
+    assert changed(frame, drawing.frame(RenderState(q))).sum() > 50
+    moved = on(reach).frame(RenderState(q, obstacles=reach.goals.layouts[1]))
+    assert changed(frame, moved).sum() > 50
 
 
 @pytest.mark.parametrize("name", ["reach", "push"])
