@@ -91,7 +91,7 @@ def read_policies(args: argparse.Namespace, library: Library) -> Iterator[Policy
     Raises:
         TaskError: If the folder of a run is missing, or does not list its robots.
     """
-    make = RobotFactory(library.folders)
+    make = RobotFactory(library)
     recipes = [ComposedRecipe((f"arm={arm}", "ee=stick")) for arm in REAL_ARMS]
     arms = {arm.name: arm for arm in members(map(make, recipes), ("reach",), obstacles=False)}
     stored = read_scores(args.results)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,15 +13,18 @@ from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import (
-    MEASURES,
     NEAR_THRESHOLDS,
     NearThresholds,
     is_same_reach,
-    most_alike,
 )
-from morphgen.benchmark.split import SIDES, Member, Side, Split
-from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_split
-from morphgen.errors import BenchmarkError
+from morphgen.benchmark.split import SIDES, Member, Side, Split, sided_members
+from morphgen.benchmark.survey import (
+    Fault,
+    SplitSurvey,
+    SurveyedRobot,
+    nearest_train,
+    survey_split,
+)
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 
@@ -222,10 +225,7 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
     text = survey.split.provenance.get("similarity")
     if text is None:
         return
-    try:
-        bound = parse_bound(str(text))
-    except BenchmarkError as error:
-        raise BenchmarkError(f"split {survey.split.name!r}: made: {error}") from error
+    bound = parse_bound(str(text), f"split {survey.split.name!r}: made: similarity")
     for member, cosines in zip(survey.split.test, survey.by_measure("cosine").T, strict=True):
         largest = max(cosines[~np.isnan(cosines)].tolist(), default=None)
         if largest is not None and not bound.holds(largest):
@@ -237,23 +237,15 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
 
 
 def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
-    train, test = survey.split.train, survey.split.test
-    for j, member in enumerate(test):
-        for name in MEASURES:
-            values = survey.by_measure(name)[:, j]
-            best = most_alike(values, name)
-            if best is not None:
-                yield Neighbour(member.name, name, train[best].name, float(values[best]))
+    for j, member in enumerate(survey.split.test):
+        for name, train, value in nearest_train(survey.split.train, survey.similarity[:, j]):
+            yield Neighbour(member.name, name, train, value)
 
 
 def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
-    robots: Mapping[Side, Sequence[SurveyedRobot | Fault]] = {
-        "train": survey.train,
-        "test": survey.test,
-    }
-    for side in SIDES:
-        for member, robot in zip(survey.split.side(side), robots[side], strict=True):
-            yield side, member, robot
+    robots = (*survey.train, *survey.test)
+    for (side, member), robot in zip(sided_members(survey.split), robots, strict=True):
+        yield side, member, robot
 
 
 def _first_of(split: Split, indices: Sequence[int]) -> str:

@@ -10,8 +10,6 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -109,17 +107,11 @@ class Candidate:
 class RobotFactory:
     """Make candidates from recipes; can be pickled and sent to a worker process."""
 
-    folders: tuple[Path, ...]
-    """Folders of the library of parts."""
+    library: Library
     with_features: bool = False
     """Compute the features of each robot."""
     max_links: int = MAX_LINKS
     """Largest number of links of a robot."""
-
-    @cached_property
-    def library(self) -> Library:
-        """The library of parts."""
-        return Library(self.folders)
 
     def __call__(self, recipe: Recipe) -> Candidate:
         """Make a robot."""
@@ -162,7 +154,7 @@ class RobotFactory:
         self._require_links(robot)
         robot_features = None
         if self.with_features:
-            shapes = token_shapes(robot, self.folders)
+            shapes = token_shapes(robot, self.library.folders)
             robot_features = features(robot, shapes, max_links=self.max_links)
         return Candidate(robot.name, category, written, robot_hash(robot), robot_features)
 
@@ -291,7 +283,7 @@ class RobotStream:
 RejectDerivation = Callable[[Derivation], str]
 """Returns the reason why a derivation cannot be a test robot's; empty if it can."""
 RejectRobot = Callable[[Candidate], str]
-"""Returns the reason why a composed robot cannot be a test robot; empty if it can."""
+"""Same for a composed robot."""
 
 
 class TestRobotSearch:
@@ -302,11 +294,7 @@ class TestRobotSearch:
         request: SplitRequest,
         train: Sequence[Candidate],
         factory: RobotFactory,
-        *,
-        skip_unfit: bool = False,
     ) -> None:
-        """Begin with no test robots."""
-        self._skip_unfit = skip_unfit
         self._request, self._factory = request, factory
         self._num_train = len(train)
         self._name_by_hash = {robot.hash: robot.name for robot in train}
@@ -345,14 +333,8 @@ class TestRobotSearch:
         reason = reject_derivation(derivation) if derivation else "no end"
         if reason:
             return reason
-        try:
-            with show_progress(None):
-                robot = self._factory(stream.recipe(number))
-        except UnfitRobotError as error:
-            if not self._skip_unfit:
-                raise
-            self._num_composed += 1
-            return error.reason
+        with show_progress(None):
+            robot = self._factory(stream.recipe(number))
         # The robot comes from a later draw if the conditions of the grammar reject the first one.
         reason = reject_derivation(robot.derivation)
         if not reason and robot.hash in self._name_by_hash:
@@ -417,18 +399,8 @@ def assemble_drawn(
     provenance: Mapping[str, object],
 ) -> tuple[Split, ...]:
     """Return the requested splits with a member for each robot and task; see ``assemble``."""
-    train_members, test_members = (
-        members(side, request.tasks, request.obstacles) for side in (train, test)
-    )
-    return assemble(
-        request,
-        regime,
-        summary,
-        train_members,
-        test_members,
-        provenance,
-        per_robot=len(request.tasks),
-    )
+    first, second = (members(side, request.tasks, request.obstacles) for side in (train, test))
+    return assemble(request, regime, summary, first, second, provenance, len(request.tasks))
 
 
 def interpolation(
@@ -443,21 +415,18 @@ def interpolation(
 
     Train robots are numbers 0, 1, ... of the grammar with one seed; test robots are sampled with
     another seed.
-
-    Returns:
-        A split for each size.
     """
     require_size(request)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
     train_stream = RobotStream.of(grammar, grammar.name, request)
     test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
-    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
+    factory = RobotFactory(library, with_features=True, max_links=request.max_links)
     recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
     train = make_robots(recipes, factory, jobs=jobs)
-    criterion = StructureAndHull(train, request.train[0], hull, library)
+    criterion = _StructureAndHull(train, request.train[0], hull, library)
     search = TestRobotSearch(request, train, factory)
-    if not search.find([test_stream], criterion, NearReason(train)):
+    if not search.find([test_stream], criterion, _NearReason(train)):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
     return assemble_drawn(
@@ -474,7 +443,7 @@ def interpolation(
     )
 
 
-class StructureAndHull:
+class _StructureAndHull:
     """Reject derivations of another structure, or on the wrong side of the convex hull."""
 
     def __init__(
@@ -489,7 +458,6 @@ class StructureAndHull:
             points.append(self._point(robot.derivation))
 
     def __call__(self, derivation: Derivation) -> str:
-        """Return the reason why a derivation is rejected; empty if it is accepted."""
         kind = structure(derivation, self._library)
         if kind not in self._structures:
             return "a structure that no train robot has"
@@ -517,14 +485,13 @@ class StructureAndHull:
         )
 
 
-class NearReason:
+class _NearReason:
     """Reject robots that the audit would call nearly the same as a given one."""
 
     def __init__(self, others: Sequence[Candidate]) -> None:
         self._others = others
 
     def __call__(self, robot: Candidate) -> str:
-        """Return the reason why a robot is rejected; empty if it is accepted."""
         for other in self._others:
             if robot.features is None or other.features is None:
                 continue
@@ -548,9 +515,6 @@ def composition(
 
     With several tasks, a candidate is a robot with one task, and the split composes robots with
     tasks: the outermost part of a test robot is in no train robot of its task, but in others.
-
-    Returns:
-        A split for each size.
     """
     candidates = list(_candidates(patterns, request.tasks, library))
     sequence = np.random.SeedSequence(request.seed)
@@ -566,7 +530,7 @@ def composition(
     unique = {
         candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
     }
-    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
+    factory = RobotFactory(library, with_features=True, max_links=request.max_links)
     composed_robots = make_robots(list(unique.values()), factory, jobs=jobs)
     robot_of = dict(zip(unique, composed_robots, strict=True))
     _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
@@ -595,7 +559,7 @@ def _require_no_near(
     """Require that no test robot is nearly a train robot of its task, as the audit does."""
     for each in test:
         others = [robot_of[other.text] for other in train if other.task == each.task]
-        if reason := NearReason(others)(robot_of[each.text]):
+        if reason := _NearReason(others)(robot_of[each.text]):
             raise BenchmarkError(
                 f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
                 "--from, or name another --seed"
@@ -777,12 +741,12 @@ class Bound:
         return largest < self.value if self.is_upper else largest > self.value
 
 
-def parse_bound(text: str) -> Bound:
+def parse_bound(text: str, origin: str = "--similarity") -> Bound:
     """Read a bound such as ``<0.6``."""
     match = _BOUND.fullmatch(text)
     if match is None or float(match[2]) > 1:
         raise BenchmarkError(
-            f"--similarity {text!r}: expected '<' or '>' and a number from 0 to 1, such as '<0.6'"
+            f"{origin} {text!r}: expected '<' or '>' and a number from 0 to 1, such as '<0.6'"
         )
     return Bound(match[1] == "<", float(match[2]))
 
@@ -799,9 +763,6 @@ def extrapolation(
     """Return splits whose test robots share no grammar and no structure with a train robot.
 
     Robots are sampled from the grammars in turn, so each grammar gives equally many.
-
-    Returns:
-        A split for each size.
     """
     require_size(request)
     _require_apart(train_grammars, test_grammars)
@@ -810,13 +771,13 @@ def extrapolation(
         for grammars in (train_grammars, test_grammars)
     )
     factory = RobotFactory(
-        library.folders, with_features=similarity is not None, max_links=request.max_links
+        library, with_features=similarity is not None, max_links=request.max_links
     )
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]
     train = make_robots(recipes, factory, jobs=jobs)
-    reject_trained = UntrainedStructure(train, library)
-    reject_by_similarity = SimilarityBound(train, request.train[0], similarity)
+    reject_trained = _UntrainedStructure(train, library)
+    reject_by_similarity = _SimilarityBound(train, request.train[0], similarity)
     search = TestRobotSearch(request, train, factory)
     targets = ", ".join(grammar.name for grammar in test_grammars)
     if not search.find(test_streams, reject_trained, reject_by_similarity):
@@ -837,7 +798,7 @@ def extrapolation(
     )
 
 
-class UntrainedStructure:
+class _UntrainedStructure:
     """Reject derivations that have the structure of a train robot."""
 
     def __init__(self, train: Sequence[Candidate], library: Library) -> None:
@@ -845,12 +806,11 @@ class UntrainedStructure:
         self._names = {structure(each.derivation, library): each.name for each in reversed(train)}
 
     def __call__(self, derivation: Derivation) -> str:
-        """Return the reason why a derivation is rejected; empty if it is accepted."""
         twin = self._names.get(structure(derivation, self._library))
         return f"the structure of train robot {twin}" if twin else ""
 
 
-class SimilarityBound:
+class _SimilarityBound:
     """Reject robots whose cosine to the nearest train robot violates the bound."""
 
     def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:
@@ -860,7 +820,6 @@ class SimilarityBound:
         self._nearest: list[tuple[float, str, str]] = []
 
     def __call__(self, robot: Candidate) -> str:
-        """Return the reason why a robot is rejected; empty if it is accepted."""
         if self._bound is None or robot.features is None:
             return ""
         cosines = [

@@ -45,13 +45,13 @@ from morphgen.processes import parallel_map
 from morphgen.progress import part_of
 
 MANUFACTURER = "manufacturer"
-"""Key of conditions on the manufacturer of a part."""
+"""_Key of conditions on the manufacturer of a part."""
 EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
 """Examples of rules, for messages."""
 
 
 @dataclass(frozen=True)
-class PartCondition:
+class _PartCondition:
     """The part has a kind and a name: ``arm=kinova*``."""
 
     kind: PartKind
@@ -62,14 +62,13 @@ class PartCondition:
         return f"{self.kind}={self.pattern}"
 
     def matches(self, node: Derivation, library: Library) -> bool:
-        """Test a part of a robot."""
         return fnmatchcase(node.part, self.pattern) and library.manifest(node.part).kind == (
             self.kind
         )
 
 
 @dataclass(frozen=True)
-class ManufacturerCondition:
+class _ManufacturerCondition:
     """The part is made by a manufacturer: ``manufacturer=Kinova``, ``arm.manufacturer=Kinova``."""
 
     kind: PartKind | None
@@ -82,18 +81,16 @@ class ManufacturerCondition:
         return f"{prefix}{MANUFACTURER}={self.pattern}"
 
     def matches(self, node: Derivation, library: Library) -> bool:
-        """Test a part of a robot."""
         return self.matches_manifest(library.manifest(node.part))
 
     def matches_manifest(self, manifest: Manifest) -> bool:
-        """Test a part."""
         name = manifest.manufacturer.lower()
         is_kind = self.kind in (None, manifest.kind)
         return is_kind and bool(name) and fnmatchcase(name, self.pattern.lower())
 
 
 @dataclass(frozen=True)
-class RangeCondition:
+class _RangeCondition:
     """A parameter of the part is in a range, bounds included: ``arm3.length=0.3..0.4``."""
 
     owner: str
@@ -109,11 +106,9 @@ class RangeCondition:
         return f"{self.owner}.{self.parameter}={low}..{high}"
 
     def applies_to(self, manifest: Manifest) -> bool:
-        """Test if the part is one whose parameter has a held-out range."""
         return _is_owner(self.owner, manifest) and self.parameter in manifest.attached_parameters
 
     def matches(self, node: Derivation, library: Library) -> bool:
-        """Test a part of a robot."""
         manifest = library.manifest(node.part)
         if not self.applies_to(manifest):
             return False
@@ -121,14 +116,14 @@ class RangeCondition:
         return self.low <= dict(node.parameters).get(self.parameter, default) <= self.high
 
 
-Condition = PartCondition | ManufacturerCondition | RangeCondition
+_Condition = _PartCondition | _ManufacturerCondition | _RangeCondition
 
 
 @dataclass(frozen=True)
 class HoldOutRule:
     """Conditions that hold together for a held-out robot, each for one of its parts."""
 
-    conditions: tuple[Condition, ...]
+    conditions: tuple[_Condition, ...]
 
     def __str__(self) -> str:
         return "+".join(map(str, self.conditions))
@@ -136,7 +131,7 @@ class HoldOutRule:
     @property
     def holds_out_parts(self) -> bool:
         """Whether parts are held out as such, rather than a combination or a range."""
-        return len(self.conditions) == 1 and not isinstance(self.conditions[0], RangeCondition)
+        return len(self.conditions) == 1 and not isinstance(self.conditions[0], _RangeCondition)
 
     def holds(self, derivation: Derivation, library: Library) -> bool:
         """Test if a robot is held out."""
@@ -179,7 +174,7 @@ def held_out_parts(
     return frozenset[str]().union(*(rule.matching_parts(derivation, library) for rule in whole))
 
 
-def _condition(term: str, text: str, library: Library, origin: str) -> Condition:
+def _condition(term: str, text: str, library: Library, origin: str) -> _Condition:
     where = f"{origin} {text}" if term == text else f"{origin} {text}: {term or 'empty rule'}"
     key, _, value = term.partition("=")
     if not key or not value:
@@ -187,9 +182,9 @@ def _condition(term: str, text: str, library: Library, origin: str) -> Condition
     owner, dot, name = key.rpartition(".")
     if key in PART_KINDS:
         _require_match(value, library.names(key), key, where)
-        return PartCondition(key, value)
+        return _PartCondition(key, value)
     if name == MANUFACTURER and (not dot or owner in PART_KINDS):
-        condition = ManufacturerCondition(cast(PartKind, owner) if dot else None, value)
+        condition = _ManufacturerCondition(cast(PartKind, owner) if dot else None, value)
         manifests = library.manifests(condition.kind)
         if not any(map(condition.matches_manifest, manifests)):
             valid = {manifest.manufacturer for manifest in manifests} - {""}
@@ -203,7 +198,7 @@ def _condition(term: str, text: str, library: Library, origin: str) -> Condition
     )
 
 
-def _range(owner: str, name: str, value: str, library: Library, where: str) -> RangeCondition:
+def _range(owner: str, name: str, value: str, library: Library, where: str) -> _RangeCondition:
     manifests = [manifest for manifest in library.manifests() if _is_owner(owner, manifest)]
     if not manifests:
         _require_match(owner, [*PART_KINDS, *library.paths], "part", where)
@@ -231,7 +226,7 @@ def _range(owner: str, name: str, value: str, library: Library, where: str) -> R
         raise BenchmarkError(f"{where}: {error}") from error
     if bounds[0] > bounds[1]:
         raise BenchmarkError(f"{where}: {low} is above {high}; expected LOW..HIGH")
-    return RangeCondition(owner, name, *bounds)
+    return _RangeCondition(owner, name, *bounds)
 
 
 def _is_owner(owner: str, manifest: Manifest) -> bool:
@@ -250,7 +245,7 @@ MAX_VALUE_DRAWS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Draft:
+class _Draft:
     """A robot that may be drawn; it is composed when it is."""
 
     recipe: SampledRecipe | DerivedRecipe
@@ -275,7 +270,7 @@ class Draft:
 
 
 @dataclass(frozen=True)
-class DraftMaker:
+class _DraftMaker:
     """Convert derivations to drafts."""
 
     rules: tuple[HoldOutRule, ...]
@@ -284,7 +279,7 @@ class DraftMaker:
 
     def draft(
         self, recipe: SampledRecipe | DerivedRecipe, derivation: Derivation, category: str
-    ) -> Draft:
+    ) -> _Draft:
         """Return the draft of a derivation."""
         holding = tuple(
             number for number, rule in enumerate(self.rules) if rule.holds(derivation, self.library)
@@ -294,7 +289,7 @@ class DraftMaker:
             kind = self.library.manifest(node.part).kind
             by_kind[kind] = by_kind.get(kind, frozenset()) | {node.part}
         matching = (self.rules[n].matching_parts(derivation, self.library) for n in holding)
-        return Draft(
+        return _Draft(
             recipe,
             derivation,
             category,
@@ -306,19 +301,15 @@ class DraftMaker:
             hashlib.sha256(f"{self.seed} {derivation}".encode()).hexdigest(),
         )
 
-    def composed(self, draft: Draft, robot: Candidate) -> Draft:
-        """Return the draft with the derivation that its composed robot has."""
-        return self.draft(draft.recipe, robot.derivation, draft.category)
 
-
-def make_pool(
+def _make_pool(
     request: SplitRequest,
-    maker: DraftMaker,
+    maker: _DraftMaker,
     patterns: Sequence[str],
     grammars: Sequence[Grammar],
-) -> list[Draft]:
+) -> list[_Draft]:
     """Return every robot that may be drawn, each derivation once."""
-    drafts: dict[str, Draft] = {}
+    drafts: dict[str, _Draft] = {}
     for draft in (
         *_from_patterns(request, maker, patterns),
         *_from_grammars(request, maker, grammars),
@@ -328,8 +319,8 @@ def make_pool(
 
 
 def _from_patterns(
-    request: SplitRequest, maker: DraftMaker, patterns: Sequence[str]
-) -> Iterator[Draft]:
+    request: SplitRequest, maker: _DraftMaker, patterns: Sequence[str]
+) -> Iterator[_Draft]:
     robots = [robot for p in patterns for robot in pattern_robots(p, maker.library)]
     varied = [_varied(robot, maker) for robot in robots]
     wanted = max(request.train) + request.test
@@ -342,8 +333,8 @@ def _from_patterns(
 
 
 def _from_grammars(
-    request: SplitRequest, maker: DraftMaker, grammars: Sequence[Grammar]
-) -> Iterator[Draft]:
+    request: SplitRequest, maker: _DraftMaker, grammars: Sequence[Grammar]
+) -> Iterator[_Draft]:
     for grammar in grammars:
         stream = RobotStream.of(grammar, grammar.name, request)
         for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):
@@ -359,7 +350,7 @@ class _Choice:
     label: str
     """Label of the part in the derivation."""
     parameter: Parameter
-    condition: RangeCondition
+    condition: _RangeCondition
 
     def draw(self, rng: np.random.Generator, *, inside: bool) -> float:
         """Draw a value inside of the held-out range, or from all that are valid."""
@@ -371,7 +362,7 @@ class _Choice:
         return float(format_number(rng.uniform(low, high)))
 
 
-def _varied(robot: PatternRobot, maker: DraftMaker) -> list[_Choice]:
+def _varied(robot: PatternRobot, maker: _DraftMaker) -> list[_Choice]:
     """Return the parameters with held-out ranges, except those that the pattern sets."""
     given = {word.partition("=")[0].replace(".", "_") for word in robot.words}
     conditions = [condition for rule in maker.rules for condition in rule.conditions]
@@ -379,7 +370,7 @@ def _varied(robot: PatternRobot, maker: DraftMaker) -> list[_Choice]:
     for node in robot.derivation.walk():
         manifest = maker.library.manifest(node.part)
         for condition in conditions:
-            if not (isinstance(condition, RangeCondition) and condition.applies_to(manifest)):
+            if not (isinstance(condition, _RangeCondition) and condition.applies_to(manifest)):
                 continue
             parameter = manifest.attached_parameters[condition.parameter]
             overlaps = condition.low <= parameter.maximum and condition.high >= parameter.minimum
@@ -389,7 +380,7 @@ def _varied(robot: PatternRobot, maker: DraftMaker) -> list[_Choice]:
 
 
 def _with_values(
-    derivation: Derivation, choices: Sequence[_Choice], num_values: int, maker: DraftMaker
+    derivation: Derivation, choices: Sequence[_Choice], num_values: int, maker: _DraftMaker
 ) -> Iterator[Derivation]:
     """Yield a derivation with drawn values: as many held-out ones as others, if there are any."""
     if not choices:
@@ -419,76 +410,73 @@ def _replace_values(
     for choice in choices:
         by_name = values.setdefault(choice.label, {})
         by_name[choice.condition.parameter] = choice.draw(rng, inside=inside)
-    return _updated(derivation, values)
 
+    def updated(node: Derivation) -> Derivation:
+        return replace(
+            node,
+            parameters=tuple({**dict(node.parameters), **values.get(node.label, {})}.items()),
+            children=tuple((port, updated(child)) for port, child in node.children),
+        )
 
-def _updated(node: Derivation, values: Mapping[str, Mapping[str, float]]) -> Derivation:
-    """Return the derivation with some values replaced, by label and parameter."""
-    return replace(
-        node,
-        parameters=tuple({**dict(node.parameters), **values.get(node.label, {})}.items()),
-        children=tuple((port, _updated(child, values)) for port, child in node.children),
-    )
+    return updated(derivation)
 
 
 STRATA = ("arm", "ee", "body", "base")
 """Kinds of parts whose use is balanced, the most important first. Segments are repeated at will."""
 
-Key: TypeAlias = tuple[int, ...]
-Item: TypeAlias = tuple[str, object]
+_Key: TypeAlias = tuple[int, ...]
+_Item: TypeAlias = tuple[str, object]
 
 
-class Balance:
+class _Balance:
     """How often the parts and categories of the robots chosen so far occur."""
 
     def __init__(self) -> None:
-        self._counts: Counter[Item] = Counter()
+        self._counts: Counter[_Item] = Counter()
 
-    def _items(self, draft: Draft) -> list[list[Item]]:
+    def _items(self, draft: _Draft) -> list[list[_Item]]:
         """Return what is balanced, the most important first; each is an alternative in a group."""
-        groups: list[list[Item]] = [[("category", draft.category)]]
+        groups: list[list[_Item]] = [[("category", draft.category)]]
         return groups + [
             [(kind, part) for part in draft.parts_by_kind.get(kind, ())] for kind in STRATA
         ]
 
-    def key(self, draft: Draft) -> Key:
+    def key(self, draft: _Draft) -> _Key:
         """Return how often the items of a robot occur already; the smallest is the best robot."""
         return tuple(
             max((self._counts[item] for item in group), default=0) for group in self._items(draft)
         )
 
-    def add(self, draft: Draft) -> None:
-        """Count a chosen robot."""
+    def add(self, draft: _Draft) -> None:
         self._counts.update(item for group in self._items(draft) for item in group)
 
 
-class TestBalance(Balance):
-    """Balance the rules, then the parts that they hold for, then all parts."""
+class _TestBalance(_Balance):
+    """_Balance the rules, then the parts that they hold for, then all parts."""
 
-    def _items(self, draft: Draft) -> list[list[Item]]:
-        rules: list[Item] = [("rule", number) for number in draft.rules]
-        held: list[Item] = [("held out", part) for part in draft.matching]
+    def _items(self, draft: _Draft) -> list[list[_Item]]:
+        rules: list[_Item] = [("rule", number) for number in draft.rules]
+        held: list[_Item] = [("held out", part) for part in draft.matching]
         return [rules, held, *super()._items(draft)]
 
 
-class TrainBalance(Balance):
-    """Balance the parts; of equally good robots, prefer one with parts that test robots need."""
+class _TrainBalance(_Balance):
+    """_Balance the parts; of equally good robots, prefer one with parts that test robots need."""
 
     def __init__(self, needed: frozenset[str]) -> None:
         super().__init__()
         self._needed = set(needed)
 
-    def key(self, draft: Draft) -> Key:
+    def key(self, draft: _Draft) -> _Key:
         """Return the key of the balance, then how many needed parts the robot has, negated."""
         return (*super().key(draft), -len(self._needed & draft.parts))
 
-    def add(self, draft: Draft) -> None:
-        """Count a chosen robot; its parts are needed no more."""
+    def add(self, draft: _Draft) -> None:
         super().add(draft)
         self._needed -= draft.parts
 
 
-def stratified(drafts: Mapping[int, Draft], n: int, balance: Balance) -> list[int]:
+def _stratified(drafts: Mapping[int, _Draft], n: int, balance: _Balance) -> list[int]:
     """Return the numbers of up to n drafts, each the best one after those before it."""
     # Keys never become better while robots are chosen, so only the first of the heap is updated.
     heap = [(balance.key(draft), draft.order, number) for number, draft in drafts.items()]
@@ -510,34 +498,27 @@ MAX_REJECTED = 500
 
 
 @dataclass(frozen=True)
-class _Unfit:
-    """A draft whose robot cannot be a member."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
 class ComposeDraft:
     """Compose drafts; can be pickled and sent to a worker process."""
 
     factory: RobotFactory
 
-    def __call__(self, draft: Draft) -> Candidate | _Unfit:
+    def __call__(self, draft: _Draft) -> Candidate | str:
         """Return the composed robot, or why it cannot be a member."""
         try:
             return self.factory(draft.recipe)
         except UnfitRobotError as error:
-            return _Unfit(error.reason)
+            return error.reason
 
 
 @dataclass
-class HoldOutSearch:
+class _HoldOutSearch:
     """Choose robots, compose them, reject those that do not do, and choose again."""
 
     request: SplitRequest
-    maker: DraftMaker
+    maker: _DraftMaker
     compose: ComposeDraft
-    pool: dict[int, Draft]
+    pool: dict[int, _Draft]
     robots: dict[int, Candidate] = field(default_factory=dict)
     """Composed robots by their number in the pool."""
     rejected: dict[int, str] = field(default_factory=dict)
@@ -566,12 +547,13 @@ class HoldOutSearch:
         with part_of(None, num_known):
             results = list(parallel_map(self.compose, drafts, jobs))
         for number, result in zip(unknown, results, strict=True):
-            if isinstance(result, _Unfit):
-                self.rejected[number] = result.reason
+            if isinstance(result, str):
+                self.rejected[number] = result
                 continue
             self.robots[number] = result
             # The conditions of a grammar may have replaced the derivation that was drawn.
-            self.pool[number] = self.maker.composed(self.pool[number], result)
+            draft = self.pool[number]
+            self.pool[number] = self.maker.draft(draft.recipe, result.derivation, draft.category)
 
     def _choose(self) -> tuple[list[int], list[int]]:
         """Return the numbers of the best test and train robots that are not rejected."""
@@ -581,9 +563,9 @@ class HoldOutSearch:
         testable = {
             n: draft for n, draft in drafts.items() if draft.rules and draft.required <= train_parts
         }
-        test = stratified(testable, self.request.test, TestBalance())
+        test = _stratified(testable, self.request.test, _TestBalance())
         needed = frozenset[str]().union(*(drafts[n].required for n in test))
-        train = stratified(trainable, max(self.request.train), TrainBalance(needed))
+        train = _stratified(trainable, max(self.request.train), _TrainBalance(needed))
         return test, train
 
     def _require_enough(
@@ -736,9 +718,7 @@ def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
     """Return train parts of the kind and manufacturer of parts that are held out by their names.
 
     ``arm=kinova*`` does not hold out ``mico``, which is Kinova's, too: users may not expect that.
-
-    Returns:
-        The parts by the rule that holds them out, such as ``arm.manufacturer=Kinova``.
+    The parts are given by the rule that holds them out, such as ``arm.manufacturer=Kinova``.
     """
     named = [rule for rule in hold_out_rules(split, library) if rule.holds_out_parts]
     held = {
@@ -825,11 +805,7 @@ def hold_out(
     grammars: Sequence[Grammar] = (),
     jobs: int = 1,
 ) -> tuple[Split, ...]:
-    """Return splits whose test robots have held-out parts, and whose train robots have none.
-
-    Returns:
-        A split for each size.
-    """
+    """Return splits whose test robots have held-out parts, and whose train robots have none."""
     require_size(request)
     rules = parse_rules(hold_out, library)
     if request.test < len(rules):
@@ -839,10 +815,10 @@ def hold_out(
         )
     if not grammars and not patterns:
         patterns = (DEFAULT_PATTERN,)
-    maker = DraftMaker(rules, library, request.seed)
-    factory = RobotFactory(library.folders, with_features=True, max_links=request.max_links)
-    pool = dict(enumerate(make_pool(request, maker, patterns, grammars)))
-    search = HoldOutSearch(request, maker, ComposeDraft(factory), pool)
+    maker = _DraftMaker(rules, library, request.seed)
+    factory = RobotFactory(library, with_features=True, max_links=request.max_links)
+    pool = dict(enumerate(_make_pool(request, maker, patterns, grammars)))
+    search = _HoldOutSearch(request, maker, ComposeDraft(factory), pool)
     test, train = search.run(jobs)
     robots = [*train, *test]
     names = unique_names(robot.derivation for robot in robots)

@@ -133,10 +133,7 @@ def restriction_text(part: LicencedPart) -> str:
 
 
 def restriction_line(parts: Iterable[LicencedPart]) -> str:
-    """Return a line with all parts whose licence restricts use, and what a release of them needs.
-
-    It is empty if there is no such part.
-    """
+    """Return the restricted parts, if any, in a line with what a release of them needs."""
     limited = restricted(parts)
     if not limited:
         return ""

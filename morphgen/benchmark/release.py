@@ -40,7 +40,7 @@ from morphgen.benchmark.split_folder import (
     require_split_folder,
 )
 from morphgen.benchmark.survey import RobotDifficulty, difficulty_table
-from morphgen.errors import BenchmarkError, FormatError
+from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
@@ -131,10 +131,7 @@ def read_release(folder: Path) -> Release:
         raise BenchmarkError(
             f"{folder} is no release: it has no {RELEASE_FILE}; morphgen split release makes one"
         )
-    try:
-        return read_record(read_json(path), Release, str(path), BenchmarkError)
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
+    return read_record(read_json(path), Release, str(path), BenchmarkError)
 
 
 @contextmanager
@@ -145,10 +142,7 @@ def opened_folder(path: Path) -> Iterator[Path]:
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="morphgen-") as temporary:
-        try:
-            unpack_zip(path, Path(temporary), LIMITS)
-        except FormatError as error:
-            raise BenchmarkError(str(error)) from error
+        unpack_zip(path, Path(temporary), LIMITS)
         folders = list(Path(temporary).iterdir())
         if len(folders) != 1 or not folders[0].is_dir():
             raise BenchmarkError(
@@ -240,7 +234,7 @@ def croissant_text(
     if release.creators:
         people = [{"@type": "sc:Organization", "name": name} for name in release.creators]
         data["creator"] = people
-    data["distribution"] = [*_file_objects(sums), *_file_sets(sums)]
+    data["distribution"] = _distribution(sums)
     data["recordSet"] = [_sides(), _robots()]
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
@@ -257,8 +251,9 @@ def citation(split: Split, release: Release) -> str:
     )
 
 
-def _file_objects(sums: Mapping[str, str]) -> list[dict[str, Any]]:
-    return [
+def _distribution(sums: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the files and sets of files that a release with these checksums has."""
+    files = [
         {
             "@type": "cr:FileObject",
             "@id": name,
@@ -271,10 +266,7 @@ def _file_objects(sums: Mapping[str, str]) -> list[dict[str, Any]]:
         for name, (media_type, description) in _FILES.items()
         if name in sums
     ]
-
-
-def _file_sets(sums: Mapping[str, str]) -> list[dict[str, Any]]:
-    return [
+    sets = [
         {
             "@type": "cr:FileSet",
             "@id": name,
@@ -286,6 +278,7 @@ def _file_sets(sums: Mapping[str, str]) -> list[dict[str, Any]]:
         for name, media_type, pattern, description in _SETS
         if any(PurePosixPath(path).match(pattern) for path in sums)
     ]
+    return [*files, *sets]
 
 
 def _sides() -> dict[str, Any]:
@@ -341,18 +334,22 @@ test it on {test} that it has not seen. Made with morphgen {morphgen}; the split
 
 ```
 morphgen split verify {folder}
-morphgen train {folder} --sim {simulator}
-morphgen eval runs/{name}/me-graph/seed0 --split {folder} --sim {simulator} --submission mine.json
+morphgen train {folder} --sim {rules[simulator]}
+morphgen eval runs/{name}/me-graph/seed0 --split {folder} --sim {rules[simulator]} \
+--submission mine.json
 morphgen split score mine.json --split {folder}
 ```
 
-Without morphgen: `datasets.load_dataset("json", data_files="{robots}")`,
-`mlcroissant.Dataset("{croissant}").records("robots")`, `numpy.load("{tokens}")`, and
-`sha256sum -c {sums}`.
+Without morphgen: `datasets.load_dataset("json", data_files="robots.jsonl")`,
+`mlcroissant.Dataset("croissant.json").records("robots")`, `numpy.load("tokens.npz")`, and
+`sha256sum -c SHA256SUMS`.
 
 ## Evaluation
 
-{evaluation}
+Simulator `{rules[simulator]}`, {rules[episodes]} episodes per robot or more, seed {rules[seed]}, \
+goals of seed {rules[goal_seed]}; the constants of the tasks are in `release.json`. \
+A submission holds the outcome of every episode, and `morphgen split score` \
+computes scores and intervals from them.
 
 ## Difficulty
 
@@ -387,12 +384,7 @@ def card_text(
         id=release.id,
         files=_file_table(names),
         folder=release.stem,
-        simulator=release.evaluation["simulator"],
-        robots=ROBOTS_FILE,
-        croissant=CROISSANT_FILE,
-        tokens=TOKENS_FILE,
-        sums=SUMS_FILE,
-        evaluation=_evaluation(release),
+        rules=release.evaluation,
         difficulty=_difficulty(release, rows),
         licences=_licence_summary(parts),
         citation=citation(split, release),
@@ -470,16 +462,6 @@ def _file_table(names: Iterable[str]) -> str:
         f"| `{name}` | {content} |"
         for name, content in table.items()
         if name not in optional or name in known
-    )
-
-
-def _evaluation(release: Release) -> str:
-    rules = release.evaluation
-    return (
-        f"Simulator `{rules['simulator']}`, {rules['episodes']} episodes per robot or more, seed "
-        f"{rules['seed']}, goals of seed {rules['goal_seed']}; the constants of the tasks are in "
-        f"`{RELEASE_FILE}`. A submission holds the outcome of every episode, and `morphgen split "
-        "score` computes scores and intervals from them."
     )
 
 

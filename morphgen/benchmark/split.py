@@ -17,9 +17,7 @@ from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.model.robot import (
-    Robot,
-)
+from morphgen.model.robot import Robot
 
 Regime = Literal["interpolation", "composition", "extrapolation", "hold-out"]
 REGIMES: tuple[Regime, ...] = ("interpolation", "composition", "extrapolation", "hold-out")

@@ -17,22 +17,21 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.split import (
     SIDES,
     Member,
-    Side,
     Split,
     compose_member,
     sided_members,
@@ -44,6 +43,7 @@ from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, require_ma
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats import records
 from morphgen.formats.bundle import (
     CARD,
     PICTURE,
@@ -91,62 +91,29 @@ Record = dict[str, Any]
 """A line of ``robots.jsonl``."""
 
 
-class Robots(Sequence[Record]):
-    """Robots as dictionaries.
-
-    Keys are those of ``robots.jsonl``, and ``tokens``, shape (max_links, 48), and ``mask``, shape
-    (max_links,).
-    """
-
-    def __init__(self, records: Sequence[Record]) -> None:
-        self._records = tuple(records)
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    def __iter__(self) -> Iterator[Record]:
-        return iter(self._records)
-
-    @overload
-    def __getitem__(self, index: int) -> Record: ...
-    @overload
-    def __getitem__(self, index: slice) -> Robots: ...
-    def __getitem__(self, index: int | slice) -> Record | Robots:
-        """Return one robot, or the robots of a slice."""
-        records = self._records[index]
-        return Robots(records) if isinstance(records, tuple) else records
-
-
 @dataclass(frozen=True, eq=False)
 class SplitFolder:
     """The content of a split folder."""
 
     folder: Path
-    robots: Robots
-    """All robots, train robots first. The bundle of a robot is ``folder / robot["path"]``."""
+    robots: tuple[Record, ...]
+    """All robots, train robots first, under the keys of ``robots.jsonl``, and ``tokens``, shape
+    (max_links, 48), and ``mask``, shape (max_links,). The bundle of a robot is
+    ``folder / robot["path"]``."""
     tokens: NDArray[np.float64]
     """Tokens at home, in the order of ``robots``, shape (n, max_links, 48)."""
     mask: NDArray[np.bool_]
     """True for the rows of tokens that are links, shape (n, max_links)."""
 
     @property
-    def train(self) -> Robots:
+    def train(self) -> tuple[Record, ...]:
         """The train robots."""
-        return self._side("train")
+        return tuple(robot for robot in self.robots if robot["side"] == "train")
 
     @property
-    def test(self) -> Robots:
+    def test(self) -> tuple[Record, ...]:
         """The test robots."""
-        return self._side("test")
-
-    def _side(self, side: Side) -> Robots:
-        return Robots([robot for robot in self.robots if robot["side"] == side])
-
-    def __iter__(self) -> Iterator[Record]:
-        return iter(self.robots)
-
-    def __len__(self) -> int:
-        return len(self.robots)
+        return tuple(robot for robot in self.robots if robot["side"] == "test")
 
 
 def load_split_folder(folder: str | Path) -> SplitFolder:
@@ -159,7 +126,7 @@ def load_split_folder(folder: str | Path) -> SplitFolder:
         raise BenchmarkError(f"{folder}: {TOKENS_FILE} is not of the robots in {ROBOTS_FILE}")
     for record, table, present in zip(records, tokens, mask, strict=True):
         record["tokens"], record["mask"] = table, present
-    return SplitFolder(folder, Robots(records), tokens, mask)
+    return SplitFolder(folder, tuple(records), tokens, mask)
 
 
 def require_split_folder(folder: Path) -> None:
@@ -179,11 +146,8 @@ def require_split_folder(folder: Path) -> None:
 def read_records(path: Path) -> list[Record]:
     """Read the lines of ``robots.jsonl``."""
     records = []
-    for number, line in enumerate(_text(path).splitlines(), 1):
-        try:
-            record = parse_json(line, f"{path}:{number}")
-        except FormatError as error:
-            raise BenchmarkError(str(error)) from error
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        record = parse_json(line, f"{path}:{number}")
         if not isinstance(record, dict) or "name" not in record or record.get("side") not in SIDES:
             raise BenchmarkError(f"{path}:{number}: expected an object with a name and a side")
         records.append(record)
@@ -216,7 +180,7 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
 def read_sums(path: Path) -> dict[str, str]:
     """Read SHA-256 hashes by path, as ``sha256sum`` writes them."""
     sums = {}
-    for number, line in enumerate(_text(path).splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         match = _SUM.fullmatch(line)
         if not match:
             raise BenchmarkError(f"{path}:{number}: expected a hash, two spaces and a path")
@@ -224,22 +188,19 @@ def read_sums(path: Path) -> dict[str, str]:
     return sums
 
 
-def read_settings(path: Path) -> tuple[str, bool]:
-    """Read the id of the split, and if its robots were built light, from ``build.json``."""
-    try:
-        data = parse_json(_text(path), str(path))
-        if data["format"] != FORMAT:
-            raise BenchmarkError(f"{path}: format {data['format']!r}; this version reads {FORMAT}")
-        return str(data["split"]), bool(data["light"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise BenchmarkError(f"{path}: does not say how the split was built: {error!r}") from error
+class _Settings(records.Record, frozen=True):
+    """The content of ``build.json``; a build is continued only with the same."""
+
+    format: Literal[1]
+    split: str
+    """Id of the split."""
+    light: bool
+    picture: bool
 
 
-def _text(path: Path) -> str:
-    try:
-        return read_text(path)
-    except FormatError as error:
-        raise BenchmarkError(str(error)) from error
+def read_settings(path: Path) -> _Settings:
+    """Read ``build.json``."""
+    return records.read_record(read_json(path), _Settings, str(path), BenchmarkError)
 
 
 _README = """\
@@ -248,17 +209,17 @@ _README = """\
 {summary}
 
 A split of robots for cross-embodiment learning ({regime}): {train} robots to train on, {test} to
-test on. `{split}` says how they were chosen; its id is `{id}`.
+test on. `split.yaml` says how they were chosen; its id is `{id}`.
 
-- `{robots}`: a line of JSON a robot: name, side (train or test), task, obstacles, category,
+- `robots.jsonl`: a line of JSON a robot: name, side (train or test), task, obstacles, category,
   derivation (parts and parameters), hash of the body, links, movable joints, those between root and
   tool, degrees of freedom, reach (m), mass (kg), and path of its folder
-- `{tokens}`: tokens (n, max_links, 48) at home, mask (n, max_links), names (n,), in the order of
-  `{robots}`; layout and columns say what the 48 numbers are
-- `{bundles}/`: {bundle}
-- `{settings}`: how this folder was built
+- `tokens.npz`: tokens (n, max_links, 48) at home, mask (n, max_links), names (n,), in the order of
+  `robots.jsonl`; layout and columns say what the 48 numbers are
+- `robots/`: {bundle}
+- `build.json`: how this folder was built
 - `{sums}`: of every file, for `sha256sum -c {sums}`; `morphgen split verify .` also tests that the
-  robots are those of `{split}`
+  robots are those of `split.yaml`
 
 ```python
 from morphgen.benchmark.split_folder import load_split_folder
@@ -268,8 +229,8 @@ for robot in split.train:
     print(robot["name"], robot["tokens"].shape, split.folder / robot["path"] / "robot.urdf")
 ```
 
-Without morphgen: `datasets.load_dataset("json", data_files="{robots}")` and
-`numpy.load("{tokens}")`.
+Without morphgen: `datasets.load_dataset("json", data_files="robots.jsonl")` and
+`numpy.load("tokens.npz")`.
 """
 _BUNDLE = (
     "a folder a body: `robot.urdf`, `robot.xml` (MJCF), `meshes/`, and `card.json` with the\n"
@@ -291,7 +252,6 @@ class BuildSettings:
     """Add ``preview.png`` to the bundles."""
 
     def __post_init__(self) -> None:
-        """Check that both can be done."""
         if self.light and self.picture:
             raise BenchmarkError("a light build has no pictures; choose one of light and picture")
 
@@ -309,10 +269,10 @@ class RobotData:
     """Tokens, shape (n_links, 48)."""
 
 
-def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotData:
+def robot_data(robot: Robot, library: Library, max_links: int) -> RobotData:
     """Measure a robot."""
-    table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
-    return RobotData(robot_stats(robot).as_dict(), table)
+    table = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
+    return RobotData(vars(robot_stats(robot)), table)
 
 
 def unique_robots(split: Split) -> list[Member]:
@@ -334,7 +294,7 @@ def robot_paths(split: Split) -> dict[str, str]:
     return {member.robot_hash: f"{ROBOTS_DIR}/{member.name}" for member in unique_robots(split)}
 
 
-def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
+def robot_records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
     """Return the lines of ``robots.jsonl``."""
     paths = robot_paths(split)
     return [
@@ -351,12 +311,6 @@ def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
         }
         for side, member in sided_members(split)
     ]
-
-
-def records_text(split: Split, known: Mapping[str, RobotData]) -> str:
-    """Return the text of ``robots.jsonl``."""
-    lines = (json.dumps(record, ensure_ascii=False) for record in records(split, known))
-    return "".join(f"{line}\n" for line in lines)
 
 
 def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
@@ -381,17 +335,6 @@ def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
     return content.getvalue()
 
 
-def settings_text(split: Split, settings: BuildSettings) -> str:
-    """Return the text of ``build.json``; a build is continued only with the same settings."""
-    data = {
-        "format": FORMAT,
-        "split": split_id(split),
-        "light": settings.light,
-        "picture": settings.picture,
-    }
-    return json.dumps(data, indent=2) + "\n"
-
-
 def readme_text(split: Split, settings: BuildSettings) -> str:
     """Return the text of ``README.md``."""
     return _README.format(
@@ -402,11 +345,6 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
         test=len(split.test),
         id=split_id(split),
         bundle=_LIGHT if settings.light else _BUNDLE,
-        split=SPLIT_FILE,
-        robots=ROBOTS_FILE,
-        tokens=TOKENS_FILE,
-        bundles=ROBOTS_DIR,
-        settings=BUILD_FILE,
         sums=SUMS_FILE,
     )
 
@@ -536,7 +474,7 @@ def build_split(
             (split_folder / SUMS_FILE).unlink(missing_ok=True)
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
                 shutil.rmtree(leftover, ignore_errors=True)
-            writer = _RobotWriter(library.folders, split_folder, settings, split.max_links)
+            writer = _RobotWriter(library, split_folder, settings, split.max_links)
             results = parallel_map(writer, members, jobs)
             robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
             _finish(split_folder, split, settings, robots)
@@ -564,14 +502,10 @@ class _WrittenRobot:
 class _RobotWriter:
     """Write the folder of a member; sent to worker processes."""
 
-    folders: tuple[Path, ...]
+    library: Library
     split_folder: Path
     settings: BuildSettings
     max_links: int
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
 
     def __call__(self, member: Member) -> _WrittenRobot:
         robot = compose_member(member, self.library)
@@ -583,14 +517,14 @@ class _RobotWriter:
         )
         if not is_kept:
             write_robot(robot, folder, light=light, picture=picture)
-        return _WrittenRobot(
-            not is_kept, robot_data(robot, self.folders, self.max_links), folder_hashes(folder)
-        )
+        data = robot_data(robot, self.library, self.max_links)
+        return _WrittenRobot(not is_kept, data, folder_hashes(folder))
 
 
 def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
     """Create the folder, or check that it has the same split with the same settings."""
-    texts = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
+    build = _Settings(1, split_id(split), settings.light, settings.picture)
+    data, text = msgspec.to_builtins(build), split_text(split)
     if not (split_folder / BUILD_FILE).is_file():
         leftover = {partial_path(split_folder / BUILD_FILE)}
         if split_folder.exists() and not (
@@ -601,19 +535,15 @@ def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
                 "folder"
             )
         split_folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(split_folder / BUILD_FILE, texts[BUILD_FILE])
-    existing = read_json(split_folder / BUILD_FILE)
-    if not isinstance(existing, dict):
-        raise BenchmarkError(
-            f"{split_folder / BUILD_FILE}: expected an object, not {type(existing).__name__}"
-        )
-    for key, value in json.loads(texts[BUILD_FILE]).items():
-        if existing.get(key) != value:
+        write_atomic(split_folder / BUILD_FILE, json.dumps(data, indent=2) + "\n")
+    existing = read_settings(split_folder / BUILD_FILE)
+    for key, value in data.items():
+        if getattr(existing, key) != value:
             raise BenchmarkError(
-                f"{split_folder} holds another build: its {key} is {existing.get(key)!r}, not "
+                f"{split_folder} holds another build: its {key} is {getattr(existing, key)!r}, not "
                 f"{value!r}; name another folder"
             )
-    write_atomic(split_folder / SPLIT_FILE, texts[SPLIT_FILE])
+    write_atomic(split_folder / SPLIT_FILE, text)
 
 
 def _finish(
@@ -621,7 +551,8 @@ def _finish(
 ) -> None:
     """Write the files of the whole split, the hashes last."""
     known = {robot_hash: robot.data for robot_hash, robot in robots.items()}
-    write_atomic(split_folder / ROBOTS_FILE, records_text(split, known))
+    lines = (json.dumps(record, ensure_ascii=False) for record in robot_records(split, known))
+    write_atomic(split_folder / ROBOTS_FILE, "".join(f"{line}\n" for line in lines))
     write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
     write_atomic(split_folder / README_FILE, readme_text(split, settings))
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)

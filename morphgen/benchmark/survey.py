@@ -8,8 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
@@ -50,10 +49,6 @@ class RobotStats:
     mass: float
     """Total mass [kg]."""
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the fields as plain data for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Fault:
@@ -90,11 +85,8 @@ class SplitSurvey:
     """Results for all robots of a split."""
 
     split: Split
-    """The split."""
     train: tuple[SurveyedRobot | Fault, ...]
-    """Train robots, in the order of the split."""
     test: tuple[SurveyedRobot | Fault, ...]
-    """Test robots, in the order of the split."""
     similarity: Array
     """Similarity of train and test robots by each of ``MEASURES``, shape (n_train, n_test,
     n_measures); NaN where one of the two robots has a fault."""
@@ -149,62 +141,44 @@ def survey_split(
     jobs: int = 1,
 ) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once in each side."""
-    train_members, test_members = _firsts(split.train), _firsts(split.test)
-    done_first = len(train_members) + len(test_members)
-    total = done_first + within_train * len(train_members)
-    measurement = _Measurement(library.folders, split.max_links)
+    (train, rows), (test, columns) = _unique(split.train), _unique(split.test)
+    members, n = [*train, *test], len(train)
+    total = len(members) + n
     with part_of(total):
-        test_robots = list(parallel_map(measurement, test_members, jobs))
-    compare = _Comparison(
-        measurement,
-        tuple(None if isinstance(robot, Fault) else robot.features for robot in test_robots),
-        keep_features=within_train,
-    )
-    with part_of(total, len(test_members)):
-        train_robots = list(parallel_map(compare, train_members, jobs))
-    rows = _first_indices(split.train, train_members)
-    columns = _first_indices(split.test, test_members)
-    shape = (len(train_members), len(test_members), len(MEASURES))
-    similarity = np.array([robot.similarity for robot in train_robots]).reshape(shape)
-    pairs = None
-    if within_train:
-        compared = tuple(robot.features for robot in train_robots)
-        with part_of(total, done_first):
-            pairs = _compare_pairs(compared, jobs)
-        pairs = pairs[rows][:, rows]
+        robots = list(parallel_map(_Measurement(library, split.max_links), members, jobs))
+    known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
+    with part_of(total, len(members)):
+        compare = _Comparison(known[:n], known[n:], within_train)
+        results = list(parallel_map(compare, range(n), jobs))
+    similarity = np.array([to_test for to_test, _ in results])
+    pairs = np.full((n, n, len(MEASURES)), np.nan)
+    for i, (_, to_train) in enumerate(results):
+        pairs[i, : len(to_train)] = pairs[: len(to_train), i] = to_train
+    surveyed = [robot if isinstance(robot, Fault) else robot.surveyed for robot in robots]
     return SplitSurvey(
         split,
-        tuple(train_robots[row].surveyed for row in rows),
-        tuple(
-            robot if isinstance(robot, Fault) else robot.surveyed
-            for robot in (test_robots[column] for column in columns)
-        ),
-        similarity[rows][:, columns],
-        pairs,
+        tuple(surveyed[row] for row in rows),
+        tuple(surveyed[n + column] for column in columns),
+        similarity.reshape(n, len(test), len(MEASURES))[rows][:, columns],
+        pairs[rows][:, rows] if within_train else None,
     )
 
 
-def _firsts(members: Sequence[Member]) -> list[Member]:
-    """Return the first member with each derivation."""
-    return list({member.derivation: member for member in reversed(members)}.values())[::-1]
-
-
-def _first_indices(members: Sequence[Member], firsts: Sequence[Member]) -> list[int]:
-    """Return, for every member, the index in ``firsts`` of the one with the same derivation."""
-    index = {member.derivation: i for i, member in enumerate(firsts)}
-    return [index[member.derivation] for member in members]
+def _unique(members: Sequence[Member]) -> tuple[list[Member], list[int]]:
+    """Return the first member of each derivation, and for every member the index of that one."""
+    firsts: dict[str, Member] = {}
+    for member in members:
+        firsts.setdefault(member.derivation, member)
+    order = {derivation: i for i, derivation in enumerate(firsts)}
+    return list(firsts.values()), [order[member.derivation] for member in members]
 
 
 @dataclass(frozen=True, eq=False)
 class _Measurement:
-    """Picklable function that composes and measures a member; caches the library per worker."""
+    """Picklable function that composes and measures a member."""
 
-    folders: tuple[Path, ...]
+    library: Library
     max_links: int
-
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
 
     def __call__(self, member: Member) -> MeasuredRobot | Fault:
         try:
@@ -214,46 +188,23 @@ class _Measurement:
                 hints = (f"{part!r}{nearest(part, self.library.paths)}" for part in sorted(missing))
                 return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
             robot = compose(parsed, self.library, member.name)
-            return measure_robot(robot, self.folders, self.max_links)
+            return measure_robot(robot, self.library.folders, self.max_links)
         except MorphgenError as error:
             return Fault("body-broken", str(error))
 
 
 @dataclass(frozen=True, eq=False)
-class _ComparedRobot:
-    """A train robot and its similarity to all test robots."""
-
-    surveyed: SurveyedRobot | Fault
-    features: Features | None
-    """None if it has a fault or the features are not needed, because they are large."""
-    similarity: Array
-    """Similarity by each of ``MEASURES``, shape (n_test, n_measures)."""
-
-
-@dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Picklable function that measures a train robot and compares it with all test robots."""
+    """Picklable function that compares a train robot with the test robots and those before it."""
 
-    measurement: _Measurement
-    tests: tuple[Features | None, ...]
-    keep_features: bool
+    train: tuple[Features | None, ...]
+    test: tuple[Features | None, ...]
+    within_train: bool
 
-    def __call__(self, member: Member) -> _ComparedRobot:
-        measured = self.measurement(member)
-        if isinstance(measured, Fault):
-            return _ComparedRobot(measured, None, _similarity(None, self.tests))
-        kept = measured.features if self.keep_features else None
-        return _ComparedRobot(measured.surveyed, kept, _similarity(measured.features, self.tests))
-
-
-@dataclass(frozen=True, eq=False)
-class _PairComparison:
-    """Picklable function that compares a robot with all robots before it."""
-
-    robots: tuple[Features | None, ...]
-
-    def __call__(self, index: int) -> Array:
-        return _similarity(self.robots[index], self.robots[:index])
+    def __call__(self, index: int) -> tuple[Array, Array]:
+        before = self.train[:index] if self.within_train else ()
+        robot = self.train[index]
+        return _similarity(robot, self.test), _similarity(robot, before)
 
 
 def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Array:
@@ -262,15 +213,6 @@ def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Ar
     for row, other in zip(values, others, strict=True):
         if robot is not None and other is not None:
             row[:] = [measure.function(other, robot) for measure in MEASURES.values()]
-    return values
-
-
-def _compare_pairs(robots: tuple[Features | None, ...], jobs: int) -> Array:
-    """Return the similarity of n robots to each other, shape (n, n, n_measures); NaN to itself."""
-    values = np.full((len(robots), len(robots), len(MEASURES)), np.nan)
-    rows = parallel_map(_PairComparison(robots), range(len(robots)), jobs)
-    for i, row in enumerate(rows):
-        values[i, :i] = values[:i, i] = row
     return values
 
 
@@ -287,23 +229,18 @@ def statistics(
     *,
     jobs: int = 1,
 ) -> dict[str, object]:
-    """Compute the statistics that the file of a split contains.
-
-    Returns:
-        Plain data; see ``summarize_survey``.
-    """
+    """Compute the statistics that the file of a split contains; see ``summarize_survey``."""
     return summarize_survey(survey_split(split, library, jobs=jobs))
 
 
 def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
     """Compute the statistics of a surveyed split.
 
-    Returns:
-        For ``train`` and ``test``: the number of ``robots`` and of distinct ``bodies``; the means
-        of ``links``, ``movable`` joints (mimic joints included) and movable joints between root and
-        tool (``movable_to_tool``); mean, minimum and maximum of ``mass`` [kg] and ``reach`` [m]. A
-        robot with two tasks counts twice. For ``cosine``: mean, minimum and maximum of the cosine
-        similarity over all pairs of a test and a train robot.
+    For ``train`` and ``test``: the number of ``robots`` and of distinct ``bodies``; the means of
+    ``links``, ``movable`` joints (mimic joints included) and movable joints between root and tool
+    (``movable_to_tool``); mean, minimum and maximum of ``mass`` [kg] and ``reach`` [m]. A robot
+    with two tasks counts twice. For ``cosine``: mean, minimum and maximum of the cosine similarity
+    over all pairs of a test and a train robot.
     """
     return {
         **{side: _side(survey, side) for side in SIDES},
@@ -321,17 +258,15 @@ def _side(survey: SplitSurvey, side: Side) -> dict[str, object]:
     robots = survey.composed(side)
     if not robots:
         raise BenchmarkError(f"split {survey.split.name!r} has a side without robots")
-    stats = [robot.stats for robot in robots]
+    values = {
+        key: [float(getattr(robot.stats, key)) for robot in robots] for key in (*COUNTED, *MEASURED)
+    }
     return {
         "robots": len(robots),
         "bodies": len({robot.robot_hash for robot in robots}),
-        **{key: round(float(np.mean(_column(stats, key))), DIGITS) for key in COUNTED},
-        **{key: mean_and_range(_column(stats, key)) for key in MEASURED},
+        **{key: round(float(np.mean(values[key])), DIGITS) for key in COUNTED},
+        **{key: mean_and_range(values[key]) for key in MEASURED},
     }
-
-
-def _column(stats: Sequence[RobotStats], key: str) -> list[float]:
-    return [float(getattr(robot, key)) for robot in stats]
 
 
 PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tasks'"
@@ -344,13 +279,12 @@ class PaperRow:
     title: str
     """Name of the set of robots in the paper."""
     links: float
-    """Mean number of links."""
     movable: float
-    """Mean number of movable joints."""
+    """Movable joints."""
     movable_to_tool: float | None
-    """Mean number of movable joints between root and tool; None for the paper's dash."""
+    """Movable joints between root and tool; None for the paper's dash."""
     cosine: float
-    """Mean cosine similarity over pairs of a test and a train robot."""
+    """Cosine similarity, over pairs of a test and a train robot."""
 
 
 PAPER: Mapping[str, PaperRow] = MappingProxyType(
@@ -368,12 +302,7 @@ PAPER: Mapping[str, PaperRow] = MappingProxyType(
 
 def paper_row(split: str) -> PaperRow | None:
     """Return the paper's row for a scenario such as ``extrapolation/arms/reach``, if it has one."""
-    return PAPER.get(robot_set(split))
-
-
-def robot_set(split: str) -> str:
-    """Return the name of a scenario's set of robots: the scenario's name without the task."""
-    return "/".join(split.split("/")[:2])
+    return PAPER.get("/".join(split.split("/")[:2]))
 
 
 DIFFICULTY_DIGITS = 6
@@ -483,7 +412,10 @@ def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDiffic
                 robot.stats.movable_to_tool,
                 robot.stats.links,
                 _rounded(robot.stats.reach),
-                dict(_nearest(split.train, similarity)),
+                {
+                    name: NearestTrain(train, _rounded(value))
+                    for name, train, value in nearest_train(split.train, similarity)
+                },
                 {
                     name: BaselineResult(_rounded(found[key].score), _rounded(found[key].success))
                     for name, found in results.items()
@@ -493,11 +425,7 @@ def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDiffic
 
 
 def train_similarity(survey: SplitSurvey, side: Side, index: int) -> Array:
-    """Return the similarity of a robot to the train robots, shape (n_train, n_measures).
-
-    Returns:
-        Values of ``MEASURES``; NaN where a train robot is the robot itself.
-    """
+    """Return the similarity to the train robots, NaN to itself, shape (n_train, n_measures)."""
     if survey.train_similarity is None:
         raise ValueError("the survey has no similarity of train robots; expected within_train=True")
     if side == "test":
@@ -507,12 +435,15 @@ def train_similarity(survey: SplitSurvey, side: Side, index: int) -> Array:
     return np.where(is_other[:, None], survey.train_similarity[:, index], np.nan)
 
 
-def _nearest(train: tuple[Member, ...], similarity: Array) -> Iterator[tuple[str, NearestTrain]]:
-    """Yield the nearest train robot by the name of each measure."""
+def nearest_train(train: Sequence[Member], similarity: Array) -> Iterator[tuple[str, str, float]]:
+    """Yield each measure, the train robot that is nearest by it, and its similarity.
+
+    similarity: Similarity to the train robots, shape (n_train, n_measures).
+    """
     for name, values in zip(MEASURES, similarity.T, strict=True):
         best = most_alike(values, name)
         if best is not None:
-            yield name, NearestTrain(train[best].name, _rounded(values[best]))
+            yield name, train[best].name, float(values[best])
 
 
 def _rounded(value: float) -> float:

@@ -214,16 +214,6 @@ def decode_primitive(numbers: Array) -> Primitive | None:
     return Sphere(x) if kind == "sphere" else Cylinder(x, z)
 
 
-def encode_kind(kind: JointKind) -> tuple[float, ...]:
-    """Encode a joint type; a continuous joint counts as revolute."""
-    return _one_hot("revolute" if kind == "continuous" else kind, KINDS)
-
-
-def decode_kind(numbers: Array) -> JointKind:
-    """Decode the 3 numbers of ``joint type``."""
-    return KINDS[_hot_index(numbers, KINDS)]
-
-
 def encode_pose(pose: Pose) -> tuple[float, ...]:
     """Encode a pose as its position [m] and its quaternion (w, x, y, z) with w >= 0."""
     return (*pose.position, *rotation.normalize(pose.quaternion))
@@ -275,19 +265,6 @@ def _require_sizes(sizes: Sequence[float]) -> None:
 def _format(numbers: Sequence[float]) -> str:
     return f"[{', '.join(f'{number:g}' for number in numbers)}]"
 
-
-__all__ = [
-    "LAYOUT",
-    "MAX_LINKS",
-    "TOKEN_SIZE",
-    "Field",
-    "encode_joint_positions",
-    "normalize_positions",
-    "pad_tokens",
-    "robot_from_tokens",
-    "tokens",
-    "tokens_npz",
-]
 
 T = TypeVar("T")
 
@@ -419,7 +396,13 @@ def robot_from_tokens(
     for token in link_tokens:
         _require_index(token, max_links - 1)
     parents = [_read_parent(token, max_links - 1) for token in link_tokens]
-    shapes = {f"link{token.index}": shape for token in link_tokens if (shape := _read_shape(token))}
+    shapes = {}
+    for token in link_tokens:
+        if primitive := token.decode(GEOMETRY, decode_primitive):
+            pose = token.decode(SHAPE_POSE, decode_pose)
+            shapes[f"link{token.index}"] = Shape(primitive, pose)
+        else:
+            token.require_zeros(SHAPE_POSE, why="the link has no geometry")
     tools = [token for token in link_tokens if token.decode(TOOL_FLAG, decode_flag)]
     if len(tools) > 1:
         raise tools[1].error(TOOL_FLAG, f"link {tools[0].index} is flagged, too; only one can")
@@ -438,7 +421,9 @@ def robot_from_tokens(
 
 def _write_joint(row: Array, joint: Joint | None) -> None:
     """Write all joint fields but the position; the root counts as fixed at the identity."""
-    row[KIND.columns] = encode_kind(joint.kind if joint else "fixed")
+    kind = joint.kind if joint else "fixed"
+    # A continuous joint counts as revolute.
+    row[KIND.columns] = _one_hot("revolute" if kind == "continuous" else kind, KINDS)
     row[ORIGIN.columns] = encode_pose(joint.T_parent_joint if joint else IDENTITY)
     if joint is not None and joint.is_movable:
         row[AXIS.columns] = joint.unit_axis
@@ -493,14 +478,6 @@ def _read_parent(token: _Token, scale: int) -> int:
     return parent
 
 
-def _read_shape(token: _Token) -> Shape | None:
-    primitive = token.decode(GEOMETRY, decode_primitive)
-    if primitive is None:
-        token.require_zeros(SHAPE_POSE, why="the link has no geometry")
-        return None
-    return Shape(primitive, token.decode(SHAPE_POSE, decode_pose))
-
-
 def _require_base(token: _Token) -> None:
     joint, _ = _read_joint(token, -1)
     if joint.is_movable:
@@ -511,7 +488,7 @@ def _require_base(token: _Token) -> None:
 
 def _read_joint(token: _Token, parent: int) -> tuple[Joint, float]:
     """Decode the joint that attaches a link, and its position."""
-    kind = token.decode(KIND, decode_kind)
+    kind = token.decode(KIND, lambda numbers: KINDS[_hot_index(numbers, KINDS)])
     name, child = f"joint{token.index}", f"link{token.index}"
     origin = token.decode(ORIGIN, decode_pose)
     if kind == "fixed":

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,10 @@ from morphgen.benchmark.split_folder import (
     read_settings,
     read_sums,
     read_tokens,
-    records,
     require_split_folder,
     robot_data,
     robot_paths,
+    robot_records,
     same,
     token_tables,
 )
@@ -64,13 +64,13 @@ from morphgen.grammar.library import Library
 from morphgen.processes import parallel_map
 from morphgen.typing import Array
 
-TABLE_TOLERANCE = 1e-3
-"""Tolerance of the reach [m] and of similarities, which depend on primitives that may be fitted on
-this machine, see ``verify.FITTED_TOLERANCE``."""
+FITTED_TOLERANCE = 1e-3
+"""Tolerance of what depends on primitives that may be fitted on this machine: the token numbers of
+a link's primitive, the reach [m] and similarities."""
 _MAX_SHOWN = 100
 """Largest number of characters of a cell in a message."""
 _NUMBERS = ("reach", *MEASURES)
-"""Columns that are compared with ``TABLE_TOLERANCE``."""
+"""Columns that are compared with ``FITTED_TOLERANCE``."""
 _NEAREST = {nearest_column(name): name for name in MEASURES}
 """Measure by the column of its nearest train robot."""
 
@@ -142,27 +142,18 @@ def _row_differences(
 ) -> Iterator[str]:
     """Yield how a line differs from a robot's row, given its similarity to every train robot."""
     for column, found, expected in zip(STRUCTURAL, line, structural_cells(row), strict=False):
-        if found == expected or (column in _NUMBERS and _is_close(found, expected)):
+        if found == expected:
             continue
+        with suppress(ValueError):  # of a cell that is no number
+            if column in _NUMBERS and abs(float(found) - float(expected)) <= FITTED_TOLERANCE:
+                continue
         if column in _NEAREST and found in similarity:
             # Of nearly equal train robots another one may be the nearest on another machine.
             measure, value = _NEAREST[column], similarity[found]
             best = row.nearest.get(measure)
-            if best and abs(value[tuple(MEASURES).index(measure)] - best.value) <= TABLE_TOLERANCE:
+            if best and abs(value[tuple(MEASURES).index(measure)] - best.value) <= FITTED_TOLERANCE:
                 continue
         yield f"{column} of {row.robot} is {found[:_MAX_SHOWN]!r}, not {expected!r}"
-
-
-def _is_close(found: str, expected: str) -> bool:
-    """Return whether two texts are numbers that differ by ``TABLE_TOLERANCE`` or less."""
-    try:
-        return abs(float(found) - float(expected)) <= TABLE_TOLERANCE
-    except ValueError:
-        return False
-
-
-FITTED_TOLERANCE = 1e-3
-"""Tolerance of the token numbers of a link's primitive, which may be fitted on this machine."""
 
 
 @dataclass(frozen=True)
@@ -234,44 +225,36 @@ def require_unchanged(folder: Path, name: str) -> None:
 
 def compare_robots(split: Split, library: Library, *, jobs: int = 1) -> tuple[Difference, ...]:
     """Compose every robot of a split and compare its hash; see ``verify``."""
-    inspector = _Inspector(library.folders, split.max_links)
+    inspector = _Inspector(library, split.max_links)
     return tuple(_robot_differences(split, _inspect(split, inspector, jobs)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Inspection:
-    """Result of inspecting a robot: its differences and, in a split folder, its data."""
-
-    differences: tuple[str, ...]
-    data: RobotData | None = None
+_Inspection = tuple[list[str], RobotData | None]
+"""The differences of a robot and, in a split folder, its data."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Inspector:
     """Compose a member, and compare it with its folder; sent to worker processes."""
 
-    folders: tuple[Path, ...]
+    library: Library
     max_links: int
     split_folder: Path | None = None
     light: bool = False
     paths: Mapping[str, str] = field(default_factory=dict)
 
-    @cached_property
-    def library(self) -> Library:
-        return Library(self.folders)
-
     def __call__(self, member: Member) -> _Inspection:
         try:
             robot = compose_member(member, self.library)
             if self.split_folder is None:
-                return _Inspection(())
+                return [], None
             folder = self.split_folder / self.paths[member.robot_hash]
             # Members with the same robot share the folder of the first one, which is compared.
             is_first = folder.name == member.name
             lines = differences(folder, robot, light=self.light) if is_first else []
-            return _Inspection(tuple(lines), robot_data(robot, self.folders, self.max_links))
+            return lines, robot_data(robot, self.library, self.max_links)
         except MorphgenError as error:
-            return _Inspection((str(error),))
+            return [str(error)], None
 
 
 def _inspect(split: Split, inspector: _Inspector, jobs: int) -> dict[tuple[str, str], _Inspection]:
@@ -286,16 +269,16 @@ def _robot_differences(
     split: Split, inspected: Mapping[tuple[str, str], _Inspection]
 ) -> Iterator[Difference]:
     for _, member in sided_members(split):
-        for why in inspected[member.derivation, member.robot_hash].differences:
+        for why in inspected[member.derivation, member.robot_hash][0]:
             yield Difference(member.name, why)
 
 
 def _folder_differences(
     folder: Path, split: Split, library: Library, jobs: int
 ) -> Iterator[Difference]:
-    id_, light = read_settings(folder / BUILD_FILE)
-    if id_ != split_id(split):
-        yield Difference(BUILD_FILE, f"it is of split {id_}, not of {SPLIT_FILE}")
+    build = read_settings(folder / BUILD_FILE)
+    if build.split != split_id(split):
+        yield Difference(BUILD_FILE, f"it is of split {build.split}, not of {SPLIT_FILE}")
     try:
         paths = robot_paths(split)
     except BenchmarkError as error:
@@ -303,7 +286,7 @@ def _folder_differences(
         return
     files = list(_file_differences(folder))
     yield from files
-    inspector = _Inspector(library.folders, split.max_links, folder, light, paths)
+    inspector = _Inspector(library, split.max_links, folder, build.light, paths)
     inspected = _inspect(split, inspector, jobs)
     # A changed file explains the differences of its robot.
     explained = {difference.where for difference in files}
@@ -311,9 +294,7 @@ def _folder_differences(
         if difference.where not in explained:
             yield difference
     known = {
-        robot_hash: inspection.data
-        for (_, robot_hash), inspection in inspected.items()
-        if inspection.data is not None
+        robot_hash: data for (_, robot_hash), (_, data) in inspected.items() if data is not None
     }
     if known.keys() >= paths.keys():
         yield from _record_differences(folder / ROBOTS_FILE, split, known)
@@ -345,10 +326,10 @@ def _record_differences(
     """Yield entries of ``robots.jsonl`` that differ from the robots."""
     try:
         stored = read_records(path)
-    except BenchmarkError as error:
+    except MorphgenError as error:
         yield Difference(path.name, str(error))
         return
-    expected = records(split, known)
+    expected = robot_records(split, known)
     if len(stored) != len(expected):
         yield Difference(path.name, f"it has {len(stored)} robots, not {len(expected)}")
         return
@@ -366,7 +347,7 @@ def _token_differences(
     """Yield robots whose rows of ``tokens.npz`` differ from their tokens."""
     try:
         names, tokens, mask = read_tokens(path)
-    except BenchmarkError as error:
+    except MorphgenError as error:
         yield Difference(path.name, str(error))
         return
     computed, computed_mask = token_tables(split, known)

@@ -47,15 +47,29 @@ LARGEST_MATRIX = 20
 )
 def similarity(args: argparse.Namespace) -> None:
     """Compare the robots, print the result and write the files."""
-    from morphgen.benchmark.similarity import get_measure
-    from morphgen.formats.files import write_file
+    from morphgen.benchmark.similarity import get_measure, similarity_matrix
+    from morphgen.formats.files import require_writable_file, write_file
 
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
-    _require_writable(args)
-    features, names = _features(args)
-    matrices = _matrices(features, measures, args)
-    writers = ((args.heatmap, _heatmap), (args.map, _map), (args.csv, _csv))
-    contents = {path: write(names, matrices) for path, write in writers if path is not None}
+    outputs = {
+        "--heatmap": (args.heatmap, ".png", _heatmap),
+        "--map": (args.map, ".png", _map),
+        "--csv": (args.csv, ".csv", _csv),
+    }
+    given = {option: row for option, row in outputs.items() if row[0] is not None}
+    files = [path.resolve() for path, _, _ in given.values()]
+    for option_name, (path, suffix, _) in given.items():  # before the long work
+        require_writable_file(path, option_name, suffix)
+        if files.count(path.resolve()) > 1:
+            raise BenchmarkError(f"{path}: is named for two files; name another for one of them")
+    robots, names = _features(args)
+    matrices: dict[str, Array] = {}
+    pairs = len(measures) * len(names) * (len(names) + 1) // 2
+    with bar(args, "comparing", "pair", pairs):
+        for name in measures:
+            with part_of(pairs, len(matrices) * pairs // len(measures)):
+                matrices[name] = similarity_matrix(robots, name)
+    contents = {path: write(names, matrices) for path, _, write in given.values()}
     for path, content in contents.items():
         write_file(path, content)
     results = {
@@ -65,30 +79,13 @@ def similarity(args: argparse.Namespace) -> None:
         }
         for name, matrix in matrices.items()
     }
-    files = [str(path) for path in contents]
+    data = {"robots": names, "measures": results, "files": list(map(str, contents))}
 
     def text() -> str:
         tables = "\n\n".join(_text(names, *item) for item in matrices.items())
-        return "\n".join([tables, *files])
+        return "\n".join([tables, *map(str, contents)])
 
-    opt.print_result(args, {"robots": names, "measures": results, "files": files}, text)
-
-
-def _require_writable(args: argparse.Namespace) -> None:
-    """Refuse files that cannot be written, before the long work."""
-    from morphgen.formats.files import require_writable_file
-
-    for option_name, path, suffix in (
-        ("--heatmap", args.heatmap, ".png"),
-        ("--map", args.map, ".png"),
-        ("--csv", args.csv, ".csv"),
-    ):
-        if path is not None:
-            require_writable_file(path, option_name, suffix)
-    given = [path for path in (args.heatmap, args.map, args.csv) if path is not None]
-    for path in given:
-        if sum(other.resolve() == path.resolve() for other in given) > 1:
-            raise BenchmarkError(f"{path}: is named for two files; name another for one of them")
+    opt.print_result(args, data, text)
 
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
@@ -110,20 +107,6 @@ def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
     if len(set(names)) < len(names):
         names = [source.label for source, _ in pairs]
     return computed, names
-
-
-def _matrices(
-    robots: Sequence[Features], measures: Sequence[str], args: argparse.Namespace
-) -> dict[str, Array]:
-    from morphgen.benchmark.similarity import similarity_matrix
-
-    pairs = len(measures) * len(robots) * (len(robots) + 1) // 2
-    matrices: dict[str, Array] = {}
-    with bar(args, "comparing", "pair", pairs):
-        for name in measures:
-            with part_of(pairs, len(matrices) * pairs // len(measures)):
-                matrices[name] = similarity_matrix(robots, name)
-    return matrices
 
 
 def _text(names: Sequence[str], measure: str, values: Array) -> str:
@@ -170,10 +153,9 @@ def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import Panel, heatmap_png
     from morphgen.benchmark.similarity import get_measure
 
-    panels = [
-        Panel(_title(name), values, get_measure(name).larger_is_more_alike)
-        for name, values in matrices.items()
-    ]
+    panels = []
+    for name, values in matrices.items():
+        panels.append(Panel(_title(name), values, get_measure(name).larger_is_more_alike))
     return heatmap_png(names, panels)
 
 
@@ -181,10 +163,9 @@ def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import MapPanel, map_png
     from morphgen.benchmark.similarity import classical_mds, to_distances
 
-    panels = [
-        MapPanel(_title(name), classical_mds(to_distances(values, name)))
-        for name, values in matrices.items()
-    ]
+    panels = []
+    for name, values in matrices.items():
+        panels.append(MapPanel(_title(name), classical_mds(to_distances(values, name))))
     return map_png(names, panels)
 
 
@@ -326,10 +307,7 @@ def _layout_text() -> str:
 
     from morphgen.benchmark.tokens import LAYOUT
 
-    rows = [
-        (field.name, f"{field.start}:{field.columns.stop}", field.size, field.content)
-        for field in LAYOUT
-    ]
+    rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
     return tabulate(rows, ("field", "columns", "size", "content"), disable_numparse=True)
 
 

@@ -115,12 +115,9 @@ def _goals_text(results: Sequence[GoalResult], seed: int) -> str:
         if result.goals is None:
             lines.append(f"{robot}: {result.error}")
         elif result.certificate_errors:
-            more = (
-                f" (and {len(result.certificate_errors) - 1} more)"
-                if result.certificate_errors[1:]
-                else ""
-            )
-            lines.append(f"{robot}: {result.certificate_errors[0]}{more}")
+            first, *others = result.certificate_errors
+            more = f" (and {len(others)} more)" if others else ""
+            lines.append(f"{robot}: {first}{more}")
     complete = sum(result.goals is not None for result in results)
     return "\n".join([*lines, f"{complete} of {len(results)} goal sets are complete, seed {seed}"])
 
@@ -139,17 +136,13 @@ def _goals_row(result: GoalResult) -> tuple[str, ...]:
 def _data(results: Sequence[GoalResult], seed: int) -> dict[str, object]:
     from morphgen.tasks.goals.split_goals import goal_record
 
-    sets = [
-        goal_record(result)
-        | {
-            "certified": None
-            if result.certificate_errors is None
-            else not result.certificate_errors,
-            "unproven": list(result.certificate_errors or ()),
-        }
-        for result in results
-        if result.goals
-    ]
+    sets = []
+    for result in results:
+        if result.goals:
+            errors = result.certificate_errors
+            certified = None if errors is None else not errors
+            unproven = list(errors or ())
+            sets.append({**goal_record(result), "certified": certified, "unproven": unproven})
     failures = [
         {"robot": result.robot, "side": result.side, "task": result.task, "why": result.error}
         for result in results
@@ -282,10 +275,9 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: s
 
 
 def _by_code(findings: Sequence[Finding]) -> dict[str, list[Finding]]:
-    groups: dict[str, list[Finding]] = {}
-    for finding in findings:
-        groups.setdefault(finding.code, []).append(finding)
-    return groups
+    """Return the findings of each code, in the order of the first of each."""
+    codes = dict.fromkeys(finding.code for finding in findings)
+    return {code: [each for each in findings if each.code == code] for code in codes}
 
 
 def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
@@ -320,23 +312,16 @@ def build(args: argparse.Namespace) -> None:
     settings = BuildSettings(light=args.light, picture=args.picture)
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     goals = make_goals(args, split, config) if args.goals else []
+    library = opt.library_of(args)
     with bar(args, "building"):
-        report = build_with_goals(
-            split,
-            args.out,
-            opt.library_of(args),
-            settings,
-            goals,
-            config,
-            jobs=args.jobs,
-        )
+        report = build_with_goals(split, args.out, library, settings, goals, config, jobs=args.jobs)
     written, kept = report.num_written, report.num_kept
     data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
     lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
     if args.goals:
         data["goals"] = len(goals)
         lines.append(f"{len(goals)} goal sets, seed {config.seed}")
-    if limited := restricted(licenced_parts(split, opt.library_of(args))):
+    if limited := restricted(licenced_parts(split, library)):
         data["restricted"] = [part.as_dict() for part in limited]
         lines += [f"restricted: {restriction_text(part)}" for part in limited]
     lines.append(f"verify it anywhere: morphgen split verify {report.folder}")
@@ -491,7 +476,7 @@ def list_splits(args: argparse.Namespace) -> None:
     from morphgen.benchmark.split_file import read_split, split_names
 
     splits = [read_split(name) for name in split_names()]
-    data = [
+    data: list[dict[str, Any]] = [
         {
             "name": split.name,
             "regime": split.regime,
@@ -508,15 +493,11 @@ def list_splits(args: argparse.Namespace) -> None:
     headers = ("name", "regime", "task", "train", "test", "categories", "summary")
     rows = [
         (
-            split.name,
-            split.regime,
-            ", ".join(_tasks(split)),
-            len(split.train),
-            len(split.test),
-            f"{', '.join(_categories(split.train))} -> {', '.join(_categories(split.test))}",
-            split.summary,
+            *(row["name"], row["regime"], ", ".join(row["tasks"]), row["train"], row["test"]),
+            f"{', '.join(row['train_categories'])} -> {', '.join(row['test_categories'])}",
+            row["summary"],
         )
-        for split in splits
+        for row in data
     ]
     opt.print_result(args, data, lambda: tabulate(rows, headers))
 

@@ -4,44 +4,39 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
-from morphgen.errors import BenchmarkError, nearest
-from morphgen.tasks.registry import TASKS
+from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.generate import SplitRequest
-    from morphgen.benchmark.new_split import RobotChoice
     from morphgen.benchmark.split import Split
     from morphgen.grammar.library import Library
 
 
 def new_split(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
+    from morphgen.api.splits import split as choose
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
-    from morphgen.benchmark.new_split import choose_robots
     from morphgen.benchmark.split import split_id
-    from morphgen.benchmark.split_file import require_split_name, split_paths, write_new_splits
-    from morphgen.benchmark.survey import statistics
+    from morphgen.benchmark.split_file import split_paths, write_new_splits
 
-    request = _request(args)
-    require_split_name(request.name)
-    library = opt.library_of(args)
-    total = request.train[-1] + request.test if request.train else None
+    try:
+        sizes = tuple(int(text) for text in args.train.split(",")) if args.train else ()
+    except ValueError as error:
+        raise BenchmarkError(
+            f"--train {args.train}: expected a whole number, or several such as 10,30,100"
+        ) from error
+    total = sizes[-1] + args.test if sizes else None
     with bar(args, "sampling", total=total):
-        splits = choose_robots(_choice(args), request, library, jobs=args.jobs)
-    if args.statistics:
-        splits = tuple(
-            replace(split, statistics=statistics(split, library, jobs=args.jobs))
-            for split in splits
-        )
+        loaded = choose(args.name or "", train=sizes, library=args.library, **_choice(args))
+    splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)
+    library = opt.library_of(args)
     parts = [licenced_parts(split, library) for split in splits]
     data = [
         {
@@ -62,43 +57,25 @@ def new_split(args: argparse.Namespace) -> None:
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 
-def _request(args: argparse.Namespace) -> SplitRequest:
-    from morphgen.benchmark.generate import SplitRequest
-    from morphgen.benchmark.new_split import default_name
-    from morphgen.benchmark.tokens import MAX_LINKS
-
-    tasks = [text.strip() for text in args.task.split(",")]
-    for i, task in enumerate(tasks):
-        if task not in TASKS:
-            raise BenchmarkError(f"--task {args.task}: unknown task {task!r}{nearest(task, TASKS)}")
-        if task in tasks[:i]:
-            raise BenchmarkError(f"--task {args.task}: {task!r} is named twice")
-    try:
-        train = tuple(int(text) for text in args.train.split(",")) if args.train else ()
-    except ValueError as error:
-        raise BenchmarkError(
-            f"--train {args.train}: expected a whole number, or several such as 10,30,100"
-        ) from error
-    name = args.name or default_name(_choice(args), tasks, args.obstacles, args.seed)
-    links = MAX_LINKS if args.max_links is None else args.max_links
-    return SplitRequest(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
-
-
-def _choice(args: argparse.Namespace) -> RobotChoice:
-    """Return the rules that the options of a regime name."""
-    from morphgen.benchmark.new_split import RobotChoice
-
-    grammar = getattr(args, "grammar", "")
-    return RobotChoice(
-        args.regime,
-        hold_out=tuple(getattr(args, "hold_out", ())),
-        robots=tuple(getattr(args, "patterns", ())),
-        grammar=(grammar,) if args.regime == "interpolation" else _names(grammar),
-        train_category=_names(getattr(args, "train_category", "")),
-        test_category=_names(getattr(args, "test_category", "")),
-        hull=getattr(args, "hull", ""),
-        similarity=getattr(args, "similarity", ""),
-    )
+def _choice(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of a regime under the names of the arguments of ``morphgen.split``."""
+    choice = {
+        "regime": args.regime,
+        "test": args.test,
+        "task": _names(args.task),
+        "obstacles": args.obstacles,
+        "seed": args.seed,
+        "statistics": args.statistics,
+        "jobs": args.jobs,
+        "robots": getattr(args, "patterns", ()),
+    }
+    if args.max_links is not None:
+        choice["max_links"] = args.max_links
+    for key in ("hold_out", "hull", "similarity"):
+        choice[key] = getattr(args, key, None) or ()
+    for key in ("grammar", "train_category", "test_category"):
+        choice[key] = _names(getattr(args, key, ""))
+    return {key: value for key, value in choice.items() if value != ()}
 
 
 def _names(text: str) -> tuple[str, ...]:

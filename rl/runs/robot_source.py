@@ -28,7 +28,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
-from morphgen.grammar.library import default_library
+from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.processes import parallel_map
 from morphgen.progress import own_progress, show_progress
@@ -517,7 +517,7 @@ class _Drawer:
 
     @cached_property
     def _factory(self) -> RobotFactory:
-        return RobotFactory(self.folders, max_links=LARGEST_MAX_LINKS)
+        return RobotFactory(Library(self.folders), max_links=LARGEST_MAX_LINKS)
 
     def __call__(self, recipe: SampledRecipe) -> _Draw:
         """Draw a robot."""

@@ -202,14 +202,6 @@ def test_nested_sizes_share_the_test_robots_and_train_all_their_parts():
         require_sound(each, ["ee=plane"])
 
 
-def test_every_robot_does_every_task():
-    example = made(["ee=plane"], 4, tasks=("reach", "push"))
-    assert [m.task for m in example.test] == ["reach", "push"]
-    assert example.test[0].name.endswith("+plane-reach")
-    require = audit(example, LIBRARY)
-    assert require.findings == ()
-
-
 @pytest.mark.parametrize(
     ("rules", "sizes", "changes", "message"),
     [

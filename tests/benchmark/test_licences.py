@@ -2,7 +2,6 @@
 
 import pytest
 
-import morphgen
 from helpers.splits import combined
 from morphgen.benchmark.licences import (
     LICENCES,
@@ -11,7 +10,6 @@ from morphgen.benchmark.licences import (
     UNKNOWN,
     find_licence,
     licence_ids,
-    licence_lines,
     licenced_parts,
     require_allowed,
     restricted,
@@ -78,11 +76,3 @@ def test_a_restricted_licence_must_be_allowed():
     require_allowed(split, parts, ("CC-BY-NC-ND-4.0",))
     with pytest.raises(BenchmarkError, match=r"no part of .* has this licence; did you mean 'CC-"):
         require_allowed(split, parts, ("CC-BY-NC-ND-3.0",))
-
-
-def test_python_and_text_name_restricted_parts():
-    split = morphgen.split("extrapolation/arms/reach")
-    lines = licence_lines(split.licences())
-    assert lines[0] == "licences: Apache-2.0, BSD-2-Clause, BSD-3-Clause, CC-BY-NC-ND-4.0, MIT"
-    assert lines[1].startswith("restricted: sake_ez (CC-BY-NC-ND-4.0: ")
-    assert len(lines) == 2

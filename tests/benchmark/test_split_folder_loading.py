@@ -7,25 +7,24 @@ import zipfile
 import numpy as np
 import pytest
 
-from morphgen.benchmark.split_folder import Robots, load_split_folder
-from morphgen.errors import BenchmarkError
+from morphgen.benchmark.split_folder import load_split_folder
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats import zip_files as npz_files
 
 
 def test_loading_returns_plain_records_with_tokens(whole, example_split):
     built = load_split_folder(whole)
-    assert [robot["name"] for robot in built] == [
+    assert [robot["name"] for robot in built.robots] == [
         m.name for m in (*example_split.train, *example_split.test)
     ]
-    assert [len(each) for each in (built, built.train, built.test)] == [4, 3, 1]
-    for i, robot in enumerate(built):
+    assert [len(each) for each in (built.robots, built.train, built.test)] == [4, 3, 1]
+    for i, robot in enumerate(built.robots):
         assert type(robot) is dict
         assert robot["side"] == ("test" if i == 3 else "train")
         np.testing.assert_array_equal(robot["tokens"], built.tokens[i])
         assert robot["mask"].sum() == robot["links"]
         assert (built.folder / robot["path"] / "robot.urdf").is_file()
     assert built.test[0]["name"] == built.train[:2][1]["name"].replace("cube", "plane")
-    assert isinstance(built.train[:2], Robots)
     assert load_split_folder(str(whole)).folder == whole
 
 
@@ -60,7 +59,7 @@ def test_unreadable_files_are_errors_that_name_the_file(whole, path, content, me
         (whole / path).unlink()
     else:
         (whole / path).write_bytes(content)
-    with pytest.raises(BenchmarkError, match=message):
+    with pytest.raises(MorphgenError, match=message):
         load_split_folder(whole)
 
 

@@ -240,3 +240,23 @@ def test_token_files_are_reproducible_and_need_no_pickle():
         assert data["layout"].tolist() == [field.name for field in LAYOUT]
         assert data["columns"].tolist() == [[f.start, f.start + f.size] for f in LAYOUT]
         assert (data["name"].item(), data["max_links"].item()) == ("arm", 23)
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "tokens.md").read_text(encoding="utf-8")
+
+
+def test_the_example_runs_and_has_the_documented_shapes():
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(code.splitlines()) < 10
+    names = {}
+    exec(code, names)
+    assert names["table"].shape == (100, 7, 48)
+    assert names["batch"].shape == (100, 23, 48)
+    assert names["mask"].shape == (23,)
+    np.testing.assert_allclose(tokens(names["again"], names["shapes"]), names["table"][0])
+
+
+def test_the_page_documents_every_field():
+    for field in LAYOUT:
+        columns = f"{field.start}:{field.columns.stop}"
+        assert f"| {field.name} | {columns} | {field.content} |" in PAGE

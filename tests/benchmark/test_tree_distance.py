@@ -273,9 +273,3 @@ def test_names_do_not_matter():
         frames=(),
     )
     assert distance(robot, other) == 0.0
-
-
-def test_similar_robots_have_smaller_distances():
-    near = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm=lwr ee=plane"))
-    far = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm3"))
-    assert 0 < near < 0.1 < far

@@ -12,13 +12,9 @@ from morphgen.benchmark.similarity import density_overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
-    FramePosition,
-    frame_pose,
-    frame_positions,
-    random_configurations,
     reach,
 )
-from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.model.tree import scale_links
 
 LWR = "arm=lwr ee=plane"
@@ -33,34 +29,6 @@ def chain(*joints, tool=(0.0, 0.0, 0.5)):
     links = tuple(Link(f"l{k}") for k in range(len(made) + 1))
     home = (0.0,) * sum(joint.is_movable for joint in made)
     return Robot("chain", links, tuple(made), (Frame("tool", links[-1].name, Pose(tool)),), home)
-
-
-def led(robot):
-    """The arm with its tool on a mimic finger."""
-    *joints, last = robot.joints
-    joints.append(replace(last, mimic=Mimic("left", -0.5, 0.1)))
-    tool = Frame("tool", "right", Pose((0.01, 0.02, 0.03)))
-    return replace(robot, name="led", joints=tuple(joints), frames=(tool,))
-
-
-@pytest.mark.parametrize(
-    "robot",
-    [
-        arm(),
-        led(arm()),
-        morphgen.compose("arm=lwr ee=claw"),
-        morphgen.compose("base=gantry arm=ur5 ee=stick"),
-        morphgen.compose("chain beads=2"),
-        chain(("revolute", (0.1, 0.2, 0.3), (0.0, 0.0, -1.0)), ("revolute", (0, 0, 1), (1, 2, -9))),
-    ],
-    ids=lambda robot: robot.name,
-)
-def test_the_density_agrees_with_forward_kinematics(robot):
-    q = random_configurations(robot, 100, np.random.default_rng(0))
-    expected = frame_pose(robot, q)[:, :3, 3]
-    np.testing.assert_allclose(frame_positions(robot, q.T).T, expected, atol=1e-12)
-    position = FramePosition(robot)
-    np.testing.assert_allclose([position(row) for row in q.tolist()], expected, atol=1e-12)
 
 
 def test_the_density_is_normalized_and_reproducible():

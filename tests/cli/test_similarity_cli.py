@@ -12,7 +12,6 @@ import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
 from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
-from morphgen.cli import similarity as command
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
 
@@ -38,10 +37,6 @@ def light_set(run):
     """``set``: four cubes of a light set."""
     assert run("sample", "cubes", "-n", "4", "--light", "--out", "set", "--json")[0] == 0
     return Path("set")
-
-
-def test_the_measures_are_those_of_the_room():
-    assert (*MEASURES, "all") == command.MEASURES
 
 
 def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
@@ -101,18 +96,6 @@ def test_paths_can_be_mixed_and_duplicates_are_dropped(run, bundles, light_set):
     names = json.loads(out)["robots"]
     assert len(names) == len(set(names)) == 8
     assert names[0] == "robots/lwr-plane"  # two robots are called lwr-plane
-
-
-def test_robots_of_a_light_set_are_composed(run, light_set):
-    code, out, _ = run("similarity", light_set, "--measure", "cosine", "--json")
-    assert code == 0
-    data = json.loads(out)
-    assert data["robots"] == [f"cubes-{i:06d}" for i in range(4)]
-    robots = list(morphgen.sample("cubes", 4))
-    robot_features = [features(robot, token_shapes(robot)) for robot in robots]
-    np.testing.assert_allclose(
-        data["measures"]["cosine"]["matrix"], similarity_matrix(robot_features, "cosine"), atol=1e-9
-    )
 
 
 def test_more_than_twenty_robots_list_the_nearest_of_each(run):
@@ -205,7 +188,3 @@ def test_paths_that_are_not_robots_are_rejected(paths, reason, refused, bundles,
 )
 def test_unwritable_output_is_rejected_before_computing(arguments, reason, refused, bundles):
     assert reason in refused("similarity", "robots", *arguments)
-
-
-def test_unknown_measure_is_rejected(refused, bundles):
-    assert "invalid choice: 'cosin'" in refused("similarity", "robots", "--measure", "cosin")

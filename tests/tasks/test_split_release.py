@@ -32,7 +32,7 @@ from morphgen.benchmark.split_folder import (
 )
 from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.benchmark.verify import verify
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
 from morphgen.grammar.library import default_library
 from morphgen.tasks.goals.eval_protocol import EvalProtocol
@@ -176,7 +176,7 @@ def test_verify_accepts_another_nearest_robot_that_is_as_near_up_to_rounding(fol
     pattern = r"(planar-plane,push,.*)planar-cube,[\d.]+$"
     change_difficulty(folder, lambda text: re.sub(pattern, r"\1gantry-cylinder,0.75", text))
     assert len(verify(folder, LIBRARY).differences) == 2
-    monkeypatch.setattr(release_checks, "TABLE_TOLERANCE", 1.0)
+    monkeypatch.setattr(release_checks, "FITTED_TOLERANCE", 1.0)
     assert verify(folder, LIBRARY).differences == ()
 
 
@@ -275,11 +275,11 @@ def test_archives_that_are_no_release_are_refused(tmp_path, monkeypatch):
         with zipfile.ZipFile(path, "w") as archive:
             for entry in entries:
                 archive.writestr(entry, "x")
-        with pytest.raises(BenchmarkError, match=rf"{name}.zip: ") as caught:
+        with pytest.raises(MorphgenError, match=rf"{name}.zip: ") as caught:
             verify(path, LIBRARY)
         assert "morphgen-" not in str(caught.value)  # the temporary folder
     monkeypatch.setattr(release_module, "LIMITS", ZipLimits(10, 10))
-    with pytest.raises(BenchmarkError, match="more than 0 MB"), opened_folder(tmp_path / "two.zip"):
+    with pytest.raises(MorphgenError, match="more than 0 MB"), opened_folder(tmp_path / "two.zip"):
         raise AssertionError
 
 

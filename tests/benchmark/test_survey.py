@@ -1,28 +1,95 @@
-"""The difficulty of a split robot by robot, and its CSV and readable tables."""
+"""The statistics of a split, and the difficulty of its robots one by one."""
 
 import csv
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.similarity import MEASURES, features
+from morphgen.benchmark.similarity import MEASURES, cosine, features
 from morphgen.benchmark.split import SIDES, compose_member
+from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.survey import (
+    PAPER,
     STRUCTURAL,
     BaselineResult,
     NearestTrain,
     RobotDifficulty,
     difficulty_csv,
     difficulty_table,
+    paper_row,
     robot_stats,
     split_difficulty,
+    statistics,
     survey_difficulty,
     survey_split,
 )
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.kinematics import reach
+
+
+def test_link_and_joint_counts_are_means_over_train_or_test():
+    summary = statistics(split(["base=gantry ee=plane", "cubes"], ["chain beads=2"]), LIBRARY)
+    assert (summary["train"]["robots"], summary["test"]["robots"]) == (2, 1)
+    for key, gantry, cubes, chain in (
+        ("links", 7, 3, 10),
+        ("movable", 5, 2, 7),
+        ("movable_to_tool", 5, 2, 7),
+    ):
+        assert summary["train"][key] == (gantry + cubes) / 2
+        assert summary["test"][key] == chain
+
+
+def test_joints_beyond_the_tool_and_mimic_joints_do_not_count_as_movable_to_tool():
+    summary = statistics(split(["arm=lwr ee=claw"], ["arm=lwr ee=plane"]), LIBRARY)
+    assert (summary["train"]["movable"], summary["train"]["movable_to_tool"]) == (11, 7)
+    assert (summary["test"]["movable"], summary["test"]["movable_to_tool"]) == (7, 7)
+
+
+def test_masses_reaches_and_cosine_similarities_have_mean_and_range():
+    example_split = combined()
+    summary = statistics(example_split, LIBRARY)
+    robots = [compose_member(m, LIBRARY) for m in example_split.train]
+    (test,) = (compose_member(m, LIBRARY) for m in example_split.test)
+    alike = [
+        cosine(features(test, token_shapes(test)), features(robot, token_shapes(robot)))
+        for robot in robots
+    ]
+    for got, values in (
+        (summary["train"]["mass"], [robot.mass for robot in robots]),
+        (summary["train"]["reach"], [reach(robot) for robot in robots]),
+        (summary["cosine"], alike),
+    ):
+        expected = {"mean": np.mean(values), "min": min(values), "max": max(values)}
+        assert got == pytest.approx(expected, abs=5e-5)
+
+
+def test_a_robot_with_two_tasks_is_counted_twice():
+    reaching = replace(member("cubes"), name="reaching", task="reach")
+    summary = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
+    assert (summary["train"]["robots"], summary["train"]["bodies"]) == (2, 1)
+
+
+def test_a_robot_that_cannot_be_composed_is_an_error():
+    wrong = replace(member("cubes"), derivation="cubes=cubez")
+    with pytest.raises(
+        BenchmarkError, match=r"'mine/some': robot 'cubes': .*'cubez'; did you mean"
+    ):
+        statistics(split([wrong], ["chain"]), LIBRARY)
+    with pytest.raises(BenchmarkError, match="a side without robots"):
+        statistics(split(["cubes"], []), LIBRARY)
+
+
+def test_rows_of_the_paper_and_scenarios_match():
+    sets = {"/".join(name.split("/")[:2]) for name in split_names()}
+    assert set(PAPER) <= sets
+    assert sets - set(PAPER) == {"extrapolation/arms-small"}
+    assert paper_row("extrapolation/arms/push") is PAPER["extrapolation/arms"]
+    assert paper_row("mine/arms/push") is None
+
 
 RESULTS = {
     "random": {("train", "gantry-plane"): BaselineResult(0.0, 0.25)},
