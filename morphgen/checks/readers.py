@@ -244,15 +244,21 @@ def _pybullet_joint(info: Sequence[float]) -> JointReading:
     )
 
 
-def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF with Pinocchio, mimic joints uncoupled; a second model has the couplings."""
+def _pinocchio_model(urdf: Path, **options: bool) -> pinocchio.Model:
     import pinocchio
 
     with quiet():
         try:
-            model = pinocchio.buildModelFromUrdf(str(folder / URDF))
+            return pinocchio.buildModelFromUrdf(str(urdf), **options)
         except (ValueError, RuntimeError) as error:
             raise FormatError(f"Pinocchio: {one_line(str(error))}") from error
+
+
+def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the URDF with Pinocchio, mimic joints uncoupled; a second model has the couplings."""
+    import pinocchio
+
+    model = _pinocchio_model(folder / URDF)
     model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
     kind = pinocchio.FrameType.BODY
     if frame and not model.existFrame(frame, kind):
@@ -289,13 +295,10 @@ def _pinocchio_mimics(urdf: Path) -> dict[str, Mimic] | None:
 
     It refuses those that follow another mimic joint or a continuous one.
     """
-    import pinocchio
-
-    with quiet():
-        try:
-            model = pinocchio.buildModelFromUrdf(str(urdf), mimic=True)
-        except (ValueError, RuntimeError):
-            return None
+    try:
+        model = _pinocchio_model(urdf, mimic=True)
+    except FormatError:
+        return None
     pairs = zip(model.mimicking_joints.tolist(), model.mimicked_joints.tolist(), strict=True)
     mimics = {}
     for follower, leader in pairs:

@@ -74,26 +74,21 @@ class SelfCollisionChecker:
         self._model.body_quat[body] = T_parent_joint.quaternion
 
     def penetrations(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
-        """Test configurations, one at a time as the result is iterated.
+        """Yield the pairs of links that penetrate at each configuration, with their depths [m].
+
+        A configuration is tested when the iterator reaches it. Depths are above ``PENETRATION``.
 
         q: Independent joint positions, shape (n, dof) [rad or m].
-
-        Returns:
-            For each configuration, every penetrating pair of links and its depth [m], which is
-            more than ``PENETRATION``.
         """
         rows = self._require_rows(q)
         return (self._test(positions) for positions in movable_positions(self._robot, rows))
 
     def free(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Return which configurations have no penetration, as ``penetrations`` finds them.
+        """Return which configurations have no penetration, shape (n,).
 
         Several times as fast as ``penetrations``, which says what penetrates.
 
         q: Independent joint positions, shape (n, dof) [rad or m].
-
-        Returns:
-            Shape (n,).
         """
         import mujoco
 

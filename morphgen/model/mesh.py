@@ -27,7 +27,7 @@ MAX_STL_FACES = 200_000
 MAX_ROBOT_BYTES = 96 * 2**20
 """Size of all mesh files of a robot [bytes]. The largest of 1,441 real robots, B1 with an arm, has
 61 MiB."""
-MAX_ROBOT_FACES = 2_000_000
+MAX_ROBOT_FACES = 1_500_000
 """Number of triangles in all mesh files of a robot. The largest, Vega, has 0.94 million."""
 MAX_ROBOT_PIXELS = 2**26
 """Number of pixels in all textures of a robot's mesh files."""
