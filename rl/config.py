@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
-from functools import cache
+from functools import lru_cache
 from typing import Any, cast, get_type_hints
 
 import msgspec
@@ -92,7 +92,7 @@ def read_fields(
     return {name: getattr(record, name) for name in cast(Mapping[str, Any], data)}
 
 
-@cache
+@lru_cache(maxsize=64)
 def _record_of(kind: type, given: frozenset[str]) -> type[msgspec.Struct]:
     """Return a record with the fields of a dataclass: unlike this it has no unknown keys."""
     hints, declared = get_type_hints(kind), []

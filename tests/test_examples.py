@@ -21,7 +21,7 @@ from morphgen.viewer.episode import episode_bytes, read_episode
 from morphgen.viewer.pages.play import parse_rollout
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
-from morphgen.viewer.scene.rollout import record_scene
+from morphgen.viewer.scene.rollout import episode_page
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CUSTOM_TASK = EXAMPLES / "09_custom_task.py"
@@ -131,7 +131,7 @@ def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys
     (tmp_path / "episode.npz").write_bytes(episode_bytes(rollout.episode))
     read = read_episode(tmp_path / "episode.npz", places).tracks[0]
     assert np.array_equal(read.marker_poses["goal"], goals)
-    assert record_scene(rollout.episode)
+    assert episode_page(rollout.episode, dark=False)
 
 
 def test_files_of_before_a_task_existed_are_read(follow, monkeypatch):

@@ -341,4 +341,4 @@ def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_pat
     code, out, err = run(*words)
     assert code == 1
     assert f"{broken.relative_to(tmp_path)} is not a checkpoint" in err
-    assert "1 of 2 (missing: 0)" in out
+    assert "- missing: mine/small me-mlp seed 0\n" in out

@@ -624,7 +624,10 @@ class Expansion:
             self.met_foreign = True
             raise RefusedError(f"{filename} was not installed")
         Path(filename).stat()  # so that the error of a missing file names the line of its use
-        return read_bytes(Path(filename), MAX_FILE)
+        try:
+            return read_bytes(Path(filename), MAX_FILE)
+        except FormatError as error:
+            raise RefusedError(str(error)) from error  # gets the line of its use
 
     def _list_files(self, pattern: str) -> list[str]:
         """Return the files that match a pattern; its fixed first folders must be allowed."""
