@@ -64,6 +64,7 @@ RELATIVE_TOLERANCE = 1e-5
 """Largest accepted relative difference of a joint's value: gains are written with 6 digits."""
 ABSOLUTE_TOLERANCE = 1e-9
 """Largest accepted difference of a joint's value near zero, in its SI unit."""
+_NO_LIMITS = (-math.inf, math.inf)
 _WITHOUT_VELOCITY = (None, 0.0, math.inf)
 """Velocity limits that loaders read where a file names none."""
 GRAVITY_TOLERANCE = 1e-6
@@ -325,7 +326,9 @@ def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | Non
     gain_faults: list[str] = []
     for name in shared:
         joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
-        lower, upper = (-math.inf, math.inf) if joint.is_continuous else joint.effective_limits
+        # Without limits, a loader may read none, or those that a bundle has.
+        is_open = joint.is_continuous or (joint.limits is None and read.limits == _NO_LIMITS)
+        lower, upper = _NO_LIMITS if is_open else joint.effective_limits
         limits += _differences(
             name, ("lower limit", read.limits[0], lower), ("upper limit", read.limits[1], upper)
         )

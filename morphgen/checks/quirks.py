@@ -131,9 +131,9 @@ def _zero_ranges(root: etree._Element, urdf: Path) -> None:
             limit.set("upper", "0")
 
 
-def _open_zero_ranges(root: etree._Element, urdf: Path) -> None:
+def _open_ranges(root: etree._Element, urdf: Path, is_open: Callable[[float, float], bool]) -> None:
     for limit in root.iterfind("joint/limit"):
-        if float(limit.get("lower") or 0) == float(limit.get("upper") or 0) == 0:
+        if is_open(*(float(limit.get(name) or 0) for name in ("lower", "upper"))):
             for name in ("lower", "upper"):
                 limit.attrib.pop(name, "")
 
@@ -208,6 +208,10 @@ def _drop_lost_mimics(root: etree._Element, urdf: Path) -> None:
 _ZERO_IMPOSSIBLE = partial(_set_inertias, is_wrong=lambda a, b, c: a < 0 or c > a + b, moment="0")
 NO_QUATERNIONS = Quirk("reads no quat_xyzw", _drop_quaternions)
 COUNT_MASSLESS = Quirk("counts the inertia of links without mass", _count_massless)
+NO_WRONG_RANGES = Quirk(
+    "reads a range in the wrong order as none",
+    partial(_open_ranges, is_open=lambda lower, upper: lower > upper),
+)
 ZERO_RANGES = Quirk("reads a range that is missing as 0 to 0", _zero_ranges)
 YOURDFPY_QUIRKS = (
     NO_QUATERNIONS,
@@ -219,12 +223,17 @@ PYBULLET_QUIRKS = (
     Quirk("gives links without inertia 1 kg and 1 kg m^2", _add_inertia),
     Quirk("sets inertia that no body has to zero", _ZERO_IMPOSSIBLE),
     Quirk("limits continuous joints that name a range", _limit_continuous),
+    NO_WRONG_RANGES,
 )
 MUJOCO_QUIRKS = (
     NO_QUATERNIONS,
     Quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", _add_solids),
     Quirk("joins the base to the world, without its mass", _empty_base),
-    Quirk("reads a range of 0 to 0 as none", _open_zero_ranges),
+    NO_WRONG_RANGES,
+    Quirk(
+        "reads a range of 0 to 0 as none",
+        partial(_open_ranges, is_open=lambda lower, upper: lower == upper == 0),
+    ),
 )
 PINOCCHIO_QUIRKS = (COUNT_MASSLESS, ZERO_RANGES)
 USD_QUIRKS = (NO_QUATERNIONS, ZERO_RANGES)

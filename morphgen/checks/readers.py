@@ -347,9 +347,8 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
         model.joint(i).name or f"{model.body(model.jnt_bodyid[i]).name}_joint" for i in movable
     ]
     joints = {name: _mujoco_joint(model, i) for i, name in zip(movable, names, strict=True)}
-    # Forces and inertia are those of the bodies, without contacts, equalities and motors.
+    # Forces and inertia are those of the bodies, without contacts and equalities.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    model.dof_armature[:] = 0
     model.opt.gravity[:] = 0.0, 0.0, -GRAVITY
     data = mujoco.MjData(model)
     sites = {model.site(i).name: i for i in range(model.nsite)}
@@ -378,7 +377,8 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
             mujoco.mj_forward(model, data)
             mujoco.mj_fullM(model, data, M)
             forces[i] = data.qfrc_bias[columns]
-            inertia[i] = M[np.ix_(columns, columns)]
+            # Setting the armature to zero is not enough: MuJoCo keeps the inertia of simple bodies.
+            inertia[i] = (M - np.diag(model.dof_armature))[np.ix_(columns, columns)]
     return Reading(
         joints,
         float(model.body_mass.sum()),

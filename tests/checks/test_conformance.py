@@ -266,6 +266,15 @@ def carrying_nothing(kind, **axis):
     return replace(with_end(Link("end"), joint), frames=(tool,))
 
 
+def wheel(kind, axis):
+    """A body that turns about its centre, whose inertia MuJoCo computes only once."""
+    inertial = Inertial(0.5, inertia=(1e-3, 0.0, 0.0, 1e-3, 0.0, 2e-3))
+    strength = {"limits": None if kind == "continuous" else (-1, 1), "effort": 1.0, "velocity": 1.0}
+    joint = Joint("turn", kind, "frame", "wheel", axis=axis, **strength)
+    links = (rod("frame"), Link("wheel", inertial))
+    return Robot("wheel", links, (joint,), (Frame("tool", "wheel"),), home=(0.0,))
+
+
 @pytest.mark.parametrize(
     "robot",
     [
@@ -278,6 +287,9 @@ def carrying_nothing(kind, **axis):
         carrying_nothing("prismatic"),
         carrying_nothing("revolute"),
         carrying_nothing("prismatic", axis=(0.6, 0.0, 0.8)),
+        wheel("continuous", (0.0, 0.0, 1.0)),
+        wheel("prismatic", (1.0, 0.0, 0.0)),
+        wheel("revolute", (0.0, 1.0, 0.0)),
     ],
 )
 def test_what_libraries_round_is_no_disagreement(robot, tmp_path):
@@ -373,6 +385,20 @@ TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
         (
             {"tip": TIP, "limit": LIMIT.replace("1", "0", 2)},
             {"mujoco (urdf)": (*NO_BASE, "reads a range of 0 to 0 as none")},
+        ),
+        *(
+            (
+                {"tip": TIP, "kind": kind, "limit": LIMIT.replace('"-1" upper="1"', turned)},
+                {
+                    "pybullet": ("reads a range in the wrong order as none",),
+                    "mujoco (urdf)": (*NO_BASE, "reads a range in the wrong order as none"),
+                },
+            )
+            for kind, turned in (
+                ("revolute", '"1" upper="-1"'),
+                ("prismatic", '"0.1" upper="0"'),
+                ("prismatic", '"2" upper="1"'),
+            )
         ),
     ],
 )
@@ -525,14 +551,3 @@ def test_a_xacro_is_expanded_for_the_loaders(tmp_path):
     text = path.read_text().replace('value="2"', 'value="${1 + 1}"')
     path.write_text(text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/xacro" ', 1))
     assert file_rows(path)["mujoco (urdf)"].passed
-
-
-def test_limits_in_the_wrong_order_are_compared(tmp_path):
-    file = tmp_path / "slide.urdf"
-    file.write_text(
-        '<robot name="slide"><link name="a"/><link name="b"/><joint name="j" type="prismatic">'
-        '<parent link="a"/><child link="b"/><limit lower="1" upper="-1" effort="1" velocity="1"/>'
-        "</joint></robot>"
-    )
-    (row,) = [row for row in compare_file(file, default_finder()) if row.loader == "yourdfpy"]
-    assert (row.passed, row.message) == (True, "")
