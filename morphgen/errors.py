@@ -9,6 +9,19 @@ _MAX_LISTED = 24
 """Largest number of valid names that a hint lists completely."""
 _MAX_COMPARED = 200
 """Longest name that is compared with the valid ones [characters]; the time grows quadratically."""
+MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    NameError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+)
+"""Exceptions that libraries raise on malformed files of strangers, besides their own."""
 
 
 class MorphgenError(Exception):

@@ -1,4 +1,4 @@
-"""What loaders do with files of others: how they read a URDF otherwise, and what they refuse.
+"""Deviations of loaders: how they read the URDFs of others otherwise, and what they refuse.
 
 Each deviation has a change of the file with which it can be tried.
 """
@@ -35,7 +35,7 @@ class Quirk:
 
 @dataclass(frozen=True)
 class Refusal(Quirk):
-    """What a loader refuses; ``change`` takes it out of the URDF."""
+    """A reason why a loader refuses a URDF; ``change`` takes it out of the file."""
 
     pattern: str
     """Regular expression of the loader's message."""

@@ -134,7 +134,7 @@ MAX_SRDF_BYTES = 16 * 2**20
 
 
 class _Rule(NamedTuple):
-    """What an element may have: names of attributes and tags, separated by spaces."""
+    """Attributes and tags that an element may have: names separated by spaces."""
 
     required: str
     optional: str = ""

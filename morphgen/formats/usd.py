@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lxml import etree
-
 from morphgen.errors import FormatError
 from morphgen.formats.quiet import quiet
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
+from morphgen.formats.xml import parse_xml
 from morphgen.model.geometry import Pose
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def _write_poses(stage: Usd.Stage, urdf: Path) -> None:
     from pxr import Gf, UsdPhysics
 
     origins: dict[tuple[str, str], Pose] = {}
-    for joint in etree.parse(urdf).iterfind("joint"):
+    for joint in parse_xml(urdf.read_bytes(), str(urdf)).iterfind("joint"):
         origin = joint.find("origin")
         texts = ("", "") if origin is None else (origin.get("xyz", ""), origin.get("rpy", ""))
         (x, y, z), (roll, pitch, yaw) = (map(float, (text or "0 0 0").split()) for text in texts)

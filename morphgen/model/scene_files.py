@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from trimesh.visual import TextureVisuals
 
+from morphgen.errors import MALFORMED
 from morphgen.model.geometry import Rgba
 from morphgen.typing import Array
 
@@ -61,18 +62,9 @@ _PICTURE_FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
 """Formats of pictures. Pillow knows others, some of which it reads by starting a program."""
 
 UNREADABLE = (
-    ArithmeticError,
+    *MALFORMED,
     AssertionError,
-    AttributeError,
     Image.DecompressionBombError,
-    LookupError,
-    MemoryError,
-    NameError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
     collada.DaeError,
     struct.error,
 )

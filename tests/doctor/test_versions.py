@@ -1,4 +1,4 @@
-"""What ``docs/versions.md`` promises: values that are the same in all versions 0.3.x, and formats.
+"""Promises of ``docs/versions.md``: values that are the same in all versions 0.3.x, and formats.
 
 A change of a value needs a new minor version; then record the new values in ``reference.json``.
 """

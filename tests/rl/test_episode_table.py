@@ -10,6 +10,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.rl.scores.episode_table import (
     COLUMNS,
     EPISODES,
+    MAX_BYTES,
     append_submission,
     mode_of,
     read_submissions,
@@ -94,6 +95,11 @@ HEAD = json.dumps({key: value for key, value in data().items() if key != "robots
         (broken(f"{HEADER}\n# {{}}\n"), "line 2: is not the head of a submission"),
         (broken(f"{HEADER}\n# {HEAD}\nmine/small,ours\n"), "line 2: the rows of its run are"),
         (broken(f'{HEADER}\n# {HEAD[:-1]}, "x": 1}}\n'), "line 2: unknown key 'x'"),
+        *(
+            (broken(f"{HEADER}\n# {HEAD}\n,,,,,,,,,,{count},1,1,1,1,1,,\n"), f": {count} episodes;")
+            for count in (0, 10_001, 10**12)
+        ),
+        (broken(f"{HEADER}\n{' ' * MAX_BYTES}\n"), f"more than {MAX_BYTES} bytes"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path, content, why):

@@ -1,4 +1,4 @@
-"""What every simulation on the CPU does: states, targets, resets, divergence, blocks and errors."""
+"""Conduct of all simulations on the CPU: states, targets, resets, divergence, blocks and errors."""
 
 import math
 import re

@@ -26,7 +26,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import yaml
 
-from morphgen.errors import FormatError, nearest, shortened
+from morphgen.errors import MALFORMED, FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes, yaml_problem
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro.evaluator import (
@@ -466,19 +466,7 @@ MAX_REASON = 400
 """Longest reason in an error [characters]; expressions can be long."""
 
 _COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
-_FAULTS = (
-    ArithmeticError,
-    AttributeError,
-    ExpatError,
-    LookupError,
-    MemoryError,
-    NameError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-)
+_FAULTS = (*MALFORMED, ExpatError)
 """Exceptions that an invalid document can raise in the evaluator, besides XacroException."""
 
 
