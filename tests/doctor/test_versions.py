@@ -102,7 +102,7 @@ FORMATS = {
     "episodes.csv.gz": "",
     "release.json": release.FORMAT,
     "eval --submission": submission.FORMAT,
-    ".npz": f"{episode.FORMAT}; 1 is read",
+    ".npz": episode.FORMAT,
 }
 
 
