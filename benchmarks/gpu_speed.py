@@ -36,8 +36,8 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
 from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
+from morphgen.tasks.registry import COLLISION_GEOMETRIES, CollisionGeometry
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
-from morphgen.tasks.sim.base import COLLISION_GEOMETRIES, CollisionGeometry
 from morphgen.tasks.sim.warp_sim import Group, WarpSimulation
 
 SPLITS = (

@@ -10,8 +10,6 @@ from os import PathLike
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-import numpy as np
-
 from morphgen.errors import MorphgenError, SignatureError
 
 P = ParamSpec("P")
@@ -65,6 +63,8 @@ def whole_number(
 
 def truth(name: str, value: object, error: type[MorphgenError]) -> bool:
     """Return a ``bool``, also for one of NumPy's."""
+    import numpy as np  # 0.1 s, which `morphgen --help` does not need
+
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise error(f"{name} {value!r}: expected True or False")

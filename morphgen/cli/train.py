@@ -16,8 +16,13 @@ from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS, preset_of
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
-from morphgen.tasks.registry import CHANNELS, DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.sim.base import COLLISION_GEOMETRIES
+from morphgen.tasks.registry import (
+    CHANNELS,
+    COLLISION_GEOMETRIES,
+    DEFAULT_SIMULATOR,
+    SIMULATORS,
+    TASKS,
+)
 
 if TYPE_CHECKING:
     from morphgen.rl.runs.agent_spec import AgentSpec

@@ -30,10 +30,9 @@ from morphgen.rl.policies import make_networks
 from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
 from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.scenes.make import require_geometry
-from morphgen.tasks.sim.base import CollisionGeometry
 from morphgen.tasks.task import TaskConfig
 
 MAX_ROWS = 100_000

@@ -32,13 +32,17 @@ from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.random_numbers import require_seed
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, installed_simulators
+from morphgen.tasks.registry import (
+    COLLISION_GEOMETRIES,
+    DEFAULT_SIMULATOR,
+    SIMULATORS,
+    CollisionGeometry,
+    installed_simulators,
+)
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import (
-    COLLISION_GEOMETRIES,
-    CollisionGeometry,
     Contacts,
     Scene,
     Simulator,

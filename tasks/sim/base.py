@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Protocol
 
 from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own weight
 from morphgen.model.geometry import IDENTITY, Pose
@@ -20,10 +20,6 @@ SUBSTEPS = 4
 """Number of physics steps per control step."""
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
-CollisionGeometry = Literal["primitive", "convex"]
-"""Collision shapes of simulated robots. ``primitive``: all primitives. ``convex``: convex pieces of
-the meshes, which are closer to them and take more time."""
-COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 
 HOST_DEVICES = ("cpu",)
 """Types of devices whose tensors the processor reads without waiting.
