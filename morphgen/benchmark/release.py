@@ -22,6 +22,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from string import Template
 from typing import Any
 
 import msgspec
@@ -31,12 +32,9 @@ from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids,
 from morphgen.benchmark.split import SIDES, Split
 from morphgen.benchmark.split_file import is_split_name
 from morphgen.benchmark.split_folder import (
-    ROBOTS_DIR,
     ROBOTS_FILE,
-    SPLIT_FILE,
-    SUMS_FILE,
-    TOKENS_FILE,
     is_archive,
+    read_template,
     require_split_folder,
 )
 from morphgen.benchmark.survey import RobotDifficulty, difficulty_table
@@ -156,70 +154,13 @@ def opened_folder(path: Path) -> Iterator[Path]:
         yield folders[0]
 
 
-CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
-_CROISSANT_TERMS = (
-    *("citeAs", "column", "equivalentProperty", "extract", "field", "fileProperty", "fileObject"),
-    *("fileSet", "format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField"),
-    *("path", "recordSet", "references", "regex", "repeated", "replace", "samplingRate"),
-    *("separator", "source", "subField", "transform"),
-)
-_CONTEXT: dict[str, Any] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "cr": "http://mlcommons.org/croissant/",
-    "dct": "http://purl.org/dc/terms/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "sc": "https://schema.org/",
-    "conformsTo": "dct:conformsTo",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    **{term: f"cr:{term}" for term in _CROISSANT_TERMS},
-}
-"""The context that Croissant 1.0 prescribes."""
-_FILES = {
-    SPLIT_FILE: ("application/yaml", "The split: derivation, task and hash of every robot"),
-    ROBOTS_FILE: ("application/jsonlines", "A line per robot, train robots first"),
-    TOKENS_FILE: ("application/x-npz", "Tokens (n, max_links, 48) of the robots, with a mask"),
-    RELEASE_FILE: ("application/json", "Version, evaluation and difficulty of the release"),
-    DIFFICULTY_FILE: ("text/csv", "Size, nearest train robots and scores of every robot"),
-    LICENCES_FILE: ("application/json", "Every part with its licence, source and robots"),
-    SCORES_FILE: ("application/json", "Reference scores"),
-}
-"""Media type and description of the files that are described one by one."""
-_SETS = (
-    ("urdf", "application/xml", f"{ROBOTS_DIR}/*/robot.urdf", "The URDF of every robot"),
-    ("mjcf", "application/xml", f"{ROBOTS_DIR}/*/robot.xml", "The MJCF of every robot"),
-    ("goal-sets", "application/x-npz", "goals/*/*.npz", "Goals and starts of every robot"),
-)
-"""Name, media type, pattern and description of sets of files."""
-_FIELDS = (
-    ("name", "Text", "Name of the robot"),
-    ("side", "Text", "Side of the split: train or test"),
-    ("task", "Text", "Task of the robot"),
-    ("obstacles", "Boolean", "Whether the scene has obstacles"),
-    ("category", "Text", "Grammar that the robot was sampled from, or composed"),
-    ("derivation", "Text", "Parts and parameters of the robot"),
-    ("hash", "Text", "Hash of the physical robot"),
-    ("links", "Integer", "Number of links"),
-    ("movable", "Integer", "Number of movable joints"),
-    ("movable_to_tool", "Integer", "Number of movable joints between root and tool"),
-    ("dof", "Integer", "Number of independent joints"),
-    ("reach", "Float", "Largest distance of the tool from the root's origin [m]"),
-    ("mass", "Float", "Mass [kg]"),
-    ("path", "Text", "Folder of the robot's files"),
-)
-"""Name, data type and description of the fields of a robot."""
-
-
 def croissant_text(
     split: Split, release: Release, licences: Sequence[str], sums: Mapping[str, str]
 ) -> str:
-    """Return the text of ``croissant.json``."""
-    data: dict[str, Any] = {
-        "@context": _CONTEXT,
-        "@type": "sc:Dataset",
-        "conformsTo": CONFORMS_TO,
+    """Return the text of ``croissant.json``, whose template describes all files that may exist."""
+    data: dict[str, Any] = json.loads(read_template(CROISSANT_FILE))
+    distribution, records = data.pop("distribution"), data.pop("recordSet")
+    data |= {
         "name": release.stem,
         "description": f"{split.summary}. A split of robots for cross-embodiment learning: "
         f"{len(split.train)} robots to train on, {len(split.test)} to test on.",
@@ -234,8 +175,13 @@ def croissant_text(
     if release.creators:
         people = [{"@type": "sc:Organization", "name": name} for name in release.creators]
         data["creator"] = people
-    data["distribution"] = _distribution(sums)
-    data["recordSet"] = [_sides(), _robots()]
+    data["distribution"] = []
+    for entry in distribution:
+        if entry["name"] in sums:
+            data["distribution"].append({**entry, "sha256": sums[entry["name"]]})
+        elif any(PurePosixPath(path).match(entry.get("includes", "-")) for path in sums):
+            data["distribution"].append(entry)  # a set of files
+    data["recordSet"] = records
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
@@ -251,118 +197,10 @@ def citation(split: Split, release: Release) -> str:
     )
 
 
-def _distribution(sums: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the files and sets of files that a release with these checksums has."""
-    files = [
-        {
-            "@type": "cr:FileObject",
-            "@id": name,
-            "name": name,
-            "description": description,
-            "contentUrl": name,
-            "encodingFormat": media_type,
-            "sha256": sums[name],
-        }
-        for name, (media_type, description) in _FILES.items()
-        if name in sums
-    ]
-    sets = [
-        {
-            "@type": "cr:FileSet",
-            "@id": name,
-            "name": name,
-            "description": description,
-            "encodingFormat": media_type,
-            "includes": pattern,
-        }
-        for name, media_type, pattern, description in _SETS
-        if any(PurePosixPath(path).match(pattern) for path in sums)
-    ]
-    return [*files, *sets]
-
-
-def _sides() -> dict[str, Any]:
-    """Return the record set of the sides, which Croissant calls splits."""
-    name = "sides/name"
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "sides",
-        "name": "sides",
-        "dataType": "cr:Split",
-        "key": {"@id": name},
-        "field": [{"@type": "cr:Field", "@id": name, "name": name, "dataType": "sc:Text"}],
-        "data": [{name: side} for side in SIDES],
-    }
-
-
-def _robots() -> dict[str, Any]:
-    """Return the record set of the robots."""
-    fields = []
-    for name, kind, description in _FIELDS:
-        field: dict[str, Any] = {
-            "@type": "cr:Field",
-            "@id": f"robots/{name}",
-            "name": f"robots/{name}",
-            "description": description,
-            "dataType": f"sc:{kind}",
-            "source": {"fileObject": {"@id": ROBOTS_FILE}, "extract": {"column": name}},
-        }
-        if name == "side":
-            field["references"] = {"field": {"@id": "sides/name"}}
-        fields.append(field)
-    return {"@type": "cr:RecordSet", "@id": "robots", "name": "robots", "field": fields}
-
-
 MAX_ROWS = 20
 """Largest number of test robots in the table of the card."""
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 """Size categories of Hugging Face by their upper bound."""
-
-_CARD = """\
-# {name} {version}
-
-{summary}
-
-A split of robots for cross-embodiment learning ({regime}): train a policy on {train} robots, and
-test it on {test} that it has not seen. Made with morphgen {morphgen}; the split's id is `{id}`.
-
-| file | content |
-|---|---|
-{files}
-
-## Use it
-
-```
-morphgen split verify {folder}
-morphgen train {folder} --sim {rules[simulator]}
-morphgen eval runs/{name}/me-graph/seed0 --split {folder} --sim {rules[simulator]} \
---submission mine.json
-morphgen split score mine.json --split {folder}
-```
-
-Without morphgen: `datasets.load_dataset("json", data_files="robots.jsonl")`,
-`mlcroissant.Dataset("croissant.json").records("robots")`, `numpy.load("tokens.npz")`, and
-`sha256sum -c SHA256SUMS`.
-
-## Evaluation
-
-Simulator `{rules[simulator]}`, {rules[episodes]} episodes per robot or more, seed {rules[seed]}, \
-goals of seed {rules[goal_seed]}; the constants of the tasks are in `release.json`. \
-A submission holds the outcome of every episode, and `morphgen split score` \
-computes scores and intervals from them.
-
-## Difficulty
-
-{difficulty}
-
-## Licences
-
-{licences}
-
-## Citation
-
-{citation}
-"""
 
 
 def card_text(
@@ -372,8 +210,19 @@ def card_text(
     names: Iterable[str],
     rows: Sequence[RobotDifficulty],
 ) -> str:
-    """Return the dataset card: Markdown with the front matter that Hugging Face reads."""
-    text = _CARD.format(
+    """Return the dataset card: Markdown with the front matter that Hugging Face reads.
+
+    names: Paths of the files of the release.
+    """
+    present = {name.partition("/")[0] for name in names}
+    absent = {"goals", SCORES_FILE, SUBMISSIONS_DIR} - present
+    template = "".join(
+        line
+        for line in read_template("release_card.md").splitlines(keepends=True)
+        if not line.startswith(tuple(f"| `{name}` |" for name in absent))
+    )
+    text = Template(template).substitute(
+        release.evaluation,
         name=release.name,
         version=release.version,
         summary=split.summary or "(no summary)",
@@ -382,9 +231,7 @@ def card_text(
         test=len(split.test),
         morphgen=release.morphgen,
         id=release.id,
-        files=_file_table(names),
         folder=release.stem,
-        rules=release.evaluation,
         difficulty=_difficulty(release, rows),
         licences=_licence_summary(parts),
         citation=citation(split, release),
@@ -439,30 +286,6 @@ def _front_matter(split: Split, release: Release, parts: Sequence[LicencedPart])
     }
     text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=10_000)
     return text
-
-
-def _file_table(names: Iterable[str]) -> str:
-    known = {name.partition("/")[0] for name in names}
-    table = {
-        SPLIT_FILE: "the split: derivation, task and hash of every robot",
-        ROBOTS_FILE: "a line per robot: side, task, numbers of links and joints, reach, mass, path",
-        TOKENS_FILE: "tokens (n, max_links, 48) of the robots at home, with a mask",
-        ROBOTS_DIR: "a folder per robot with its URDF",
-        "goals": "goals and starts of every robot",
-        RELEASE_FILE: "version, evaluation and difficulty",
-        DIFFICULTY_FILE: "a row per robot: size, nearest train robots, scores of baselines",
-        SCORES_FILE: "reference scores",
-        SUBMISSIONS_DIR: "submissions that reference scores were computed from",
-        f"{LICENCES_TEXT}, {LICENCES_FILE}": "every part with its licence, source and robots",
-        CROISSANT_FILE: "this dataset in Croissant 1.0",
-        SUMS_FILE: "SHA-256 of every file",
-    }
-    optional = ("goals", SCORES_FILE, SUBMISSIONS_DIR)
-    return "\n".join(
-        f"| `{name}` | {content} |"
-        for name, content in table.items()
-        if name not in optional or name in known
-    )
 
 
 def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:

@@ -21,8 +21,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
+from string import Template
 from typing import Any, Literal
 
 import msgspec
@@ -203,35 +205,6 @@ def read_settings(path: Path) -> _Settings:
     return records.read_record(read_json(path), _Settings, str(path), BenchmarkError)
 
 
-_README = """\
-# {name}
-
-{summary}
-
-A split of robots for cross-embodiment learning ({regime}): {train} robots to train on, {test} to
-test on. `split.yaml` says how they were chosen; its id is `{id}`.
-
-- `robots.jsonl`: a line of JSON a robot: name, side (train or test), task, obstacles, category,
-  derivation (parts and parameters), hash of the body, links, movable joints, those between root and
-  tool, degrees of freedom, reach (m), mass (kg), and path of its folder
-- `tokens.npz`: tokens (n, max_links, 48) at home, mask (n, max_links), names (n,), in the order of
-  `robots.jsonl`; layout and columns say what the 48 numbers are
-- `robots/`: {bundle}
-- `build.json`: how this folder was built
-- `{sums}`: of every file, for `sha256sum -c {sums}`; `morphgen split verify .` also tests that the
-  robots are those of `split.yaml`
-
-```python
-from morphgen.benchmark.split_folder import load_split_folder
-
-split = load_split_folder(".")
-for robot in split.train:
-    print(robot["name"], robot["tokens"].shape, split.folder / robot["path"] / "robot.urdf")
-```
-
-Without morphgen: `datasets.load_dataset("json", data_files="robots.jsonl")` and
-`numpy.load("tokens.npz")`.
-"""
 _BUNDLE = (
     "a folder a body: `robot.urdf`, `robot.xml` (MJCF), `meshes/`, and `card.json` with the\n"
     "  sources and licences of its parts"
@@ -337,7 +310,7 @@ def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
 
 def readme_text(split: Split, settings: BuildSettings) -> str:
     """Return the text of ``README.md``."""
-    return _README.format(
+    return Template(read_template("split_readme.md")).substitute(
         name=split.name,
         summary=split.summary or "(no summary)",
         regime=split.regime,
@@ -347,6 +320,11 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
         bundle=_LIGHT if settings.light else _BUNDLE,
         sums=SUMS_FILE,
     )
+
+
+def read_template(name: str) -> str:
+    """Return a template of a file that a split folder or a release has."""
+    return (files("morphgen.benchmark") / "texts" / name).read_text(encoding="utf-8")
 
 
 def sums_text(sums: Mapping[str, str]) -> str:
