@@ -10,6 +10,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -41,9 +42,6 @@ from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import report, show_progress
-
-Progress = Callable[[int], None]
-"""Receives the number of robots that are finished."""
 
 
 @dataclass(frozen=True)
@@ -159,16 +157,6 @@ class RobotFactory:
         return Candidate(robot.name, category, written, robot_hash(robot), robot_features)
 
 
-def make_robots(
-    recipes: Sequence[Recipe],
-    factory: RobotFactory,
-    *,
-    jobs: int = 1,
-) -> list[Candidate]:
-    """Make robots and return them in the order of their recipes."""
-    return list(parallel_map(factory, recipes, jobs))
-
-
 def category_of(words: Sequence[str], library: Library) -> str:
     """Return the grammar that the arguments of ``compose`` begin with, else ``composed``."""
     is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
@@ -280,81 +268,82 @@ class RobotStream:
             return None
 
 
-RejectDerivation = Callable[[Derivation], str]
-"""Returns the reason why a derivation cannot be a test robot's; empty if it can."""
-RejectRobot = Callable[[Candidate], str]
-"""Same for a composed robot."""
+class _Rules(Protocol):
+    """The rules of a regime for test robots that are drawn from grammars."""
+
+    def reject_derivation(self, derivation: Derivation) -> str:
+        """Return why a derivation cannot be a test robot's; empty if it can."""
+
+    def reject_robot(self, robot: Candidate) -> str:
+        """Return why a composed robot cannot be a test robot; empty if it can."""
+
+    def advice(self) -> str:
+        """Return what to change if a search finds too few robots."""
 
 
-class TestRobotSearch:
-    """Search for test robots in streams, number by number."""
+def _drawn_splits(
+    request: SplitRequest,
+    regime: Regime,
+    summary: str,
+    streams: tuple[Sequence[RobotStream], Sequence[RobotStream]],
+    rules_of: Callable[[Sequence[Candidate]], _Rules],
+    factory: RobotFactory,
+    provenance: Mapping[str, object],
+    jobs: int,
+) -> tuple[Split, ...]:
+    """Return splits of robots that are taken from streams of train and test robots in turn.
 
-    def __init__(
-        self,
-        request: SplitRequest,
-        train: Sequence[Candidate],
-        factory: RobotFactory,
-    ) -> None:
-        self._request, self._factory = request, factory
-        self._num_train = len(train)
-        self._name_by_hash = {robot.hash: robot.name for robot in train}
-        self._rejected: Counter[str] = Counter()
-        self._num_composed = 0
-        self.robots: list[Candidate] = []
-        """Test robots so far."""
+    rules_of: Makes the rules of the test robots from the train robots.
+    """
+    train_streams, test_streams = streams
+    turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
+    recipes = [train_streams[stream].recipe(number) for number, stream in turns]
+    train = list(parallel_map(factory, recipes, jobs))
+    test = _find_test_robots(request, train, test_streams, rules_of(train), factory)
+    seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
+    return assemble_drawn(request, regime, summary, train, test, {**provenance, "seeds": seeds})
 
-    def find(
-        self,
-        streams: Sequence[RobotStream],
-        reject_derivation: RejectDerivation,
-        reject_robot: RejectRobot = lambda robot: "",
-    ) -> bool:
-        """Take test robots from the streams in turn; return True when the request is met."""
-        for number in itertools.count():
-            for stream in streams:
-                if len(self.robots) == self._request.test:
-                    return True
-                if self._rejected.total() == MAX_DRAWS or self._num_composed == MAX_COMPOSED:
-                    return False
-                reason = self._try(stream, number, reject_derivation, reject_robot)
-                if reason:
-                    self._rejected[reason] += 1
-        return False
 
-    def _try(
-        self,
-        stream: RobotStream,
-        number: int,
-        reject_derivation: RejectDerivation,
-        reject_robot: RejectRobot,
-    ) -> str:
-        """Take a robot and return an empty text, or return the reason why it is rejected."""
-        derivation = stream.derivation(number, self._factory.library)
-        reason = reject_derivation(derivation) if derivation else "no end"
-        if reason:
-            return reason
-        with show_progress(None):
-            robot = self._factory(stream.recipe(number))
+def _find_test_robots(
+    request: SplitRequest,
+    train: Sequence[Candidate],
+    streams: Sequence[RobotStream],
+    rules: _Rules,
+    factory: RobotFactory,
+) -> list[Candidate]:
+    """Take test robots from the streams in turn, number by number."""
+    name_by_hash = {robot.hash: robot.name for robot in train}
+    found: list[Candidate] = []
+    rejected: Counter[str] = Counter()
+    num_composed = 0  # of the rejected ones
+    for number, stream in ((n, each) for n in itertools.count() for each in streams):
+        if len(found) == request.test:
+            return found
+        if rejected.total() == MAX_DRAWS or num_composed == MAX_COMPOSED:
+            break
+        derivation = stream.derivation(number, factory.library)
+        if reason := rules.reject_derivation(derivation) if derivation else "no end":
+            rejected[reason] += 1
+            continue
+        with show_progress(None):  # one robot is one step, whatever its fits report
+            robot = factory(stream.recipe(number))
         # The robot comes from a later draw if the conditions of the grammar reject the first one.
-        reason = reject_derivation(robot.derivation)
-        if not reason and robot.hash in self._name_by_hash:
-            reason = f"the body of {self._name_by_hash[robot.hash]}"
-        if reason := reason or reject_robot(robot):
-            self._num_composed += 1
-            return reason
-        self._name_by_hash[robot.hash] = robot.name
-        self.robots.append(robot)
-        report(self._num_train + len(self.robots), None)
-        return ""
-
-    def failure(self) -> str:
-        """Return how many robots were drawn and found, and the most common reason of rejection."""
-        reason, count = self._rejected.most_common(1)[0]
-        drawn = self._rejected.total() + len(self.robots)
-        return (
-            f"{len(self.robots)} of {self._request.test} test robots found in {drawn} draws; "
-            f"{count} had {reason}"
-        )
+        reason = rules.reject_derivation(robot.derivation)
+        if not reason and robot.hash in name_by_hash:
+            reason = f"the body of {name_by_hash[robot.hash]}"
+        if reason := reason or rules.reject_robot(robot):
+            rejected[reason] += 1
+            num_composed += 1
+            continue
+        name_by_hash[robot.hash] = robot.name
+        found.append(robot)
+        report(len(train) + len(found), None)
+    reason, count = rejected.most_common(1)[0]
+    raise BenchmarkError(
+        f"{', '.join(stream.grammar.name for stream in streams)}: {len(found)} of {request.test} "
+        f"test robots found in {rejected.total() + len(found)} draws; {count} had {reason}; "
+        f"{rules.advice()}"
+    )
 
 
 def assemble(
@@ -419,37 +408,28 @@ def interpolation(
     require_size(request)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
-    train_stream = RobotStream.of(grammar, grammar.name, request)
-    test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
-    factory = RobotFactory(library, with_features=True, max_links=request.max_links)
-    recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
-    train = make_robots(recipes, factory, jobs=jobs)
-    criterion = _StructureAndHull(train, request.train[0], hull, library)
-    search = TestRobotSearch(request, train, factory)
-    if not search.find([test_stream], criterion, _NearReason(train)):
-        raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
+    train = RobotStream.of(grammar, grammar.name, request)
+    test = RobotStream.of(grammar, f"{grammar.name}-test", request)
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
-    return assemble_drawn(
+    return _drawn_splits(
         request,
         "interpolation",
         f"{{n}} robots of {grammar.name}; test: {request.test} {where[hull]}",
-        train,
-        search.robots,
-        {
-            "grammar": {grammar.name: grammar.digest},
-            "hull": hull,
-            "seeds": {stream.prefix: stream.seed for stream in (train_stream, test_stream)},
-        },
+        ([train], [test]),
+        lambda robots: _InterpolationRules(robots, request.train[0], hull, library),
+        RobotFactory(library, with_features=True, max_links=request.max_links),
+        {"grammar": {grammar.name: grammar.digest}, "hull": hull},
+        jobs,
     )
 
 
-class _StructureAndHull:
-    """Reject derivations of another structure, or on the wrong side of the convex hull."""
+class _InterpolationRules:
+    """A test robot has a trained structure, is on a side of the hull, and nearly no train robot."""
 
     def __init__(
         self, train: Sequence[Candidate], smallest: int, hull: str, library: Library
     ) -> None:
-        self._hull, self._library = hull, library
+        self._train, self._hull, self._library = train, hull, library
         self._structures = {structure(robot.derivation, library) for robot in train[:smallest]}
         self._points: dict[str, list[list[float]]] = {}
         # A point inside the smallest hull is inside all; one outside the largest is outside all.
@@ -457,7 +437,8 @@ class _StructureAndHull:
             points = self._points.setdefault(structure(robot.derivation, library), [])
             points.append(self._point(robot.derivation))
 
-    def __call__(self, derivation: Derivation) -> str:
+    def reject_derivation(self, derivation: Derivation) -> str:
+        """Return why the structure or the parameters do not fit; empty if they do."""
         kind = structure(derivation, self._library)
         if kind not in self._structures:
             return "a structure that no train robot has"
@@ -467,6 +448,10 @@ class _StructureAndHull:
         if is_inside == (self._hull == "inside"):
             return ""
         return f"parameters {'inside' if is_inside else 'outside'} the hull of the train robots"
+
+    def reject_robot(self, robot: Candidate) -> str:
+        """Return which train robot is nearly the same; empty if none is."""
+        return _near_reason(robot, self._train)
 
     def _point(self, derivation: Derivation) -> list[float]:
         return list(parameters(derivation, self._library).values())
@@ -485,19 +470,12 @@ class _StructureAndHull:
         )
 
 
-class _NearReason:
-    """Reject robots that the audit would call nearly the same as a given one."""
-
-    def __init__(self, others: Sequence[Candidate]) -> None:
-        self._others = others
-
-    def __call__(self, robot: Candidate) -> str:
-        for other in self._others:
-            if robot.features is None or other.features is None:
-                continue
-            if is_near(robot.features, other.features):
-                return f"almost the sizes of {other.name}"
-        return ""
+def _near_reason(robot: Candidate, others: Iterable[Candidate]) -> str:
+    """Return the first robot that the audit would call nearly the same; empty if none is."""
+    for other in others:
+        if robot.features and other.features and is_near(robot.features, other.features):
+            return f"almost the sizes of {other.name}"
+    return ""
 
 
 NUM_ATTEMPTS = 50
@@ -531,7 +509,7 @@ def composition(
         candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
     }
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
-    composed_robots = make_robots(list(unique.values()), factory, jobs=jobs)
+    composed_robots = parallel_map(factory, list(unique.values()), jobs)
     robot_of = dict(zip(unique, composed_robots, strict=True))
     _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
     robots = []
@@ -559,7 +537,7 @@ def _require_no_near(
     """Require that no test robot is nearly a train robot of its task, as the audit does."""
     for each in test:
         others = [robot_of[other.text] for other in train if other.task == each.task]
-        if reason := _NearReason(others)(robot_of[each.text]):
+        if reason := _near_reason(robot_of[each.text], others):
             raise BenchmarkError(
                 f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
                 "--from, or name another --seed"
@@ -770,56 +748,45 @@ def extrapolation(
         [RobotStream.of(grammar, grammar.name, request) for grammar in grammars]
         for grammars in (train_grammars, test_grammars)
     )
-    factory = RobotFactory(
-        library, with_features=similarity is not None, max_links=request.max_links
+    sources, targets = (
+        ", ".join(grammar.name for grammar in grammars)
+        for grammars in (train_grammars, test_grammars)
     )
-    turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
-    recipes = [train_streams[stream].recipe(number) for number, stream in turns]
-    train = make_robots(recipes, factory, jobs=jobs)
-    reject_trained = _UntrainedStructure(train, library)
-    reject_by_similarity = _SimilarityBound(train, request.train[0], similarity)
-    search = TestRobotSearch(request, train, factory)
-    targets = ", ".join(grammar.name for grammar in test_grammars)
-    if not search.find(test_streams, reject_trained, reject_by_similarity):
-        raise BenchmarkError(f"{targets}: {search.failure()}; {reject_by_similarity.advice()}")
-    sources = ", ".join(grammar.name for grammar in train_grammars)
-    return assemble_drawn(
+    return _drawn_splits(
         request,
         "extrapolation",
         f"{{n}} robots of {sources}; test: {request.test} of {targets}",
-        train,
-        search.robots,
+        (train_streams, test_streams),
+        lambda robots: _ExtrapolationRules(robots, request.train[0], similarity, library),
+        RobotFactory(library, with_features=similarity is not None, max_links=request.max_links),
         {
             "train_categories": {grammar.name: grammar.digest for grammar in train_grammars},
             "test_categories": {grammar.name: grammar.digest for grammar in test_grammars},
             **({"similarity": str(similarity)} if similarity else {}),
-            "seeds": {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)},
         },
+        jobs,
     )
 
 
-class _UntrainedStructure:
-    """Reject derivations that have the structure of a train robot."""
+class _ExtrapolationRules:
+    """A test robot has no trained structure, and a cosine to the nearest train robot in a bound."""
 
-    def __init__(self, train: Sequence[Candidate], library: Library) -> None:
-        self._library = library
+    def __init__(
+        self, train: Sequence[Candidate], smallest: int, bound: Bound | None, library: Library
+    ) -> None:
+        self._library, self._bound = library, bound
         self._names = {structure(each.derivation, library): each.name for each in reversed(train)}
+        # The largest cosine grows with the set.
+        self._train = train[:smallest] if bound and not bound.is_upper else train
+        self._nearest: list[tuple[float, str, str]] = []
 
-    def __call__(self, derivation: Derivation) -> str:
+    def reject_derivation(self, derivation: Derivation) -> str:
+        """Return the train robot of the same structure; empty if there is none."""
         twin = self._names.get(structure(derivation, self._library))
         return f"the structure of train robot {twin}" if twin else ""
 
-
-class _SimilarityBound:
-    """Reject robots whose cosine to the nearest train robot violates the bound."""
-
-    def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:
-        # The largest cosine grows with the set.
-        self._train = train[:smallest] if bound and not bound.is_upper else train
-        self._bound = bound
-        self._nearest: list[tuple[float, str, str]] = []
-
-    def __call__(self, robot: Candidate) -> str:
+    def reject_robot(self, robot: Candidate) -> str:
+        """Return that the robot violates the bound; empty if it does not."""
         if self._bound is None or robot.features is None:
             return ""
         cosines = [

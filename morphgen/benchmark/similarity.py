@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,10 +27,6 @@ from morphgen.model.robot import TOOL, Joint, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.progress import report
 from morphgen.typing import Array
-
-if TYPE_CHECKING:
-    pass
-
 
 SAMPLES = 65_536
 """Number of random configurations."""
@@ -451,19 +446,9 @@ def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_
 
     shapes: One primitive per link with geometry, by link name, as from ``token_shapes``.
     """
-    table = compared_tokens(robot, shapes, max_links=max_links)
+    table = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
     space = workspace(robot)
     return Features(robot.name, table, labelled_tree(robot, shapes, space.reach), space)
-
-
-def compared_tokens(
-    robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS
-) -> Array:
-    """Return the tokens that ``cosine`` compares, without joint positions, shape (n_links, 32).
-
-    Arguments and errors are those of ``features``.
-    """
-    return tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
 
 
 def cosine(a: Features, b: Features) -> float:

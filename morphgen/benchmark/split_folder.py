@@ -41,7 +41,13 @@ from morphgen.benchmark.split import (
 )
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.benchmark.survey import robot_stats
-from morphgen.benchmark.tokens import LAYOUT, TOKEN_SIZE, pad_tokens, require_max_links, tokens
+from morphgen.benchmark.tokens import (
+    LAYOUT_ARRAYS,
+    TOKEN_SIZE,
+    pad_tokens,
+    require_max_links,
+    tokens,
+)
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
@@ -302,8 +308,7 @@ def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
         tokens=tables,
         mask=mask,
         names=np.array([member.name for _, member in sided_members(split)]),
-        layout=np.array([field.name for field in LAYOUT]),
-        columns=np.array([(field.start, field.columns.stop) for field in LAYOUT]),
+        **LAYOUT_ARRAYS,
     )
     return content.getvalue()
 

@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,6 +88,11 @@ POSITION = Field(
 )
 LAYOUT = (INDEX, PARENT, TOOL_FLAG, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITION)
 """The fields of a token, in order."""
+LAYOUT_ARRAYS: Mapping[str, NDArray[Any]] = {
+    "layout": np.array([field.name for field in LAYOUT]),
+    "columns": np.array([(field.start, field.columns.stop) for field in LAYOUT]),
+}
+"""Names, and first and end index, of the fields, for files."""
 
 
 def default_max_links(link_counts: Iterable[int]) -> int:
@@ -145,8 +150,7 @@ def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = 
         content,
         tokens=tokens,
         links=np.array(links),
-        layout=np.array([field.name for field in LAYOUT]),
-        columns=np.array([(field.start, field.columns.stop) for field in LAYOUT]),
+        **LAYOUT_ARRAYS,
         name=np.array(name),
         max_links=np.array(max_links),
     )

@@ -151,10 +151,8 @@ def sample(args: argparse.Namespace) -> None:
     from morphgen.grammar.grammar_file import grammar_text
     from morphgen.grammar.robot_set import (
         SetConfig,
-        SetWorker,
         make_in_processes,
         make_on_ray,
-        make_serially,
         make_set,
     )
     from morphgen.grammar.values import parse_conditions
@@ -172,11 +170,7 @@ def sample(args: argparse.Namespace) -> None:
         not args.no_picture,
         tuple(args.library),
     )
-    work: SetWorker = make_serially
-    if args.ray is not None:
-        work = make_on_ray(args.ray or None)
-    elif args.jobs > 1:
-        work = make_in_processes(args.jobs)
+    work = make_in_processes(args.jobs) if args.ray is None else make_on_ray(args.ray or None)
     with bar(args, "sampling", total=args.n):
         report = make_set(config, args.n, work)
 
@@ -295,7 +289,7 @@ def mutate(args: argparse.Namespace) -> None:
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
     """Return the URDF that a derivation gives, as in a bundle or in a light set."""
-    from morphgen.fitting.collision_geometry import with_geometry
+    from morphgen.fitting.replace_collision import with_geometry
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
     from morphgen.grammar.robot_set import light_urdf

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -117,13 +117,6 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
         report = _write_index(config, len(missing), len(finished))
         path.unlink()
     return report
-
-
-def make_serially(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-    """Make robots one after the other in this process."""
-    maker = RobotMaker(config)
-    for index in indices:
-        yield maker.make(index)
 
 
 class RobotMaker:
@@ -321,8 +314,8 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     return SetReport(made, kept, dict(rejected), duplicates)
 
 
-def make_in_processes(jobs: int) -> SetWorker:
-    """Return a worker that makes robots in ``jobs`` processes of this machine."""
+def make_in_processes(jobs: int = 1) -> SetWorker:
+    """Return a worker that makes robots in ``jobs`` processes; one is this process."""
 
     def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
         return parallel_map(RobotMaker(config).make, indices, jobs)
@@ -356,15 +349,9 @@ def make_on_ray(address: str | None) -> SetWorker:
 
 def _distribute(ray: ModuleType, config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
     """Start a maker on every CPU, and give each the next chunk when it is free."""
-    chunks = deque(indices[i : i + CHUNK_SIZE] for i in range(0, len(indices), CHUNK_SIZE))
+    chunks = [indices[i : i + CHUNK_SIZE] for i in range(0, len(indices), CHUNK_SIZE)]
     cpus = max(int(ray.cluster_resources().get("CPU", 1)), 1)
     remote = ray.remote(num_cpus=1)(RobotMaker)
-    free = deque(remote.remote(config) for _ in range(min(cpus, len(chunks))))
-    running: dict[Any, Any] = {}
-    while chunks or running:
-        while chunks and free:
-            maker = free.popleft()
-            running[maker.make_all.remote(list(chunks.popleft()))] = maker
-        (done, *_), _ = ray.wait(list(running))
-        free.append(running.pop(done))
-        yield from ray.get(done)
+    makers = ray.util.ActorPool([remote.remote(config) for _ in range(min(cpus, len(chunks)))])
+    for records in makers.map_unordered(lambda maker, chunk: maker.make_all.remote(chunk), chunks):
+        yield from records

@@ -19,7 +19,6 @@ from morphgen.benchmark.generate import (
     composition,
     extrapolation,
     interpolation,
-    make_robots,
     parse_bound,
 )
 from morphgen.benchmark.regimes import parameters, regime_findings, structure
@@ -302,4 +301,4 @@ def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
     monkeypatch.setattr(generate, "check", lambda robot: findings)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
-        make_robots([ComposedRecipe(("base=gantry", "ee=cube"))], RobotFactory(LIBRARY))
+        RobotFactory(LIBRARY)(ComposedRecipe(("base=gantry", "ee=cube")))

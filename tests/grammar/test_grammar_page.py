@@ -12,7 +12,7 @@ from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.manifest import UNITS
 from morphgen.grammar.request import pin
-from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
+from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_set
 from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.grammar.values import DISTRIBUTIONS, PROPERTIES
@@ -102,7 +102,7 @@ def test_the_index_has_the_documented_fields(tmp_path):
     (row,) = re.findall(r"\| `index\.jsonl` \| one line per robot: (.*?) \|", PAGE)
     named = set(row.replace("rejected draws", "rejected").split(", "))
     plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
-    make_set(plan, 1, make_serially)
+    make_set(plan, 1, make_in_processes())
     import json
 
     record = json.loads((tmp_path / "s" / "index.jsonl").read_text())

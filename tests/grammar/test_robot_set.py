@@ -22,7 +22,6 @@ from morphgen.grammar.robot_set import (
     SETTINGS,
     SetConfig,
     make_in_processes,
-    make_serially,
     make_set,
     read_index,
 )
@@ -40,7 +39,7 @@ def plan(folder, category="cubes", **changes):
 def whole(tmp_path):
     """A set of eight cubes."""
     config = plan(tmp_path / "whole")
-    make_set(config, 8, make_serially)
+    make_set(config, 8, make_in_processes())
     return config.folder
 
 
@@ -51,7 +50,7 @@ def interrupted(plan, n, done):
         pass
 
     def work(plan, indices):
-        yield from make_serially(plan, indices[:done])
+        yield from make_in_processes()(plan, indices[:done])
         raise Killed
 
     with pytest.raises(Killed):
@@ -85,14 +84,14 @@ def test_the_index_can_be_read_with_pandas(whole):
 
 
 def test_a_full_set_consists_of_bundles(tmp_path):
-    make_set(plan(tmp_path / "s", light=False), 1, make_serially)
+    make_set(plan(tmp_path / "s", light=False), 1, make_in_processes())
     files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
     assert {"card.json", "robot.urdf", "robot.xml"} <= files
 
 
 def test_progress_reaches_the_number_of_robots(tmp_path):
     seen = []
-    for n, work in ((3, make_serially), (5, make_in_processes(2))):
+    for n, work in ((3, make_in_processes()), (5, make_in_processes(2))):
         with show_progress(lambda *now: seen.append(now)):
             make_set(plan(tmp_path / "s"), n, work)
     assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (3, 5), (4, 5), (5, 5)]
@@ -103,14 +102,14 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
     one = plan(tmp_path / "one", "chain", light=light)
     two = replace(one, folder=tmp_path / "two")
     n = 20 if light else 3
-    make_set(one, n, make_serially)
+    make_set(one, n, make_in_processes())
     make_set(two, n, make_in_processes(2))
     assert tree(one.folder) == tree(two.folder)
 
 
 def test_the_order_of_generation_does_not_matter(tmp_path, whole):
     def backwards(plan, indices):
-        return make_serially(plan, indices[::-1])
+        return make_in_processes()(plan, indices[::-1])
 
     make_set(plan(tmp_path / "s"), 8, backwards)
     assert tree(tmp_path / "s") == tree(whole)
@@ -118,11 +117,11 @@ def test_the_order_of_generation_does_not_matter(tmp_path, whole):
 
 def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
     config = plan(tmp_path / "s")
-    assert make_set(config, 3, make_serially).made == 3
-    report = make_set(config, 8, make_serially)
+    assert make_set(config, 3, make_in_processes()).made == 3
+    report = make_set(config, 8, make_in_processes())
     assert (report.made, report.kept) == (5, 3)
     assert tree(config.folder) == tree(whole)
-    assert make_set(config, 2, make_serially).made == 0
+    assert make_set(config, 2, make_in_processes()).made == 0
     assert tree(config.folder) == tree(whole)
 
 
@@ -132,7 +131,7 @@ def test_robots_written_before_an_interruption_are_kept(tmp_path, whole, done):
     interrupted(config, 8, done)
     with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
         read_index(config.folder)
-    report = make_set(config, 8, make_serially)
+    report = make_set(config, 8, make_in_processes())
     assert (report.made, report.kept, report.duplicates) == (8 - done, done, [])
     assert tree(config.folder) == tree(whole)
 
@@ -141,7 +140,7 @@ def test_deleted_robots_are_regenerated(tmp_path, whole):
     before = tree(whole)
     shutil.rmtree(whole / "cubes-000003")
     (whole / "cubes-000005" / "robot.urdf").unlink()
-    report = make_set(plan(whole), 8, make_serially)
+    report = make_set(plan(whole), 8, make_in_processes())
     assert (report.made, report.kept) == (2, 6)
     assert tree(whole) == before
 
@@ -149,7 +148,7 @@ def test_deleted_robots_are_regenerated(tmp_path, whole):
 def test_without_journal_or_index_everything_is_regenerated(tmp_path, whole):
     before = tree(whole)
     (whole / INDEX).unlink()
-    assert make_set(plan(whole), 8, make_serially).made == 8
+    assert make_set(plan(whole), 8, make_in_processes()).made == 8
     assert tree(whole) == before
 
 
@@ -162,7 +161,7 @@ def test_a_truncated_journal_regenerates_one_robot(tmp_path, whole, cut):
         "".join(f"{line}\n" for line in lines[:4]) + lines[4][:cut]
     )
     interrupted(config, 8, 2)
-    report = make_set(config, 8, make_serially)
+    report = make_set(config, 8, make_in_processes())
     assert report.made in (2, 3)
     assert tree(config.folder) == tree(whole)
 
@@ -172,7 +171,7 @@ def test_partially_written_robots_are_removed(tmp_path, whole):
     interrupted(config, 8, 2)
     (config.folder / ".cubes-000002.x1y2").mkdir()
     (config.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
-    make_set(config, 8, make_serially)
+    make_set(config, 8, make_in_processes())
     assert tree(config.folder) == tree(whole)
 
 
@@ -182,7 +181,7 @@ def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, 
     config.folder.mkdir()
     for name in left:
         (config.folder / name).write_text(config.grammar_text if name == GRAMMAR else "{")
-    make_set(config, 8, make_serially)
+    make_set(config, 8, make_in_processes())
     assert tree(config.folder) == tree(whole)
 
 
@@ -198,7 +197,7 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     again = start(*words, "--out", tmp_path / "killed")
     out, err = again.communicate(timeout=60)
     assert (again.returncode, "32 made" in out) == (0, False), err
-    make_set(plan(tmp_path / "whole", "chain", seed=3), 32, make_serially)
+    make_set(plan(tmp_path / "whole", "chain", seed=3), 32, make_in_processes())
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
@@ -224,7 +223,7 @@ def wait_for(happened, process):
 def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
     before = tree(whole)
     with pytest.raises(FormatError) as caught:
-        make_set(plan(whole, **change), 9, make_serially)
+        make_set(plan(whole, **change), 9, make_in_processes())
     assert message in str(caught.value)
     assert tree(whole) == before
 
@@ -236,20 +235,20 @@ def test_a_folder_with_other_files_is_an_error(tmp_path, name):
     with pytest.raises(
         FormatError, match=r"exists and is not a set \(no set\.json\); name another"
     ):
-        make_set(plan(tmp_path / "s"), 1, make_serially)
+        make_set(plan(tmp_path / "s"), 1, make_in_processes())
     assert tree(tmp_path / "s") == {name: b"mine"}
 
 
 def test_a_file_instead_of_the_folder_is_an_error(tmp_path):
     (tmp_path / "s").write_text("mine")
     with pytest.raises(FormatError):
-        make_set(plan(tmp_path / "s"), 1, make_serially)
+        make_set(plan(tmp_path / "s"), 1, make_in_processes())
     assert (tmp_path / "s").read_text() == "mine"
 
 
 def test_duplicate_robots_are_reported(tmp_path):
     config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
-    report = make_set(config, 3, make_serially)
+    report = make_set(config, 3, make_in_processes())
     assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
     hashes = {record["hash"] for record in read_index(config.folder)}
     assert len(hashes) == 1
@@ -257,14 +256,16 @@ def test_duplicate_robots_are_reported(tmp_path):
 
 def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
     config = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
-    report = make_set(config, 8, make_serially)
+    report = make_set(config, 8, make_in_processes())
     counted = sum(sum(record["rejected"].values()) for record in read_index(config.folder))
     assert report.rejected == {"where (mass < 0.5)": counted}
     assert counted > 0
-    assert make_set(config, 8, make_serially).rejected == report.rejected
+    assert make_set(config, 8, make_in_processes()).rejected == report.rejected
 
 
-@pytest.mark.parametrize("work", [make_serially, make_in_processes(2)], ids=["1 job", "2 jobs"])
+@pytest.mark.parametrize(
+    "work", [make_in_processes(), make_in_processes(2)], ids=["1 job", "2 jobs"]
+)
 def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
     with pytest.raises(SamplingError, match=r"500 failed at: where \(mass > 900\)"):
         make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
@@ -272,7 +273,7 @@ def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
 
 def test_a_light_robot_references_meshes_in_their_packages(tmp_path):
     config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
-    make_set(config, 1, make_serially)
+    make_set(config, 1, make_in_processes())
     text = (config.folder / "g-000000" / "robot.urdf").read_text()
     assert 'filename="package://' in text
     assert str(Path.home()) not in text
@@ -283,8 +284,8 @@ def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path):
 
     def work(plan, indices):
         with pytest.raises(FormatError, match="is being written by another run"):
-            make_set(plan, 8, make_serially)
-        yield from make_serially(plan, indices)
+            make_set(plan, 8, make_in_processes())
+        yield from make_in_processes()(plan, indices)
 
     make_set(config, 2, work)
     assert len(read_index(config.folder)) == 2
@@ -316,7 +317,7 @@ def test_an_invalid_index_line_is_an_error(whole, change):
 @pytest.mark.parametrize("line", ["[" * 100_000, "[]", "null", "5", "{}"])
 def test_an_invalid_journal_is_ignored(whole, line):
     (whole / JOURNAL).write_text(line + "\n")
-    assert make_set(plan(whole), 9, make_serially).made == 1
+    assert make_set(plan(whole), 9, make_in_processes()).made == 1
     assert len(read_index(whole)) == 9
     (whole / INDEX).write_text(line + "\n")
     with pytest.raises(FormatError, match=r"index.jsonl:1: not a line of an index"):
@@ -329,4 +330,4 @@ def test_invalid_settings_are_errors(whole, text):
     with pytest.raises(
         FormatError, match=r"set.json: (invalid JSON|is nested deeper|expected the settings)"
     ):
-        make_set(plan(whole), 9, make_serially)
+        make_set(plan(whole), 9, make_in_processes())

@@ -8,7 +8,7 @@ from helpers.commands import tree
 from helpers.grammars import shipped
 from morphgen.errors import MorphgenError
 from morphgen.grammar.grammar_file import grammar_text
-from morphgen.grammar.robot_set import SetConfig, make_on_ray, make_serially, make_set
+from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_on_ray, make_set
 from morphgen.grammar.sampling import SamplingError
 
 pytestmark = pytest.mark.slow
@@ -32,7 +32,7 @@ def plan(folder: Path, where=()) -> SetConfig:
 
 
 def test_a_ray_cluster_writes_the_same_bytes_as_one_process(address, tmp_path):
-    make_set(plan(tmp_path / "serial"), 40, make_serially)
+    make_set(plan(tmp_path / "serial"), 40, make_in_processes())
     report = make_set(plan(tmp_path / "ray"), 40, make_on_ray(address))
     assert report.made == 40
     assert tree(tmp_path / "ray") == tree(tmp_path / "serial")
