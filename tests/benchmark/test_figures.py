@@ -1,7 +1,6 @@
 """Pictures of similarity are reproducible and complete."""
 
 import io
-import struct
 
 import matplotlib
 import numpy as np
@@ -40,16 +39,6 @@ def pixels(png):
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=int)
 
 
-def chunks(png):
-    """Return the names of a PNG's chunks."""
-    found, at = [], 8
-    while at < len(png):
-        (size,) = struct.unpack(">I", png[at : at + 4])
-        found.append(png[at + 4 : at + 8].decode())
-        at += size + 12
-    return found
-
-
 @pytest.mark.parametrize(
     "n", [1, MAX_WITH_VALUES, pytest.param(MAX_NAMED, marks=pytest.mark.slow), MAX_NAMED + 1]
 )
@@ -60,13 +49,10 @@ def test_figures_can_be_drawn_for_any_number_of_robots(n):
 
 
 @pytest.mark.parametrize("n", [2, MAX_NAMED + 1])
-def test_pictures_are_reproducible(n):
+def test_pictures_are_reproducible_and_hold_no_version(n):
     assert drawings(n) == drawings(n)
-
-
-def test_pictures_contain_no_date_and_no_version():
-    for png in drawings(5):
-        assert set(chunks(png)) == {"IHDR", "pHYs", "IDAT", "IEND"}
+    for png in drawings(n):
+        assert Image.open(io.BytesIO(png)).info.keys() <= {"dpi"}
         assert matplotlib.__version__.encode() not in png
 
 
@@ -98,28 +84,10 @@ def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
     assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
 
 
-@pytest.mark.slow
-def test_robots_of_a_map_are_labelled_up_to_a_limit():
-    some = [f"robot{i}" for i in range(MAX_NAMED)]
-    others = [f"other{i}" for i in range(MAX_NAMED)]
-    assert map_png(some, [map_panel(MAX_NAMED)]) != map_png(others, [map_panel(MAX_NAMED)])
-    some, others = [*some, "robot"], [*others, "other"]
-    assert map_png(some, [map_panel(MAX_NAMED + 1)]) == map_png(others, [map_panel(MAX_NAMED + 1)])
-
-
 def test_names_are_not_parsed_as_formulas():
     odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
     assert heatmap_png(odd, [panel(4)])
     assert map_png(odd, [map_panel(4)])
-
-
-@pytest.mark.slow
-def test_panels_are_drawn_side_by_side():
-    one = pixels(heatmap_png(names(5), [panel(5)]))
-    three = pixels(heatmap_png(names(5), [panel(5), panel(5, "cosine", True), panel(5)]))
-    assert three.shape[0] == one.shape[0]
-    assert three.shape[1] > 2 * one.shape[1]
-    assert pixels(map_png(names(5), [map_panel(5)] * 2)).shape[1] == 1500
 
 
 def test_families_have_different_colours():

@@ -1,9 +1,12 @@
-"""Split folders: complete, loadable, reproducible, resumable and protected against overwriting."""
+"""Split folders: complete, reproducible, resumable, protected against overwriting, readable."""
 
 import hashlib
 import json
 import signal
+import subprocess
+import sys
 import time
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +20,9 @@ from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split, load_split_folder
 from morphgen.benchmark.tokens import pad_tokens, tokens
-from morphgen.errors import BenchmarkError, FormatError
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats import zip_files as npz_files
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
 from morphgen.progress import show_progress
@@ -46,9 +50,8 @@ def test_every_robot_is_a_bundle(whole, example_split):
 
 def test_each_robot_has_one_line_of_json(whole, example_split):
     records = [json.loads(line) for line in (whole / "robots.jsonl").read_text().splitlines()]
-    assert [record["name"] for record in records] == [
-        m.name for m in (*example_split.train, *example_split.test)
-    ]
+    members = (*example_split.train, *example_split.test)
+    assert [record["name"] for record in records] == [m.name for m in members]
     assert [record["side"] for record in records] == ["train"] * 3 + ["test"]
     assert records[0] == {
         "name": "gantry-plane",
@@ -84,9 +87,7 @@ def test_tokens_match_the_robots(whole, example_split):
 
 def test_a_robot_with_more_than_max_links_is_an_error(tmp_path):
     example_split = split(["chain beads=7"], ["base=gantry ee=cube"])
-    with pytest.raises(
-        BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_links 23"
-    ):
+    with pytest.raises(BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_li"):
         build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
 
 
@@ -126,10 +127,9 @@ def test_a_light_build_references_meshes_in_their_packages(tmp_path):
     own = folder / "robots" / "ur5-plane"
     assert sorted(path.name for path in own.iterdir()) == ["derivation.txt", "robot.urdf"]
     assert (own / "derivation.txt").read_text() == f"{example_split.train[0].derivation}\n"
-    assert (own / "robot.urdf").read_text() == light_urdf(
-        compose_member(example_split.train[0], LIBRARY)
-    )
-    assert 'filename="package://' in (own / "robot.urdf").read_text()
+    text = (own / "robot.urdf").read_text()
+    assert text == light_urdf(compose_member(example_split.train[0], LIBRARY))
+    assert 'filename="package://' in text
     assert "derivation.txt" in (folder / "README.md").read_text()
 
 
@@ -138,32 +138,17 @@ def test_a_robot_listed_twice_is_written_once(tmp_path):
     example_split = combined(test=[twin, *combined().test])
     report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
     assert report.num_written == 4
-    assert {path.name for path in (report.folder / "robots").iterdir()} == {
-        "gantry-plane",
-        "planar-cube",
-        "gantry-cylinder",
-        "planar-plane",
-    }
-    (record,) = [
-        robot for robot in load_split_folder(report.folder).test if robot["name"] == "twin"
-    ]
-    assert (record["path"], record["task"]) == ("robots/gantry-plane", "reach")
-
-
-def test_pictures_are_written_on_request(tmp_path):
-    example_split = split(["cubes"], ["base=planar ee=plane"])
-    folder = build_split(
-        example_split, tmp_path, LIBRARY, settings=BuildSettings(picture=True)
-    ).folder
-    assert (folder / "robots" / "cubes" / "preview.png").is_file()
-    assert (
-        build_split(example_split, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).num_kept
-        == 2
-    )
+    names = {path.name for path in (report.folder / "robots").iterdir()}
+    assert names == {"gantry-plane", "planar-cube", "gantry-cylinder", "planar-plane"}
+    robots = {robot["name"]: robot for robot in load_split_folder(report.folder).test}
+    assert robots["twin"]["path"] == "robots/gantry-plane"
+    assert robots["twin"]["task"] == "reach"
 
 
 @pytest.mark.parametrize(
-    "settings", [pytest.param(BUNDLED, marks=pytest.mark.slow), LIGHT], ids=["bundles", "light"]
+    "settings",
+    [pytest.param(BuildSettings(picture=True), marks=pytest.mark.slow), LIGHT],
+    ids=["pictures", "light"],
 )
 def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
@@ -173,6 +158,8 @@ def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     assert tree(one.folder) == tree(two.folder)
     again = build_split(example_split, tmp_path / "one", LIBRARY, settings=settings)
     assert (again.num_written, again.num_kept) == (0, 10)
+    pictures = list(one.folder.glob("robots/*/preview.png"))
+    assert len(pictures) == (10 if settings.picture else 0)
     assert tree(one.folder) == tree(two.folder)
 
 
@@ -279,22 +266,15 @@ def test_a_folder_of_another_build_is_an_error(tmp_path, whole, example_split):
     assert tree(whole) == before
 
 
-def test_a_folder_with_other_files_is_an_error(tmp_path, example_split):
-    (tmp_path / "mine" / "some").mkdir(parents=True)
-    (tmp_path / "mine" / "some" / "notes.txt").write_text("mine")
+@pytest.mark.parametrize("place", ["mine", "mine/some", "mine/some/notes.txt"])
+def test_other_files_in_place_of_a_build_are_errors(tmp_path, example_split, place):
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / place).write_text("mine")
     before = tree(tmp_path)
-    with pytest.raises(BenchmarkError, match=r"is no built split \(no build.json\); name another"):
+    message = r"is no built split \(no build.json\); name another|cannot write"
+    with pytest.raises(BenchmarkError, match=message):
         build_split(example_split, tmp_path, LIBRARY)
     assert tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("place", ["mine", "mine/some"])
-def test_a_file_instead_of_a_folder_is_an_error(tmp_path, example_split, place):
-    (tmp_path / place).parent.mkdir(exist_ok=True)
-    (tmp_path / place).write_text("mine")
-    with pytest.raises(BenchmarkError, match=r"exists and is no built split|cannot write"):
-        build_split(example_split, tmp_path, LIBRARY)
-    assert (tmp_path / place).read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["../up", "a//b", "/tmp/x", "", ".hidden"])
@@ -343,3 +323,97 @@ def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, example_sp
     assert not (tmp_path / "mine" / "some").exists()
     monkeypatch.undo()
     assert build_split(example_split, tmp_path, LIBRARY).num_written == 4
+
+
+def test_loading_returns_plain_records_with_tokens(whole, example_split):
+    built = load_split_folder(whole)
+    assert [len(each) for each in (built.robots, built.train, built.test)] == [4, 3, 1]
+    for i, robot in enumerate(built.robots):
+        assert type(robot) is dict
+        assert robot["side"] == ("test" if i == 3 else "train")
+        np.testing.assert_array_equal(robot["tokens"], built.tokens[i])
+        assert robot["mask"].sum() == robot["links"]
+        assert (built.folder / robot["path"] / "robot.urdf").is_file()
+    assert built.test[0]["name"] == built.train[:2][1]["name"].replace("cube", "plane")
+    assert load_split_folder(str(whole)).folder == whole
+
+
+def test_loading_does_not_import_torch(whole):
+    code = (
+        "import sys; from morphgen.benchmark.split_folder import load_split_folder; "
+        f"print(len(load_split_folder({str(whole)!r}).train), 'torch' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "3 False\n"
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "message"),
+    [
+        ("build.json", None, r"is no built split: it has no build.json; morphgen split build"),
+        ("SHA256SUMS", None, "is not finished: it has no SHA256SUMS; build it again"),
+        ("robots.jsonl", None, "robots.jsonl: no such file"),
+        ("robots.jsonl", b"{\n", "robots.jsonl:1: invalid JSON"),
+        ("robots.jsonl", b"[]\n", "robots.jsonl:1: expected an object with a name and a side"),
+        ("robots.jsonl", b"\xff\n", "robots.jsonl: cannot be read"),
+        ("robots.jsonl", b"", "tokens.npz is not of the robots in robots.jsonl"),
+        ("tokens.npz", None, "tokens.npz: no such file"),
+        ("tokens.npz", b"", "tokens.npz: cannot be read"),
+        ("tokens.npz", b"PK\x03\x04 and so on", "tokens.npz: cannot be read"),
+    ],
+)
+def test_unreadable_files_are_errors_that_name_the_file(whole, path, content, message):
+    if content is None:
+        (whole / path).unlink()
+    else:
+        (whole / path).write_bytes(content)
+    with pytest.raises(MorphgenError, match=message):
+        load_split_folder(whole)
+
+
+@pytest.mark.parametrize("change", ["tokens", "mask", "names"])
+def test_inconsistent_token_arrays_are_errors(whole, change):
+    with np.load(whole / "tokens.npz") as data:
+        arrays = dict(data)
+    arrays[change] = arrays[change][:2]
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=r"names, tokens and mask are of shapes \("):
+        load_split_folder(whole)
+    del arrays[change]
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=f"cannot be read: .*{change}"):
+        load_split_folder(whole)
+
+
+@pytest.mark.parametrize("kind", ["U4", "M8[s]", "?", "c16"])
+def test_token_arrays_of_other_types_are_errors(whole, kind):
+    with np.load(whole / "tokens.npz") as data:
+        arrays = dict(data)
+    arrays["tokens"] = arrays["tokens"].astype(int).astype(kind)
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=r"are of types .*expected str, float64 and bool"):
+        load_split_folder(whole)
+
+
+def test_arrays_that_claim_or_hold_more_than_the_memory_are_errors(whole, monkeypatch):
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**9, 10**5)}
+    with zipfile.ZipFile(whole / "tokens.npz", "w") as archive:
+        for name in ("names", "tokens", "mask"):
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(BenchmarkError, match=r"tokens\.npz: cannot be read: "):
+        load_split_folder(whole)
+    monkeypatch.setattr(npz_files, "MAX_BYTES", 1000)
+    np.savez_compressed(whole / "tokens.npz", tokens=np.zeros(10_000))
+    with pytest.raises(BenchmarkError, match="its arrays have more than"):
+        load_split_folder(whole)
+    with (whole / "tokens.npz").open("wb") as file:
+        np.save(file, np.zeros(3))  # one array without an archive
+    with pytest.raises(BenchmarkError, match=r"tokens\.npz: cannot be read: "):
+        load_split_folder(whole)
+
+
+def test_loading_a_parent_folder_suggests_the_split_folder(tmp_path, whole):
+    with pytest.raises(BenchmarkError, match=r"did you mean .*whole/mine/some\?"):
+        load_split_folder(tmp_path / "whole")
+    with pytest.raises(BenchmarkError, match="nowhere: no such folder"):
+        load_split_folder(tmp_path / "nowhere")

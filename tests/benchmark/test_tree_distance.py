@@ -145,22 +145,21 @@ def test_costs_of_changed_joints(change, cost):
     assert edit_distance(tree(hinge), tree(other)) == pytest.approx(cost, abs=1e-12)
 
 
-def test_cost_of_a_changed_size():
-    hinge = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, BLOCK])
-    other = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, Shape(Box((0.3, 0.1, 0.6)))])
-    cost = 1 / 16 * (0 + 0.1 / 0.55 + 0.3 / 0.95) / 3
-    assert edit_distance(tree(hinge), tree(other)) == pytest.approx(cost)
-
-
 @pytest.mark.parametrize(
-    ("other", "cost"), [(Sphere(0.1), 1 / 16), (Cylinder(0.1, 0.2), 1 / 16), (Box((0.2,) * 3), 0.0)]
+    ("other", "cost"),
+    [
+        (Sphere(0.1), 1 / 16),
+        (Cylinder(0.1, 0.2), 1 / 16),
+        (Box((0.2,) * 3), 0.0),
+        (Box((0.3, 0.1, 0.6)), 1 / 16 * (0.1 / 0.35 + 0.1 / 0.55 + 0.4 / 0.85) / 3),
+    ],
 )
 def test_cost_of_a_changed_shape(other, cost):
     cube, changed = (
         body(("prismatic", 0, (0, 0, 1), 0.2), shapes=[None, Shape(geometry)])
         for geometry in (Box((0.2, 0.2, 0.2)), other)
     )
-    assert edit_distance(tree(cube), tree(changed)) == cost
+    assert edit_distance(tree(cube), tree(changed)) == pytest.approx(cost)
 
 
 def test_a_capsule_costs_the_same_as_a_cylinder_and_a_missing_shape_costs_more():
@@ -169,9 +168,6 @@ def test_a_capsule_costs_the_same_as_a_cylinder_and_a_missing_shape_costs_more()
     a, b = (tree(body(joint, shapes=[None, shape])) for shape in (capsule, cylinder))
     assert edit_distance(a, b) == pytest.approx(0, abs=1e-12)
     assert edit_distance(a, tree(body(joint))) > 1 / 16
-
-
-def test_a_mesh_is_an_error():
     with pytest.raises(ValueError, match="a mesh has no label"):
         labelled_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
 
@@ -205,14 +201,6 @@ def test_empty_links_do_not_change_the_distance():
         ("fixed", 5, (1, 0, 0), 0.7),
     )
     assert distance(plain, framed) == pytest.approx(0, abs=1e-12)
-
-
-def test_fixed_links_with_shapes_change_the_distance():
-    plain = body(("revolute", 0, (0, 0, 1), 0.3))
-    stood = body(
-        ("fixed", 0, (1, 0, 0), 0.1), ("revolute", 1, (0, 0, 1), 0.3), shapes=[None, BLOCK]
-    )
-    assert edit_distance(tree(plain), tree(stood)) == pytest.approx(FIXED)
 
 
 @given(st.randoms(use_true_random=False))

@@ -70,6 +70,9 @@ def test_a_primitive_aligned_with_the_link_axes_stays_aligned() -> None:
     assert box.geometry == Box((0.1, 0.2, 0.3))
     assert box.T_link_shape.position == (0.5, 0.0, -0.2)
     assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+    points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
+    noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
+    assert enclose(points + noise).T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
 
     upright = np.asarray(trimesh.creation.cylinder(0.1, 0.5).vertices)
     cylinder = enclose(upright + centre)
@@ -82,14 +85,6 @@ def test_a_primitive_aligned_with_the_link_axes_stays_aligned() -> None:
 
     sphere = enclose(np.asarray(trimesh.creation.icosphere(2, 0.1).vertices) + centre)
     assert sphere == Shape(Sphere(0.1), box.T_link_shape)
-
-
-def test_noise_does_not_rotate_a_box_away_from_the_link_axes() -> None:
-    points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
-    noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
-    box = enclose(points + noise)
-    assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
-    assert outside(box, points + noise) <= 1e-9
 
 
 @pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (1, 1.0), (2, 1.0), (3, 1e-4)])
@@ -125,16 +120,6 @@ def test_enclosures_of_links_are_not_larger_than_those_of_trimesh(robot: str) ->
         shape = enclose(mesh.vertices)
         assert size(shape) <= tightest * ROUNDING
         assert outside(shape, np.asarray(mesh.vertices)) <= 1e-9
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_enclosures_of_point_clouds_are_not_larger_than_those_of_trimesh(seed: int) -> None:
-    points = cloud(np.random.default_rng(seed), n=12)
-    _, extents = trimesh.bounds.oriented_bounds(points)
-    cylinder = trimesh.bounds.minimum_cylinder(points)
-    assert size(enclose(points, ["box"])) <= np.prod(extents) * ROUNDING
-    least = math.pi * cylinder["radius"] ** 2 * cylinder["height"]
-    assert size(enclose(points, ["cylinder"])) <= least * ROUNDING
 
 
 def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube() -> None:
@@ -227,8 +212,5 @@ def test_a_dense_round_hull_is_enclosed_tightly() -> None:
 def test_points_without_volume_are_an_error(points: Array, reason: str) -> None:
     with pytest.raises(FitError, match=reason):
         enclose(points)
-
-
-def test_points_of_another_shape_are_an_error() -> None:
     with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
         enclose(CUBE[:, :2])

@@ -136,19 +136,6 @@ def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
     assert len(fits[2].primitives) == 2
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
-        ({"iou": 1.5}, "IoU 1.5"),
-        ({"seed": -1}, "seed -1"),
-    ],
-)
-def test_options_out_of_range_are_errors(options, message):
-    with pytest.raises(FitError, match=message):
-        FitOptions(**options)
-
-
 def test_replacing_collisions_preserves_masses_and_joints():
     meshes = morphgen.compose("arm=ur5 ee=plane")
     primitive_robot = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")

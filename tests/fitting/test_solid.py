@@ -10,7 +10,6 @@ from morphgen.errors import FitError, MeshError
 from morphgen.fitting.solid import (
     DECIMATED_FACES,
     MAX_FACES,
-    MAX_OPENNESS,
     Cavities,
     solid_of,
     solid_of_mesh,
@@ -82,6 +81,7 @@ def test_a_closed_box_is_its_own_solid():
     assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
     assert solid.size == pytest.approx(math.hypot(*SIZE))
     assert solid.hull.volume == pytest.approx(BOX_VOLUME)
+    assert not solid.contains(np.array([(0.1001, 0, 0), (5, 5, 5)])).any()
 
 
 def test_the_solid_of_an_l_is_not_its_convex_hull():
@@ -91,18 +91,7 @@ def test_the_solid_of_an_l_is_not_its_convex_hull():
     assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
 
 
-def test_points_outside_the_bounding_box_are_outside():
-    assert not solid_of_mesh(box()).contains(np.array([(0.1001, 0, 0), (5, 5, 5)])).any()
-
-
-def test_an_inverted_box_is_repaired():
-    solid = solid_of_mesh(box(inverted=True))
-    assert solid.method == "repaired"
-    assert solid.mesh.volume == pytest.approx(BOX_VOLUME)
-    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
-
-
-@pytest.mark.parametrize("flipped", range(1, 12, 3))
+@pytest.mark.parametrize("flipped", [1, 4, 7, 10, 12])
 def test_inverted_triangles_are_repaired(flipped):
     mesh = box()
     faces = mesh.faces.copy()
@@ -241,12 +230,9 @@ def test_flat_meshes_are_errors(tmp_path, pose):
     assert counted(solid_of([shape, Shape(Box(SIZE))])) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
-def test_an_empty_list_of_shapes_is_an_error():
+def test_missing_shapes_and_unreadable_meshes_are_errors(tmp_path):
     with pytest.raises(FitError, match="no shapes"):
         solid_of([])
-
-
-def test_an_unreadable_mesh_is_an_error(tmp_path):
     with pytest.raises(MeshError, match=r"lost\.stl"):
         solid_of([Shape(Box(SIZE)), Shape(Mesh(tmp_path / "lost.stl"))])
 
@@ -310,6 +296,8 @@ def test_distances_are_measured_to_the_surface():
 def test_the_surface_of_a_box_is_sampled_uniformly():
     points = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
     assert len(points) == pytest.approx(6000, rel=0.02)
+    again = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
+    np.testing.assert_array_equal(again, points)
     beyond = np.abs(points) - np.array(SIZE) / 2
     np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
     x, y, z = SIZE
@@ -329,34 +317,12 @@ def test_the_surface_excludes_enclosed_faces(inverted):
     np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
 
 
-def test_the_surface_of_overlapping_boxes_is_that_of_their_union():
-    boxes = [box((0.2, 0.2, 0.2), (-0.05, 0, 0)), box((0.2, 0.1, 0.1), (0.1, 0, 0))]
-    solid = solid_of_mesh(trimesh.util.concatenate(boxes))
-    points = solid.surface(4000, np.random.default_rng(0))
-    big, small = (
-        (np.abs(points - at) - np.array(size) / 2).max(axis=1)
-        for at, size in (((-0.05, 0, 0), (0.2, 0.2, 0.2)), ((0.1, 0, 0), (0.2, 0.1, 0.1)))
-    )
-    np.testing.assert_allclose(np.minimum(big, small), 0, atol=1e-9)
-    assert (big < small).any()
-    assert (small < big).any()
-
-
-def test_surface_samples_are_reproducible():
-    solid = solid_of_mesh(angle())
-    first, second = (solid.surface(100, np.random.default_rng(3)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-
-
 def test_the_given_meshes_are_not_modified():
     for mesh in (box(inverted=True), without(box(), np.arange(12) < 2)):
         before = mesh.vertices.copy(), mesh.faces.copy()
         solid_of_mesh(mesh)
         np.testing.assert_array_equal(mesh.vertices, before[0])
         np.testing.assert_array_equal(mesh.faces, before[1])
-
-
-POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (4000, 3))
 
 
 def tube(wall=0.01, radius=0.1, length=0.6, closed=False):
@@ -376,42 +342,24 @@ def solid_from(mesh, tmp_path):
 def test_openness_is_zero_inside_a_box_one_far_away_and_half_on_a_wall():
     around = Cavities(trimesh.creation.box((1, 1, 1)))
     points = np.array([(0.1, 0.2, -0.3), (50.0, 0, 0), (0.5 + 1e-4, 0, 0)])
-    inside, outside, wall = around.openness(points)
-    assert inside == 0
-    assert outside == 1
-    assert wall == pytest.approx(0.5, abs=0.02)
+    assert around.openness(points) == pytest.approx([0, 1, 0.5], abs=0.02)
     assert around.openness(np.zeros((0, 3))).shape == (0,)
 
 
 def test_openness_in_a_cup_is_the_solid_angle_of_its_opening():
-    cup = trimesh.util.concatenate(
-        [
-            trimesh.creation.annulus(0.49, 0.5, 1.0, transform=None),
-            trimesh.creation.box((1, 1, 0.01)),
-        ]
-    )
-    cup.apply_translation((0, 0, 0))
+    walls, lid = trimesh.creation.annulus(0.49, 0.5, 1.0), trimesh.creation.box((1, 1, 0.01))
+    cup = trimesh.util.concatenate([walls, lid])
     # The opening of the upper half as seen from the bottom: radius 0.49 at distance 0.49.
     (openness,) = Cavities(cup).openness(np.array([(0.0, 0.0, 0.01)]))
     assert openness == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)
-
-
-def test_points_outside_the_convex_hull_are_not_enclosed():
-    mesh = tube()
-    beyond = POINTS[~np.asarray(trimesh.convex.convex_hull(mesh).contains(POINTS))]
-    assert Cavities(mesh).openness(beyond).min() > MAX_OPENNESS
 
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_tube_is_filled_except_near_its_opening(tmp_path, closed):
     solid = solid_from(tube(closed=closed), tmp_path)
     assert solid.method == "filled"
-    deep, mouth, beside = solid.contains(
-        np.array([(0.02, 0.03, -0.1), (0.0, 0.0, 0.299), (0.11, 0.0, 0.0)])
-    )
-    assert deep
-    assert not mouth
-    assert not beside
+    deep, mouth, beside = (0.02, 0.03, -0.1), (0.0, 0.0, 0.299), (0.11, 0.0, 0.0)
+    assert solid.contains(np.array([deep, mouth, beside])).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -420,9 +368,9 @@ def test_a_tube_is_filled_except_near_its_opening(tmp_path, closed):
         trimesh.creation.annulus(0.4, 0.5, 0.1),
         trimesh.util.concatenate(
             [
-                trimesh.creation.box((0.02, 0.1, 0.3), transform=np.eye(4)),
-                trimesh.creation.box(bounds=[(0.14, -0.05, -0.15), (0.16, 0.05, 0.15)]),
-                trimesh.creation.box(bounds=[(-0.01, -0.05, -0.17), (0.16, 0.05, -0.15)]),
+                box((0.02, 0.1, 0.3)),
+                box((0.02, 0.1, 0.3), (0.15, 0, 0)),
+                box((0.17, 0.1, 0.02), (0.075, 0, -0.16)),
             ]
         ),
         trimesh.creation.box((0.3, 0.2, 0.1)),

@@ -9,13 +9,12 @@ import trimesh
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
-from morphgen.fitting.quality import quality, signed_distance
+from morphgen.fitting.quality import quality
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
-from morphgen.fitting.search import Candidates, best_spheres, distances, sample_solid
+from morphgen.fitting.search import best_spheres, sample_solid
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.rotation import IDENTITY
 
 BALLS = ((0.1, 0.0, 0.0, 0.05), (-0.02, 0.03, 0.0, 0.07), (0.0, -0.04, 0.1, 0.04))
 BOX = (0.3, 0.1, 0.08)
@@ -80,29 +79,10 @@ def test_more_spheres_overlap_more_and_a_cover_costs_overlap():
 
 
 def test_protruding_share_of_a_ball_around_a_cube():
-    """A sphere of radius r around a cube of edge 2a has six caps outside of the cube.
-
-    Each cap has the height r - a.
-    """
+    """A sphere of radius r around a cube of edge 2a has six caps of height r - a outside of it."""
     a, r = 0.05, 0.06
     measured = quality(solid_of([Shape(Box((2 * a,) * 3))]), [Shape(Sphere(r))])
     assert measured.protrusion_share == pytest.approx(6 * (r - a) / (2 * r), rel=0.01)
-
-
-def test_distances_of_spheres_are_those_of_other_shapes():
-    rng = np.random.default_rng(0)
-    centres, radii = rng.normal(size=(2, 3, 3)), rng.uniform(0.3, 0.9, (2, 3))
-    points = rng.normal(size=(50, 3))
-    candidates = Candidates(
-        np.full((2, 3), 2), centres, np.tile(IDENTITY, (2, 3, 1)), np.repeat(radii[..., None], 3, 2)
-    )
-    for row in range(2):
-        shapes = [
-            Shape(Sphere(float(r)), Pose(tuple(c.tolist())))
-            for c, r in zip(centres[row], radii[row], strict=True)
-        ]
-        expected = signed_distance(shapes, points)
-        np.testing.assert_allclose(distances(candidates, points)[row], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +95,9 @@ def test_distances_of_spheres_are_those_of_other_shapes():
         ({"cover": 0.9}, "cover 0.9: expected a number of spheres"),
         ({"spheres": 4, "cover": 1.0}, "cover 1: expected more than 0, at most 0.9999"),
         ({"spheres": 4, "cover": float("nan")}, "cover nan"),
+        ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
+        ({"iou": 1.5}, "IoU 1.5"),
+        ({"seed": -1}, "seed -1"),
     ],
 )
 def test_invalid_options_are_refused(options, message):
@@ -159,17 +142,12 @@ def test_robots_get_spheres_and_keep_everything_else(made):
 def test_spheres_are_fitted_once(made, no_search):
     meshed, robot = made
     again = as_spheres(meshed, spheres=3, cover=0.9)
-    assert [link.collisions for link in again.links] == [link.collisions for link in robot.links]
     assert again.ignore_pairs == robot.ignore_pairs
+    for kept in (again, as_spheres(robot, spheres=5)):  # links of spheres keep them
+        assert [link.collisions for link in kept.links] == [link.collisions for link in robot.links]
     for other in ({"spheres": 3}, {"spheres": 2, "cover": 0.9}, {"spheres": 3, "cover": 0.8}):
         with pytest.raises(AssertionError, match="again"):
             as_spheres(meshed, **other)
-
-
-def test_links_of_spheres_keep_them(made, no_search):
-    _, robot = made
-    kept = as_spheres(robot, spheres=5)
-    assert [link.collisions for link in kept.links] == [link.collisions for link in robot.links]
 
 
 def test_tokens_of_a_robot_with_spheres_are_those_of_its_shapes(made):
@@ -179,9 +157,7 @@ def test_tokens_of_a_robot_with_spheres_are_those_of_its_shapes(made):
     assert token_shapes(as_spheres(robot)) == tokens
 
 
-def test_a_broken_cache_is_an_error_and_one_that_cannot_be_written_a_warning(
-    made, tmp_path, monkeypatch, caplog
-):
+def test_faults_of_the_cache_are_reported(made, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     robot = replace(made[0], links=made[0].links[:1], joints=(), home=())
     as_spheres(robot, spheres=1)

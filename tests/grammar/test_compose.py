@@ -26,12 +26,7 @@ from morphgen.model.robot import Inertial
 
 PAPER_ARMS = ("ur5", "panda", "kinova_gen3", "jaco2", "xarm7", "lwr", "yumi_right", "widowx")
 EES = LIBRARY.names("ee")
-SAMPLE = [
-    ("ur5", "stick"),
-    ("panda", "robotiq_2f85"),
-    ("lwr", "panda_hand"),
-    ("widowx", "sake_ez"),
-]
+SAMPLE = [("ur5", "stick"), ("panda", "robotiq_2f85"), ("lwr", "panda_hand"), ("widowx", "sake_ez")]
 
 
 class PosedRobot:
@@ -83,17 +78,20 @@ def turn(yaw):
     return Pose.from_xyz_rpy((0, 0, 0), (0, 0, yaw)).matrix
 
 
-@pytest.mark.parametrize("ee", [name for name in EES if name != "none"])
-def test_the_end_effector_mount_equals_the_flange_up_to_mount_yaw(ee):
-    there = PosedRobot(f"arm=ur5 ee={ee} ee.mount_yaw=33deg")
+@pytest.mark.parametrize(
+    ("arm", "ee"),
+    [
+        *(("ur5", name) for name in EES if name != "none"),
+        *((arm, "panda_hand") for arm in PAPER_ARMS[1:]),
+    ],
+)
+def test_the_end_effector_mount_equals_the_flange_up_to_mount_yaw(arm, ee):
+    there = PosedRobot(f"arm={arm} ee={ee} ee.mount_yaw=33deg")
     expected = there.flange() @ turn(math.radians(33))
     np.testing.assert_allclose(there.mount(), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("arm", PAPER_ARMS)
-def test_every_arm_accepts_an_end_effector_on_its_flange(arm):
-    there = PosedRobot(f"arm={arm} ee=panda_hand", seed=1)
-    np.testing.assert_allclose(there.mount(), there.flange(), atol=1e-12)
+    if (arm, ee) == ("panda", "panda_hand"):  # rotated by 45 degrees, as Franka Emika delivers it
+        hand = there.T_world_link[there.robot.link_index["ee_panda_hand"]]
+        np.testing.assert_allclose(hand, there.flange() @ turn(math.radians(33 - 45)), atol=1e-9)
 
 
 def test_without_an_end_effector_the_tool_is_the_flange():
@@ -130,16 +128,6 @@ def test_joints_keep_axis_limits_effort_velocity_damping_and_mimic():
                 )
 
 
-def test_mimic_joints_follow_the_leader_of_the_same_gripper():
-    robot = composed(
-        "base=pedestal left.arm=lwr left.ee=robotiq_2f85 right.arm=lwr right.ee=robotiq_2f85"
-    )
-    followers = [joint for joint in robot.joints if joint.mimic]
-    assert len(followers) == 10
-    for joint in followers:
-        assert joint.mimic.joint.split("_ee_")[0] == joint.name.split("_ee_")[0]
-
-
 def test_names_are_unique_and_prefixed_with_the_label_of_their_part():
     robot = composed("base=pedestal left.arm=ur5 left.ee=plane right.arm=ur5 right.ee=plane")
     scopes = ("base_", "left_arm_", "left_ee_", "right_arm_", "right_ee_")
@@ -158,9 +146,8 @@ def test_mass_is_the_sum_over_the_parts():
 
 def test_home_concatenates_the_homes_of_the_parts():
     robot = composed("base=gantry ee=robotiq_2f140")
-    home = dict(
-        zip([robot.joints[k].name for k in robot.independent_joints], robot.home, strict=True)
-    )
+    names = [robot.joints[k].name for k in robot.independent_joints]
+    home = dict(zip(names, robot.home, strict=True))
     assert home["base_z"] == pytest.approx(0.8)
     assert robot.home[:5] == pytest.approx((0, 0, 0.8, 0, 0))
     assert list(home)[5:] == ["ee_finger_joint"]
@@ -181,13 +168,6 @@ def test_the_tool_frame_is_at_the_working_point_of_the_end_effector():
         T_flange_tool = np.linalg.inv(there.flange()) @ frame_pose(there.robot, there.q)
         assert T_flange_tool[:3, 3] == pytest.approx([0, 0, ahead], abs=1e-9)
         assert T_flange_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-9)
-
-
-def test_the_composed_panda_equals_the_published_robot():
-    """The hand is rotated by 45 degrees, as Franka Emika delivers it."""
-    there = PosedRobot("arm=panda ee=panda_hand")
-    hand = there.T_world_link[there.robot.link_index["ee_panda_hand"]]
-    np.testing.assert_allclose(hand, there.flange() @ turn(-math.pi / 4), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -266,29 +246,25 @@ def test_an_empty_root_link_of_a_part_adds_no_link():
     assert robot.mass == pytest.approx(joined("arm=ur5 ee=plane").mass - 0.01 * 0.1 * 0.1 * 1000)
 
 
+def fixed(*children):
+    return Derivation("base", "fixed", (), children)
+
+
 @pytest.mark.parametrize(
     ("node", "message"),
     [
         (
-            Derivation("base", "fixed", (), (("topp", Derivation("arm", "ur5")),)),
+            fixed(("topp", Derivation("arm", "ur5"))),
             "'fixed' has no port 'topp'; did you mean 'top'? valid: left, right, top",
         ),
-        (
-            Derivation("base", "fixed", (), (("top", Derivation("base", "ur5")),)),
-            "two parts are labelled 'base'",
-        ),
+        (fixed(("top", Derivation("base", "ur5"))), "two parts are labelled 'base'"),
         (Derivation("arm", "yumi"), "'yumi' needs a base: its mount is not its root"),
         (
             Derivation("arm", "ur5", (("mount_yaw", 1.0),)),
             "'arm' is not attached to a port: it has no mount_yaw",
         ),
         (
-            Derivation(
-                "base",
-                "fixed",
-                (),
-                (("top", Derivation("arm", "ur5")), ("top", Derivation("arm2", "ur5"))),
-            ),
+            fixed(("top", Derivation("arm", "ur5")), ("top", Derivation("arm2", "ur5"))),
             "port 'top' of 'fixed' is already taken: it cannot hold 'arm2', too",
         ),
     ],
@@ -303,12 +279,7 @@ def test_incompatible_parts_are_an_error(node, message):
 def test_a_derivation_with_a_mount_yaw_out_of_range_is_an_error(yaw):
     arm = Derivation("arm", "ur5", (("mount_yaw", yaw),))
     with pytest.raises(PartError, match=r"arm\.mount_yaw=\w+: out of range"):
-        compose(Derivation("base", "fixed", (), (("top", arm),)), LIBRARY, "robot")
-
-
-def test_a_derivation_with_an_unknown_part_is_an_error():
-    with pytest.raises(PartError, match="unknown part 'ur55'; did you mean 'ur5'"):
-        compose(Derivation("arm", "ur55"), LIBRARY, "robot")
+        compose(fixed(("top", arm)), LIBRARY, "robot")
 
 
 OVERLAPPING = {
@@ -326,12 +297,6 @@ def test_overlapping_parts_are_reported_and_not_ignored():
     findings = [finding for finding in check(robot) if finding.severity != "info"]
     assert {finding.code for finding in findings} == {"self-collision"}
     assert any("left_arm" in f.where and "right_arm" in f.where for f in findings)
-
-
-def test_the_order_of_the_request_does_not_matter():
-    words = "left.arm=ur5 left.ee=stick right.arm=lwr right.ee=plane"
-    turned = "right.ee=plane right.arm=lwr left.ee=stick left.arm=ur5"
-    assert derive(words) == derive(turned)
 
 
 def conforms(arm, ee, tmp_path, samples):
@@ -375,34 +340,25 @@ def test_the_derivation_lists_parts_parameters_and_ports():
 
 def test_provenance_names_licence_and_citation_of_every_part():
     parts = joined("arm=ur5 ee=robotiq_2f85").provenance["parts"]
-    assert [(part["label"], part["part"]) for part in parts] == [
-        ("base", "fixed"),
-        ("arm", "ur5"),
-        ("ee", "robotiq_2f85"),
-    ]
+    labels = [(part["label"], part["part"]) for part in parts]
+    assert labels == [("base", "fixed"), ("arm", "ur5"), ("ee", "robotiq_2f85")]
     assert parts[1]["licence"] == "BSD-3-Clause"
     assert "universal_robot" in parts[1]["citation"]
     assert "linkage is open" in parts[2]["notes"]
     assert "notes" not in parts[0]
 
 
-@pytest.mark.slow
-def test_a_finding_accepted_by_a_part_has_severity_info_and_a_reason():
+def test_a_finding_accepted_by_a_part_has_severity_info_and_a_reason_in_the_bundle_too(tmp_path):
     robot = joined("arm=panda")
     by_itself = [f for f in check(replace(robot, provenance={})) if f.severity == "warning"]
     assert ("inertia-implausible", "link arm_panda_link1") in {(f.code, f.where) for f in by_itself}
     (finding,) = [f for f in check(robot) if f.where == "link arm_panda_link1"]
     assert finding.severity == "info"
     assert "; accepted: identified on the real arm" in finding.why
-
-
-def test_an_accepted_finding_stays_accepted_in_the_bundle(tmp_path):
-    robot = joined("arm=panda")
     folder = write_bundle(robot, tmp_path / "panda", check(robot), picture=False)
     card = json.loads((folder / "card.json").read_text())
-    assert [f["severity"] for f in card["findings"] if f["code"] == "inertia-implausible"] == [
-        "info"
-    ]
+    accepted = [f["severity"] for f in card["findings"] if f["code"] == "inertia-implausible"]
+    assert accepted == ["info"]
     assert {f.severity for f in check(read_bundle(folder))} <= {"info"}
 
 

@@ -32,22 +32,10 @@ def first(grammar):
 
 
 def test_there_is_a_grammar_for_each_category_and_one_for_serial_arms():
-    assert grammar_names() == [
-        "arm3",
-        "arm5",
-        "arm_ed",
-        "cartpole",
-        "chain",
-        "cubes",
-        "multi_finger",
-        "nlink",
-        "panda_variations",
-        "planar_arm",
-        "prims",
-        "serial",
-        "stick",
-        "tongs",
-    ]
+    assert " ".join(grammar_names()) == (
+        "arm3 arm5 arm_ed cartpole chain cubes multi_finger nlink panda_variations planar_arm "
+        "prims serial stick tongs"
+    )
 
 
 @pytest.mark.parametrize("name", CATEGORIES)
@@ -159,11 +147,3 @@ def test_the_digest_covers_all_included_files(write):
     assert load_grammar(path).digest == before
     write("body", "ee -> cube")
     assert load_grammar(path).digest != before
-
-
-@pytest.mark.parametrize(
-    "target", ["/etc/passwd", "/etc/x.grammar", "../x.grammar", "a/../../x.grammar"]
-)
-def test_an_include_cannot_leave_its_folder(write, target):
-    with pytest.raises(GrammarError, match="leads outside of"):
-        load_grammar(write("mine", f'include "{target}"', "robot -> cubes"))

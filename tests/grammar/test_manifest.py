@@ -39,12 +39,6 @@ def refusal(path):
     return message.removeprefix(str(path))
 
 
-def text_refusal(tmp_path, text):
-    path = tmp_path / "pincer.yaml"
-    path.write_bytes(text.encode())
-    return refusal(path)
-
-
 def test_a_template_manifest_has_a_xacro_file_and_parameters(tmp_path):
     path = write_part(tmp_path)
     manifest = read_manifest(path)
@@ -102,24 +96,12 @@ def test_a_missing_key_is_an_error(tmp_path, key):
         ({"file": None}, "needs 'source' (a data package) or 'file' (a template)"),
         ({"mount": "palm"}, "6: mount: invalid value 'palm'; expected keys and values"),
         ({"mount": {"link": "palm", "xzy": [0, 0, 0]}}, "mount: unknown key 'xzy'; did you mean"),
-        (
-            {"tool": {"link": "palm", "xyz": [0, 1]}},
-            "tool.xyz: invalid value [0, 1]; expected a list of length 3",
-        ),
-        (
-            {"tool": {"link": "palm", "rpy": [0, 0, True]}},
-            "tool.rpy[2]: invalid value True; expected a number",
-        ),
-        (
-            {"tool": {"link": "palm", "xyz": [0, 0, float("inf")]}},
-            "tool.xyz[2]: invalid value inf; expected a finite number",
-        ),
+        ({"tool": {"link": "palm", "xyz": [0, 1]}}, "tool.xyz: invalid value [0, 1]; expected a"),
+        ({"tool": {"link": "palm", "rpy": [0, 0, True]}}, "tool.rpy[2]: invalid value True;"),
+        ({"tool": {"link": "palm", "xyz": [0, 0, float("inf")]}}, "tool.xyz[2]: invalid value"),
         ({"ports": {"flange": {"link": "palm", "at": 1}}}, "ports.flange: unknown key 'at'"),
         ({"ports": {5: {"link": "palm"}}}, "ports: key 5 is not text; quote it"),
-        (
-            {"home": {"wheel": float("nan")}},
-            "home.wheel: invalid value nan; expected a finite number",
-        ),
+        ({"home": {"wheel": float("nan")}}, "home.wheel: invalid value nan; expected a finite"),
         ({"density": 0}, "density: invalid value 0; expected a number > 0"),
         ({"without": "disc"}, "without: invalid value 'disc'; expected a list"),
         ({"parameters": {"length": {"min": 0, "max": 1}}}, "length: missing key 'default'"),
@@ -128,15 +110,9 @@ def test_a_missing_key_is_an_error(tmp_path, key):
             "parameters.length: unknown key 'mx'; did you mean 'max'?",
         ),
         (REAL | {"source": {"package": "rtb-data"}}, "source: missing key 'file'"),
-        (
-            REAL | {"scaling": {"palm": 2}},
-            "scaling.palm: invalid value 2; expected text or keys and values",
-        ),
+        (REAL | {"scaling": {"palm": 2}}, "scaling.palm: invalid value 2; expected text or keys"),
         (REAL | {"scaling": {"palm": {"bye": "s"}}}, "scaling.palm: unknown key 'bye'; did you"),
-        (
-            REAL | {"scaling": {"palm": {"face": [0, 0, "z"]}}},
-            "palm.face[2]: invalid value 'z'; expected a number",
-        ),
+        (REAL | {"scaling": {"palm": {"face": [0, 0, "z"]}}}, "palm.face[2]: invalid value 'z';"),
     ],
 )
 def test_a_value_of_the_wrong_type_is_an_error_that_names_file_and_key(tmp_path, changes, message):
@@ -152,29 +128,21 @@ def test_the_name_must_equal_the_file_name(tmp_path):
     ("text", "message"),
     [
         ("name: pincer\nkind: [ee\nroot: palm\n", ":3:5: invalid YAML: "),
-        (
-            "name: pincer\nkind: ee\nname: pincer\n",
-            ":3:1: invalid YAML: key 'name' is given twice",
-        ),
+        ("name: pincer\nkind: ee\nname: pincer\n", ":3:1: invalid YAML: key 'name' is given twice"),
         ("name: !!python/object/apply:os.getcwd []\n", ":1:7: invalid YAML: "),
         ("name: 2020-13-45\n", ": invalid YAML: "),
         ("- name\n- kind\n", ":1: invalid value ['name', 'kind']; expected keys and values"),
         ("", ":1: missing key 'name'"),
+        (b"summary: pr\xe9nom", ": invalid YAML"),
+        (None, ": no such file"),
         ("5: 5\n", ":1: key 5 is not text; quote it"),
     ],
 )
 def test_invalid_yaml_is_an_error_with_line_and_column(tmp_path, text, message):
-    assert text_refusal(tmp_path, text).startswith(message)
-
-
-def test_a_manifest_that_is_not_utf8_is_an_error(tmp_path):
     path = tmp_path / "pincer.yaml"
-    path.write_bytes("summary: prénom".encode("latin-1"))
-    assert "invalid YAML" in refusal(path)
-
-
-def test_a_missing_file_is_an_error(tmp_path):
-    assert refusal(tmp_path / "pincer.yaml") == ": no such file"
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert refusal(path).startswith(message)
 
 
 SIZE = Parameter(0.1, 0.05, 0.5, "m")
@@ -183,30 +151,23 @@ SIZE = Parameter(0.1, 0.05, 0.5, "m")
 @pytest.mark.parametrize(
     ("text", "value"), [("0.1", 0.1), ("80mm", 0.08), ("12 cm", 0.12), ("1e-1m", 0.1)]
 )
-def test_lengths(text, value):
+def test_values_are_converted_to_si_units(text, value):
     assert parse_value(text, SIZE, "ee.size") == pytest.approx(value)
-
-
-def test_degrees_become_radians():
     assert parse_value("45deg", MOUNT_YAW_PARAMETER, "ee.mount_yaw") == pytest.approx(math.pi / 4)
 
 
-@pytest.mark.parametrize("text", ["45deg", "1kg", "3 furlongs"])
-def test_a_wrong_unit_is_an_error_that_lists_the_valid_ones(text):
-    with pytest.raises(PartError, match=r"ee\.size=.*wrong unit.*units: m/cm/mm"):
-        parse_value(text, SIZE, "ee.size")
-
-
-@pytest.mark.parametrize("text", ["big", "", "1.2.3", "nan", "inf", "0x10"])
-def test_values_that_are_not_numbers_are_errors(text):
-    with pytest.raises(PartError, match="not a number"):
-        parse_value(text, SIZE, "ee.size")
-
-
-@pytest.mark.parametrize("text", ["0.6", "10mm", "-0.1"])
-def test_a_value_out_of_range_is_an_error_that_names_the_range(text):
-    with pytest.raises(PartError, match=r"out of range; expected 0\.05 to 0\.5 m"):
-        parse_value(text, SIZE, "ee.size")
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["45deg", "1kg", "3 furlongs"], r"ee\.size=.*wrong unit.*units: m/cm/mm"),
+        (["big", "", "1.2.3", "nan", "inf", "0x10"], "not a number"),
+        (["0.6", "10mm", "-0.1"], r"out of range; expected 0\.05 to 0\.5 m"),
+    ],
+)
+def test_invalid_values_are_errors(texts, message):
+    for text in texts:
+        with pytest.raises(PartError, match=message):
+            parse_value(text, SIZE, "ee.size")
 
 
 def test_an_unknown_parameter_suggests_the_nearest():

@@ -13,7 +13,7 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.grammars import shipped
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, MorphgenError
 from morphgen.grammar.grammar_file import grammar_text
 from morphgen.grammar.robot_set import (
     GRAMMAR,
@@ -22,6 +22,7 @@ from morphgen.grammar.robot_set import (
     SETTINGS,
     SetConfig,
     make_in_processes,
+    make_on_ray,
     make_set,
     read_index,
 )
@@ -75,9 +76,6 @@ def test_the_index_has_one_json_line_per_robot(whole):
         assert (record["dof"], record["links"], record["movable"]) == (2, 3, 2)
         assert record["mass"] > 0
         assert record["choices"].keys() == {"robot/0.cubes.size"}
-
-
-def test_the_index_can_be_read_with_pandas(whole):
     table = pandas.read_json(whole / INDEX, lines=True)
     assert list(table["index"]) == list(range(8))
     assert table["mass"].dtype == float
@@ -105,14 +103,6 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
     make_set(one, n, make_in_processes())
     make_set(two, n, make_in_processes(2))
     assert tree(one.folder) == tree(two.folder)
-
-
-def test_the_order_of_generation_does_not_matter(tmp_path, whole):
-    def backwards(plan, indices):
-        return make_in_processes()(plan, indices[::-1])
-
-    make_set(plan(tmp_path / "s"), 8, backwards)
-    assert tree(tmp_path / "s") == tree(whole)
 
 
 def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
@@ -143,11 +133,7 @@ def test_deleted_robots_are_regenerated(tmp_path, whole):
     report = make_set(plan(whole), 8, make_in_processes())
     assert (report.made, report.kept) == (2, 6)
     assert tree(whole) == before
-
-
-def test_without_journal_or_index_everything_is_regenerated(tmp_path, whole):
-    before = tree(whole)
-    (whole / INDEX).unlink()
+    (whole / INDEX).unlink()  # and there is no journal
     assert make_set(plan(whole), 8, make_in_processes()).made == 8
     assert tree(whole) == before
 
@@ -228,22 +214,16 @@ def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
     assert tree(whole) == before
 
 
-@pytest.mark.parametrize("name", ["notes.txt", GRAMMAR])
-def test_a_folder_with_other_files_is_an_error(tmp_path, name):
-    (tmp_path / "s").mkdir()
+@pytest.mark.parametrize("name", ["notes.txt", GRAMMAR, ""])
+def test_a_folder_with_other_files_or_a_file_is_an_error(tmp_path, name):
+    if name:
+        (tmp_path / "s").mkdir()
     (tmp_path / "s" / name).write_text("mine")
     with pytest.raises(
         FormatError, match=r"exists and is not a set \(no set\.json\); name another"
     ):
         make_set(plan(tmp_path / "s"), 1, make_in_processes())
-    assert tree(tmp_path / "s") == {name: b"mine"}
-
-
-def test_a_file_instead_of_the_folder_is_an_error(tmp_path):
-    (tmp_path / "s").write_text("mine")
-    with pytest.raises(FormatError):
-        make_set(plan(tmp_path / "s"), 1, make_in_processes())
-    assert (tmp_path / "s").read_text() == "mine"
+    assert (tmp_path / "s" / name).read_bytes() == b"mine"
 
 
 def test_duplicate_robots_are_reported(tmp_path):
@@ -331,3 +311,32 @@ def test_invalid_settings_are_errors(whole, text):
         FormatError, match=r"set.json: (invalid JSON|is nested deeper|expected the settings)"
     ):
         make_set(plan(whole), 9, make_in_processes())
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Address of a cluster of two nodes with one process each."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster.address
+    cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_writes_the_same_bytes_as_one_process(address, tmp_path):
+    make_set(plan(tmp_path / "serial"), 40, make_in_processes())
+    report = make_set(plan(tmp_path / "ray"), 40, make_on_ray(address))
+    assert report.made == 40
+    assert tree(tmp_path / "ray") == tree(tmp_path / "serial")
+    with pytest.raises(SamplingError, match="0 of 500 draws") as refused:
+        make_set(plan(tmp_path / "set", where=("mass > 1000",)), 4, make_on_ray(address))
+    assert "Traceback" not in str(refused.value)
+
+
+@pytest.mark.slow
+def test_an_address_without_a_cluster_is_an_error(tmp_path):
+    with pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"):
+        make_set(plan(tmp_path / "set"), 4, make_on_ray("127.0.0.1:1"))

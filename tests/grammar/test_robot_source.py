@@ -31,14 +31,11 @@ def urdf(tmp_path):
     return write
 
 
-def test_the_tool_frame_is_at_the_given_link(urdf):
+def test_the_tool_frame_is_at_the_given_link_if_there_is_one(urdf):
     robot = import_robot(urdf(arm()), tool="left")
     frame = robot.frame("tool")
     assert (frame.link, frame.T_link_frame) == ("left", IDENTITY)
     assert robot.provenance["source"] == "some_robot.urdf"
-
-
-def test_without_a_tool_there_is_no_tool_frame(urdf):
     robot = import_robot(urdf(arm()))
     assert robot.frames == ()
     assert "tool-missing" in {finding.code for finding in check(robot)}
@@ -77,11 +74,8 @@ def test_safe_repairs_are_applied_and_reported(urdf):
     as_is = import_robot(path, repair=False)
     assert as_is.joints[1].axis == (2.0, 0.0, 0.0)
     assert as_is.provenance["repairs"] == []
-
-
-def test_a_valid_robot_is_not_repaired(urdf):
-    path = urdf(with_joint(arm(), "right", mimic=None))
-    assert import_robot(path).provenance["repairs"] == []
+    valid = with_joint(arm(), "right", mimic=None)
+    assert import_robot(urdf(valid)).provenance["repairs"] == []
 
 
 def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(urdf):
@@ -110,15 +104,9 @@ def test_xacro_arguments_are_passed(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"root_link": "bass"},
-            "no link 'bass' for root link; did you mean 'base'? valid: base, left,",
-        ),
+        ({"root_link": "bass"}, "no link 'bass' for root link; did you mean 'base'? valid: base,"),
         ({"tool": "slidr"}, "no link 'slidr' for tool; did you mean 'slider'?"),
-        (
-            {"root_link": "slider", "tool": "base"},
-            "tool 'base' is not below the root link 'slider'",
-        ),
+        ({"root_link": "slider", "tool": "base"}, "tool 'base' is not below the root link"),
         ({"args": {"length": "1"}}, "xacro arguments length for a file that is not a xacro"),
     ],
 )
@@ -127,8 +115,3 @@ def test_unknown_links_are_errors(urdf, options, message):
     with pytest.raises(FormatError) as caught:
         import_robot(path, **options)
     assert str(caught.value).startswith(f"{path}: {message}")
-
-
-def test_a_missing_file_is_an_error(tmp_path):
-    with pytest.raises(FormatError, match=r"nowhere\.urdf: no such file"):
-        import_robot(tmp_path / "nowhere.urdf")

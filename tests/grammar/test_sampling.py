@@ -8,17 +8,24 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped, unphysical
+from helpers.grammars import CATEGORIES, LIBRARY, benchmark_counts, grammar, shipped, unphysical
 from morphgen.checks import check
+from morphgen.checks.conformance import conformance
 from morphgen.errors import GrammarError, MorphgenError
+from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.rounding import round_number
-from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar import sampling
 from morphgen.grammar.analysis import check_grammar, count_structures
 from morphgen.grammar.derivation import difference
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
-from morphgen.grammar.sampling import SamplingError, mutate, robot_name, sample_robot, sample_robots
+from morphgen.grammar.sampling import (
+    Sample,
+    SamplingError,
+    mutate,
+    sample_robot,
+    sample_robots,
+)
 from morphgen.grammar.syntax import parse_condition
 
 
@@ -31,15 +38,11 @@ def test_a_robot_does_not_depend_on_the_number_of_samples():
     alone = sample_robot(shipped("chain"), LIBRARY, 5)
     assert str(alone.derivation) == bodies("chain", 7)[5]
     assert (alone.index, alone.robot.name) == (5, "chain-000005")
+    assert len(list(itertools.islice(sample_robots(shipped("cubes"), LIBRARY, 10**9), 2))) == 2
 
 
 def test_another_seed_gives_other_robots():
     assert not set(bodies("cubes", 5)) & set(bodies("cubes", 5, seed=1))
-
-
-def test_robots_are_drawn_lazily():
-    endless = sample_robots(shipped("cubes"), LIBRARY, 10**9)
-    assert len(list(itertools.islice(endless, 2))) == 2
 
 
 def test_a_sample_records_its_choices():
@@ -65,14 +68,6 @@ def test_a_rejected_draw_does_not_change_other_robots():
     same = [d.index for d in kept if not d.rejected]
     assert 0 < len(same) < 12
     assert all(str(kept[i].derivation) == free[i] for i in same)
-
-
-def test_conditions_in_the_grammar_apply():
-    robot_grammar = grammar("robot -> cubes(size=choice(0.05, 0.1))", "where mass < 0.1")
-    sizes = {
-        dict(d.derivation.parameters)["size"] for d in sample_robots(robot_grammar, LIBRARY, 8)
-    }
-    assert sizes == {0.05}
 
 
 @pytest.mark.parametrize(
@@ -173,28 +168,14 @@ def test_random_grammars_round_trip_through_printing(text):
     assert grammar_text(grammar_from_text(printed, "g")) == printed
 
 
-def test_names_have_six_digits():
-    assert robot_name(shipped("cubes"), 17) == "cubes-000017"
-    (drawn,) = sample_robots(shipped("cubes"), LIBRARY, 1)
-    assert 'robot name="cubes-000000"' in urdf_text(drawn.robot, str)
-
-
 def as_in_index(choices):
     """Return choices as read back from a file."""
     return json.loads(json.dumps({key: round_number(value) for key, value in choices.items()}))
 
 
 def neighbours(robot_grammar, origin, n, seed=0):
-    return list(
-        mutate(
-            robot_grammar,
-            LIBRARY,
-            as_in_index(origin.choices),
-            n,
-            seed=seed,
-            name=origin.robot.name,
-        )
-    )
+    choices, name = as_in_index(origin.choices), origin.robot.name
+    return list(mutate(robot_grammar, LIBRARY, choices, n, seed=seed, name=name))
 
 
 def assert_one_choice_differs(before, after):
@@ -240,17 +221,6 @@ def test_choices_rounded_in_a_file_are_kept():
             assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
 
 
-def test_a_new_alternative_draws_its_own_parameters():
-    robot_grammar = grammar("robot -> gantry ee", "ee -> plane(size=uniform(0.1, 0.2)) | stick")
-    origin = next(
-        o
-        for o in (sample_robot(robot_grammar, LIBRARY, i) for i in range(9))
-        if "stick" in str(o.derivation)
-    )
-    for neighbour in neighbours(robot_grammar, origin, 3):
-        assert set(neighbour.choices) == {"robot/1.ee", "robot/1.ee/plane.size"}
-
-
 def test_neighbours_satisfy_the_conditions():
     robot_grammar = grammar(
         "robot -> post beam(length=uniform(0.1, 0.3)){2,5} jaw", "where 0.5 < reach < 0.9"
@@ -272,10 +242,9 @@ def test_neighbours_depend_on_the_seed_not_on_their_number():
 
 
 def test_a_grammar_without_choices_has_no_neighbours():
+    only = grammar("robot -> cubes")
     with pytest.raises(GrammarError, match="leaves nothing to choose: no neighbours"):
-        neighbours(
-            grammar("robot -> cubes"), sample_robot(grammar("robot -> cubes"), LIBRARY, 0), 1
-        )
+        neighbours(only, sample_robot(only, LIBRARY, 0), 1)
 
 
 def test_a_choice_without_effect_is_an_error(monkeypatch):
@@ -283,3 +252,48 @@ def test_a_choice_without_effect_is_an_error(monkeypatch):
     robot_grammar = grammar("robot -> cubes(size=choice(0.1, 0.1))")
     with pytest.raises(SamplingError, match="in 20 draws: 20 x nothing changed"):
         neighbours(robot_grammar, sample_robot(robot_grammar, LIBRARY, 0), 1)
+
+
+RANGES = {
+    "nlink": ({4, 5, 6, 7}, {2, 3, 4, 5}),
+    "chain": ({10, 13, 16, 19, 22, 25}, {7, 9, 11, 13, 15, 17}),
+    "planar_arm": (set(range(6, 11)), set(range(4, 10))),
+    "multi_finger": (set(range(8, 20)), set(range(5, 19))),
+    "tongs": ({10, 12}, {7, 9}),
+}
+"""Links and movable joints that the benchmark's table names for categories of several sizes."""
+
+
+def robot_faults(drawn: Sample, category):
+    """Return the faults of a robot of a category."""
+    robot = drawn.robot
+    counts = (len(robot.links), len(robot.movable_joints))
+    faults = unphysical(robot)
+    if counts != benchmark_counts(category, drawn.derivation):
+        faults.append(f"{counts} links and movable joints: {drawn.derivation}")
+    if category in RANGES:
+        faults += [
+            f"{n} not in {ok}"
+            for n, ok in zip(counts, RANGES[category], strict=True)
+            if n not in ok
+        ]
+    faults += [f"{f.code} {f.where}" for f in check(robot) if f.severity != "info"]
+    if [frame.name for frame in robot.frames] != ["tool"]:
+        faults.append(f"frames {robot.frames}")
+    return faults
+
+
+@pytest.mark.parametrize(
+    ("n", "every"), [(3, 3), pytest.param(100, 1, marks=pytest.mark.slow)], ids=["few", "many"]
+)
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_robots_have_the_counts_of_the_benchmark_and_loaders_agree(category, n, every, tmp_path):
+    grammar = shipped(category)
+    for index in range(n):
+        drawn = sample_robot(grammar, LIBRARY, index, seed=11)
+        assert robot_faults(drawn, category) == []
+        if index % every == 0:  # loading takes long
+            folder = write_bundle(drawn.robot, tmp_path / "robot", picture=False)
+            report = conformance(folder, 20)
+            assert report.passed, report
+            assert [f.code for f in check(read_bundle(folder)) if f.severity != "info"] == []

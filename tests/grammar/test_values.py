@@ -195,10 +195,7 @@ def test_properties_of_a_robot(gantry):
     assert (properties.links, properties.dof, properties.movable) == (7, 5, 5)
     assert properties.movable_to_tool == 5
     assert properties.mass == pytest.approx(gantry.mass)
-
-
-def test_mimic_joints_move_and_are_not_independent():
-    properties = RobotProperties(arm())
+    properties = RobotProperties(arm())  # a mimic joint moves and is not independent
     assert (properties.links, properties.dof, properties.movable) == (6, 4, 5)
     assert properties.movable_to_tool == 3
 
