@@ -100,12 +100,6 @@ def test_both_parts_of_a_held_out_pair_are_trained():
         }  # fmt: skip
 
 
-def test_a_manufacturer_is_held_out():
-    example = made(["manufacturer=kuka"], 4, test=2)
-    require_sound(example, ["manufacturer=kuka"])
-    assert set(part_counts(example.test, "arm")) == {"lwr"}
-
-
 def lengths(members, index):
     """Return the lengths of the parts number ``index`` of robots."""
     parsed = (parse_derivation(m.derivation) for m in members)

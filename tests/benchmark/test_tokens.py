@@ -93,34 +93,11 @@ def test_a_primitive_is_encoded_as_one_hot_and_sizes(geometry, numbers):
     assert not field_of(token_array, "geometry pose")[0].any()
 
 
-def test_poses_have_quaternions_with_positive_w():
-    turned = Pose((1.0, 2.0, 3.0), (-0.5, 0.5, -0.5, 0.5))
-    token_array = tokens(hinge(T_parent_joint=turned), {"b": Shape(Sphere(0.1), turned)})
-    for name in ("geometry pose", "joint origin"):
-        np.testing.assert_allclose(field_of(token_array, name)[1], [1, 2, 3, 0.5, -0.5, 0.5, -0.5])
-
-
-def test_axes_have_unit_length_and_are_zero_for_fixed_joints():
-    token_array = tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(3, 0, 4)),)), {})
-    np.testing.assert_allclose(field_of(token_array, "joint axis"), [[0, 0, 0], [0.6, 0, 0.8]])
-    token_array = tokens(hinge("fixed"), {})
-    assert not field_of(token_array, "joint axis").any()
-    assert not field_of(token_array, "joint position").any()
-    np.testing.assert_array_equal(field_of(token_array, "joint type"), [[0, 0, 1]] * 2)
-
-
 def test_only_the_link_of_the_tool_frame_is_flagged():
     frames = (Frame("left_tool", "left"), Frame("tool", "right"), Frame("camera", "base"))
     flags = field_of(arm_tokens(frames=frames), "end-effector")
     assert flags.tolist() == [[0] * 4] * 5 + [[1] * 4]
     assert not field_of(arm_tokens(frames=frames[:1]), "end-effector").any()
-
-
-def test_indices_are_divided_by_the_largest_index():
-    robot = arm()
-    token_array = tokens(robot, {}, max_links=6)
-    np.testing.assert_allclose(token_array[:, 0], [0, 0.2, 0.4, 0.6, 0.8, 1])
-    np.testing.assert_allclose(token_array[:, 1], [-0.2, 0, 0.2, 0.4, 0.6, 0.6])
 
 
 @pytest.mark.parametrize(

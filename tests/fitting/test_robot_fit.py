@@ -26,14 +26,13 @@ from morphgen.fitting.robot_fit import (
     TOKEN_OPTIONS,
     fit_links,
     parts_with_meshes,
-    store_part,
 )
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.fits import SUFFIX, read_stored_fits, shapes_key, shapes_to_fit
 from morphgen.formats.rounding import as_written
-from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Mesh, Pose, Shape, Sphere, StoredFit
 from morphgen.model.robot import Joint, Link, Robot
@@ -219,17 +218,6 @@ def test_every_real_part_has_stored_fits():
     assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
 
 
-@pytest.mark.slow
-def test_fits_of_a_user_part_are_stored_beside_its_manifest(tmp_path):
-    source = LIBRARY.paths["so101_jaw"]
-    own = tmp_path / "my_jaw.yaml"
-    own.write_text(source.read_text().replace("name: so101_jaw", "name: my_jaw"))
-    library = Library([tmp_path])
-    (manifest,) = parts_with_meshes(library, missing=True)
-    assert store_part(manifest) == tmp_path / f"my_jaw{SUFFIX}"
-    assert parts_with_meshes(library, missing=True) == []
-
-
 TEMPLATE = """\
 name: my_wedge
 kind: ee
@@ -239,15 +227,12 @@ root: wedge
 licence: CC0-1.0
 tool: {link: wedge, xyz: [0, 0, 0.1]}
 """
-XACRO = """\
-<robot name="my_wedge" xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <link name="wedge">
-    <inertial>
-      <mass value="0.1"/>
-      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-    <visual><geometry><mesh filename="my_wedge.stl"/></geometry></visual>
-    <collision><geometry><mesh filename="my_wedge.stl"/></geometry></collision>
+MESH = '<geometry><mesh filename="my_wedge.stl"/></geometry>'
+XACRO = f"""\
+<robot name="my_wedge">
+  <link name="wedge"><visual>{MESH}</visual><collision>{MESH}</collision>
+    <inertial><mass value="0.1"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
   </link>
 </robot>
 """

@@ -366,16 +366,6 @@ def test_the_order_of_kinds_in_a_row_does_not_matter(order):
     assert overlap(row, GRID, inside) == pytest.approx(iou(union, inside), abs=1e-3)
 
 
-def test_candidates_of_different_kinds_are_independent():
-    rows = [primitive(kind, centre, TURNED, halves) for kind, centre, halves in PARTS]
-    inside = within(BOX, GRID, HALVES)
-    alone = [overlap(row, GRID, inside)[0] for row in rows]
-    assert len(set(alone)) == 3
-    for order in ([0, 1, 2], [2, 0, 1, 1], [1, 2, 0]):
-        stacked = Candidates.stack([rows[i] for i in order])
-        np.testing.assert_array_equal(overlap(stacked, GRID, inside), [alone[i] for i in order])
-
-
 def test_overlapping_primitives_are_counted_once():
     halves = [primitive(BOX, (x, 0, 0), halves=(0.2, 0.2, 0.1)) for x in (-0.1, 0.1)]
     inside = within(BOX, GRID, HALVES)
