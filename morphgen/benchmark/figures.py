@@ -26,16 +26,13 @@ MAX_WITH_VALUES = 16
 """Largest number of robots whose values are written into the cells."""
 
 _DPI = 100
-_ROW_HEIGHT = 0.19
-"""Height of a named row of a heatmap [inches]."""
-_LETTER_WIDTH = 0.075
-"""Width of a letter of a name [inches]."""
+_ROW_HEIGHT = 0.19  # height of a named row of a heatmap [inches]
+_LETTER_WIDTH = 0.075  # width of a letter of a name [inches]
 _MIN_SIDE, _UNNAMED_SIDE = 3.2, 8.0
 """Smallest side of a heatmap, and side of one without names [inches]."""
 _LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
 """Distances of a name from its point, tried in turn [pixels]."""
-_LABEL_FONT_SIZE = 7.5
-"""Font size of the names in a map [points]."""
+_LABEL_FONT_SIZE = 7.5  # font size of the names in a map [points]
 _LABEL_DIRECTIONS = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (0.8, 0.7), (-0.8, 0.7), (0.8, -0.7), (-0.8, -0.7)]
 )
@@ -46,11 +43,8 @@ class Panel:
     """A similarity matrix to draw."""
 
     title: str
-    """Title above the matrix."""
-    values: Array
-    """The matrix, shape (n, n)."""
-    larger_is_more_alike: bool
-    """Whether the values are similarities; distances otherwise."""
+    values: Array  # the matrix, shape (n, n)
+    larger_is_more_alike: bool  # whether the values are similarities; distances otherwise
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +52,7 @@ class MapPanel:
     """A map to draw."""
 
     title: str
-    """Title above the map."""
-    map: MdsMap
-    """The map of n points."""
+    map: MdsMap  # the map of n points
 
 
 @contextmanager

@@ -59,8 +59,7 @@ class ComposedRecipe:
     """A robot given by the arguments of ``morphgen compose``."""
 
     words: tuple[str, ...]
-    name: str = ""
-    """Name of the robot; by default made of the names of its parts."""
+    name: str = ""  # name of the robot; by default made of the names of its parts
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,7 @@ class Candidate:
     name: str
     category: str
     derivation: Derivation
-    hash: str
-    """Hash of the robot, see ``robot_hash``."""
+    hash: str  # hash of the robot, see `robot_hash`
     features: Features | None = None
     """Features for similarity measures; None if the factory does not compute them."""
 
@@ -106,10 +104,8 @@ class RobotFactory:
     """Make candidates from recipes; can be pickled and sent to a worker process."""
 
     library: Library
-    with_features: bool = False
-    """Compute the features of each robot."""
-    max_links: int = MAX_LINKS
-    """Largest number of links of a robot."""
+    with_features: bool = False  # compute the features of each robot
+    max_links: int = MAX_LINKS  # largest number of links of a robot
 
     def __call__(self, recipe: Recipe) -> Candidate:
         """Make a robot."""
@@ -242,10 +238,8 @@ class RobotStream:
     """The endless sequence of robots sampled from a grammar with one seed."""
 
     grammar: Grammar
-    prefix: str
-    """Prefix of the robots' names."""
-    seed: int
-    """Seed; ``morphgen sample --seed`` gives the same robots."""
+    prefix: str  # prefix of the robots' names
+    seed: int  # seed; `morphgen sample --seed` gives the same robots
 
     @classmethod
     def of(cls, grammar: Grammar, prefix: str, request: SplitRequest) -> RobotStream:
@@ -567,15 +561,11 @@ class HoldOutCandidate:
     """A robot with a task, which may become a train or a test member."""
 
     name: str
-    words: tuple[str, ...]
-    """Arguments of ``morphgen compose``."""
-    text: str
-    """Derivation of the robot."""
-    combination: str
-    """Parts and ports, see ``regimes.combination``."""
+    words: tuple[str, ...]  # arguments of `morphgen compose`
+    text: str  # derivation of the robot
+    combination: str  # parts and ports, see `regimes.combination`
     parts: frozenset[str]
-    outermost: str
-    """Last part of the robot, usually the end-effector."""
+    outermost: str  # last part of the robot, usually the end-effector
     task: str
 
     @property
@@ -639,8 +629,7 @@ class _TrainPool:
         self.remaining = set(range(len(candidates)))
         self._covered = Counter(item for candidate in candidates for item in candidate.covers)
         self.held: list[int] = []
-        self.needed: set[str] = set()
-        """Parts and tasks of the candidates that are held out."""
+        self.needed: set[str] = set()  # parts and tasks of the candidates that are held out
 
     def is_fresh(self, i: int) -> bool:
         """Test that no candidate of the same combination is held out."""
@@ -707,8 +696,7 @@ class Bound:
     It is the largest cosine, because a mean would hide one near duplicate among other robots.
     """
 
-    is_upper: bool
-    """Whether the cosine must be below ``value``; above it otherwise."""
+    is_upper: bool  # whether the cosine must be below `value`; above it otherwise
     value: float
 
     def __str__(self) -> str:

@@ -55,8 +55,7 @@ class _PartCondition:
     """The part has a kind and a name: ``arm=kinova*``."""
 
     kind: PartKind
-    pattern: str
-    """Name of the part, with shell wildcards."""
+    pattern: str  # name of the part, with shell wildcards
 
     def __str__(self) -> str:
         return f"{self.kind}={self.pattern}"
@@ -71,10 +70,8 @@ class _PartCondition:
 class _ManufacturerCondition:
     """The part is made by a manufacturer: ``manufacturer=Kinova``, ``arm.manufacturer=Kinova``."""
 
-    kind: PartKind | None
-    """Kind of the part; None for any."""
-    pattern: str
-    """Name of the manufacturer in any case, with shell wildcards."""
+    kind: PartKind | None  # kind of the part; None for any
+    pattern: str  # name of the manufacturer in any case, with shell wildcards
 
     def __str__(self) -> str:
         prefix = f"{self.kind}." if self.kind else ""
@@ -93,13 +90,10 @@ class _ManufacturerCondition:
 class _RangeCondition:
     """A parameter of the part is in a range, bounds included: ``arm3.length=0.3..0.4``."""
 
-    owner: str
-    """Kind of the part, or its name with shell wildcards."""
+    owner: str  # kind of the part, or its name with shell wildcards
     parameter: str
-    low: float
-    """Lower bound [SI unit of the parameter]."""
-    high: float
-    """Upper bound [SI unit of the parameter]."""
+    low: float  # lower bound [SI unit of the parameter]
+    high: float  # upper bound [SI unit of the parameter]
 
     def __str__(self) -> str:
         low, high = format_number(self.low), format_number(self.high)
@@ -255,13 +249,10 @@ class _Draft:
     rules: tuple[int, ...]
     """Numbers of the rules that hold for the robot; none if it may be trained on."""
     parts: frozenset[str]
-    held_out: frozenset[str]
-    """Parts that are held out as such."""
-    matching: frozenset[str]
-    """Parts that the rules hold for, alone or in a combination."""
+    held_out: frozenset[str]  # parts that are held out as such
+    matching: frozenset[str]  # parts that the rules hold for, alone or in a combination
     parts_by_kind: Mapping[str, frozenset[str]]
-    order: str
-    """Random text that decides between robots that are equally good."""
+    order: str  # random text that decides between robots that are equally good
 
     @property
     def required(self) -> frozenset[str]:
@@ -347,8 +338,7 @@ def _from_grammars(
 class _Choice:
     """A parameter whose value is drawn, because a range of it is held out."""
 
-    label: str
-    """Label of the part in the derivation."""
+    label: str  # label of the part in the derivation
     parameter: Parameter
     condition: _RangeCondition
 
@@ -521,8 +511,7 @@ class _HoldOutSearch:
     pool: dict[int, _Draft]
     robots: dict[int, Candidate] = field(default_factory=dict)
     """Composed robots by their number in the pool."""
-    rejected: dict[int, str] = field(default_factory=dict)
-    """Reason by number of the robot."""
+    rejected: dict[int, str] = field(default_factory=dict)  # reason by number of the robot
     _compared: dict[tuple[int, int], bool] = field(default_factory=dict)
 
     def run(self, jobs: int) -> tuple[list[Candidate], list[Candidate]]:

@@ -25,8 +25,7 @@ class Licence:
     """Identifier in part manifests: SPDX, or ``LicenseRef-...`` for one that SPDX does not list."""
     restrictions: tuple[str, ...] = ()
     """Restrictions that a release needs permission for: ``NON_COMMERCIAL`` and so on."""
-    is_spdx: bool = True
-    """Whether SPDX lists the identifier."""
+    is_spdx: bool = True  # whether SPDX lists the identifier
 
     @property
     def url(self) -> str:
@@ -65,11 +64,9 @@ LICENCES: Mapping[str, Licence] = {
 class LicencedPart:
     """A part of a split's robots."""
 
-    part: str
-    """Name of the part."""
+    part: str  # name of the part
     licence: Licence
-    citation: str
-    """Source of the part."""
+    citation: str  # source of the part
     robots: tuple[tuple[str, str], ...]
     """Side and name of every member that has the part, train first."""
 

@@ -35,11 +35,9 @@ _WILDCARD = re.compile(r"[*?[]")
 class PatternRobot:
     """A robot that a pattern stands for."""
 
-    words: tuple[str, ...]
-    """Arguments of ``morphgen compose``."""
+    words: tuple[str, ...]  # arguments of `morphgen compose`
     derivation: Derivation
-    name: str
-    """Name that ``morphgen compose`` gives it."""
+    name: str  # name that `morphgen compose` gives it
 
 
 def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
@@ -112,8 +110,7 @@ HULLS = ("inside", "outside", "any")
 """Position of a test robot's parameters relative to the convex hull of the train robots."""
 ON_HULL = 1e-6
 """Distance up to which a point counts as inside the hull, in ranges of the parameters."""
-_SAME = 1e-9
-"""Relative difference below which a parameter does not vary."""
+_SAME = 1e-9  # relative difference below which a parameter does not vary
 
 
 def structure(derivation: Derivation, library: Library) -> str:

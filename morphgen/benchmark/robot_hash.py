@@ -25,8 +25,7 @@ HASH_LENGTH = 32
 """Hexadecimal digits of the hash of a robot and of the id of a split: 128 bits."""
 _GRID = 1e-7
 """Resolution of the numbers in a hash: lengths [m], angles [rad], masses [kg] and others."""
-_GYRATION_GRID = 1e-9
-"""Resolution of inertia over mass [m^2]; a finger has 1e-5."""
+_GYRATION_GRID = 1e-9  # resolution of inertia over mass [m^2]; a finger has 1e-5
 _OFF_GRID = 1 / math.pi
 """Offset of the grid [steps], so that decimal numbers are not halfway between grid points, where
 the last bit would decide."""

@@ -33,10 +33,8 @@ SAMPLES = 65_536
 CELLS = 10
 """Number of grid cells between the shoulder and the farthest tool position."""
 
-_PARALLEL = 0.5
-"""Sine of the angle below which two axes count as parallel."""
-_IMMOBILE = 1e-9
-"""Distance from the shoulder below which a tool counts as immobile [m]."""
+_PARALLEL = 0.5  # sine of the angle below which two axes count as parallel
+_IMMOBILE = 1e-9  # distance from the shoulder below which a tool counts as immobile [m]
 _SEED = 0
 
 
@@ -46,10 +44,8 @@ class Workspace:
 
     density: Array
     """Share of configurations at each node of a grid on [-1, 1]^3, shape (21, 21, 21)."""
-    shoulder: Vec3
-    """Centre of the grid in the root frame [m]."""
-    reach: float
-    """Largest distance of the tool from the shoulder, the unit of the grid [m]."""
+    shoulder: Vec3  # centre of the grid in the root frame [m]
+    reach: float  # largest distance of the tool from the shoulder, the unit of the grid [m]
 
 
 def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
@@ -209,18 +205,13 @@ class LabelledTree:
     has and which costs nothing.
     """
 
-    kinds: NDArray[np.int64]
-    """Kind of joint: ground, fixed, prismatic or rotational, shape (n,)."""
-    axes: Array
-    """Unit axis in the root frame at home, zeros for fixed joints, shape (n, 3)."""
-    lengths: Array
-    """Distance between the parent link's frame and the joint, shape (n,)."""
+    kinds: NDArray[np.int64]  # kind of joint: ground, fixed, prismatic or rotational, shape (n,)
+    axes: Array  # unit axis in the root frame at home, zeros for fixed joints, shape (n, 3)
+    lengths: Array  # distance between the parent link's frame and the joint, shape (n,)
     shapes: NDArray[np.int64]
     """Kind of primitive: none, box, cylinder or capsule, or sphere, shape (n,)."""
-    extents: Array
-    """Edge lengths of the primitive's bounding box, ascending, shape (n, 3)."""
-    leftmost: tuple[int, ...]
-    """Leftmost leaf below each node, as an index, shape (n,)."""
+    extents: Array  # edge lengths of the primitive's bounding box, ascending, shape (n, 3)
+    leftmost: tuple[int, ...]  # leftmost leaf below each node, as an index, shape (n,)
 
     @cached_property
     def weights(self) -> Array:
@@ -420,9 +411,7 @@ class Features:
     """The properties of a robot that the measures compare."""
 
     name: str
-    """Name of the robot."""
-    tokens: Array
-    """Tokens without the joint positions, shape (n_links, 32)."""
+    tokens: Array  # tokens without the joint positions, shape (n_links, 32)
     tree: LabelledTree
     workspace: Workspace
 
@@ -432,13 +421,9 @@ class Measure:
     """A measure of the similarity of two robots."""
 
     name: str
-    """Name in ``MEASURES``."""
-    function: Callable[[Features, Features], float]
-    """Symmetric function of two robots."""
-    larger_is_more_alike: bool
-    """True for a similarity, False for a distance."""
-    meaning: str
-    """Description for users."""
+    function: Callable[[Features, Features], float]  # symmetric function of two robots
+    larger_is_more_alike: bool  # True for a similarity, False for a distance
+    meaning: str  # description for users
 
 
 def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
@@ -546,8 +531,7 @@ class MdsMap:
 
     points: Array
     """Centred points in units of the distances, shape (n, 2); the first axis varies most."""
-    kept: float
-    """Share of the total variation that the two dimensions show, in [0, 1]."""
+    kept: float  # share of the total variation that the two dimensions show, in [0, 1]
 
 
 def classical_mds(distances: ArrayLike) -> MdsMap:
@@ -589,14 +573,10 @@ class NearThresholds:
     large or they have one workspace: the same tool positions at the same reach.
     """
 
-    tree: float
-    """Tree distance below which two robots are near."""
-    cosine: float
-    """Cosine of the tokens above which two robots are near."""
-    workspace: float = 0.999
-    """Overlap of the tool positions above which workspaces are one."""
-    reach: float = 0.01
-    """Relative difference of the reach below which workspaces are one."""
+    tree: float  # tree distance below which two robots are near
+    cosine: float  # cosine of the tokens above which two robots are near
+    workspace: float = 0.999  # overlap of the tool positions above which workspaces are one
+    reach: float = 0.01  # relative difference of the reach below which workspaces are one
 
 
 NEAR_THRESHOLDS = NearThresholds(0.001, 0.99999)

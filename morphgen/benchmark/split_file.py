@@ -94,8 +94,7 @@ class SplitFile:
     """The content of a split file; its id may be wrong."""
 
     split: Split
-    id: str
-    """Id of the split when it was written."""
+    id: str  # id of the split when it was written
 
 
 def parse_split(text: str, path: Path) -> SplitFile:

@@ -110,8 +110,7 @@ class SplitFolder:
     ``folder / robot["path"]``."""
     tokens: NDArray[np.float64]
     """Tokens at home, in the order of ``robots``, shape (n, max_links, 48)."""
-    mask: NDArray[np.bool_]
-    """True for the rows of tokens that are links, shape (n, max_links)."""
+    mask: NDArray[np.bool_]  # True for the rows of tokens that are links, shape (n, max_links)
 
     @property
     def train(self) -> tuple[Record, ...]:
@@ -200,8 +199,7 @@ class _Settings(records.Record, frozen=True):
     """The content of ``build.json``; a build is continued only with the same."""
 
     format: Literal[1]
-    split: str
-    """Id of the split."""
+    split: str  # id of the split
     light: bool
     picture: bool
 
@@ -227,8 +225,7 @@ class BuildSettings:
 
     light: bool = False
     """Write only URDF and derivation; the URDF refers to the meshes of the data packages."""
-    picture: bool = False
-    """Add ``preview.png`` to the bundles."""
+    picture: bool = False  # add `preview.png` to the bundles
 
     def __post_init__(self) -> None:
         if self.light and self.picture:
@@ -244,8 +241,7 @@ class RobotData:
 
     facts: Mapping[str, object]
     """Numbers of links and joints, reach and mass, see ``survey.RobotStats``."""
-    tokens: Array
-    """Tokens, shape (n_links, 48)."""
+    tokens: Array  # tokens, shape (n_links, 48)
 
 
 def robot_data(robot: Robot, library: Library, max_links: int) -> RobotData:
@@ -338,8 +334,7 @@ def sums_text(sums: Mapping[str, str]) -> str:
 
 
 _MESH = re.compile(r'(<mesh filename=")[^"]*"')
-_IGNORED_KEYS = {"findings", "versions"}
-"""Keys of a card that are not compared."""
+_IGNORED_KEYS = {"findings", "versions"}  # keys of a card that are not compared
 _REL_TOL, _ABS_TOL = 1e-6, 1e-9
 """Tolerances of the numbers of two cards, which may be rounded on different machines."""
 
@@ -430,10 +425,8 @@ class BuildReport:
     """Result of a build."""
 
     folder: Path
-    num_written: int
-    """Number of robots that were written."""
-    num_kept: int
-    """Number of robots that an earlier build had written."""
+    num_written: int  # number of robots that were written
+    num_kept: int  # number of robots that an earlier build had written
 
 
 def build_split(

@@ -37,17 +37,11 @@ class RobotStats:
     """Size and mobility of a robot."""
 
     links: int
-    """Number of links."""
-    movable: int
-    """Number of movable joints, mimic joints included."""
-    movable_to_tool: int
-    """Number of movable joints between the root and the tool's link."""
-    dof: int
-    """Number of independent joints."""
-    reach: float
-    """Largest distance of the tool from the root's origin [m]."""
-    mass: float
-    """Total mass [kg]."""
+    movable: int  # number of movable joints, mimic joints included
+    movable_to_tool: int  # number of movable joints between the root and the tool's link
+    dof: int  # number of independent joints
+    reach: float  # largest distance of the tool from the root's origin [m]
+    mass: float  # total mass [kg]
 
 
 @dataclass(frozen=True)
@@ -58,15 +52,13 @@ class Fault:
     """``part-missing`` if the library lacks a part, ``links-many`` if the robot has more links than
     its split allows, else ``body-broken``."""
     why: str
-    """Error message."""
 
 
 @dataclass(frozen=True)
 class SurveyedRobot:
     """A robot of a split, composed with the current library."""
 
-    robot_hash: str
-    """Hash of the robot; see ``morphgen.benchmark.robot_hash``."""
+    robot_hash: str  # hash of the robot; see `morphgen.benchmark.robot_hash`
     stats: RobotStats
     shoulder_reach: float
     """Largest distance of the tool from the shoulder, the unit of ``Workspace`` [m]."""
@@ -276,15 +268,11 @@ PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tas
 class PaperRow:
     """A row of the paper's table: means over the train robots."""
 
-    title: str
-    """Name of the set of robots in the paper."""
+    title: str  # name of the set of robots in the paper
     links: float
-    movable: float
-    """Movable joints."""
-    movable_to_tool: float | None
-    """Movable joints between root and tool; None for the paper's dash."""
-    cosine: float
-    """Cosine similarity, over pairs of a test and a train robot."""
+    movable: float  # movable joints
+    movable_to_tool: float | None  # movable joints between root and tool; None for the paper's dash
+    cosine: float  # cosine similarity, over pairs of a test and a train robot
 
 
 PAPER: Mapping[str, PaperRow] = MappingProxyType(
@@ -315,10 +303,8 @@ smaller."""
 class NearestTrain:
     """The train robot that is most similar to a robot by one measure."""
 
-    train: str
-    """Name of the train robot."""
-    value: float
-    """Value of the measure, rounded to ``DIFFICULTY_DIGITS``."""
+    train: str  # name of the train robot
+    value: float  # value of the measure, rounded to `DIFFICULTY_DIGITS`
 
 
 @dataclass(frozen=True)
@@ -327,8 +313,7 @@ class BaselineResult:
 
     score: float
     """Mean score, relative to the random policy for tasks with ``Task.relative_to_random``."""
-    success: float
-    """Success rate, 0 to 1."""
+    success: float  # success rate, 0 to 1
 
 
 BaselineResults: TypeAlias = Mapping[str, Mapping[tuple[Side, str], BaselineResult]]
@@ -339,20 +324,14 @@ BaselineResults: TypeAlias = Mapping[str, Mapping[tuple[Side, str], BaselineResu
 class RobotDifficulty:
     """A row of the difficulty of a split: a robot with its task."""
 
-    split: str
-    """Name of the split."""
+    split: str  # name of the split
     side: Side
-    robot: str
-    """Name of the robot."""
+    robot: str  # name of the robot
     task: str
-    obstacles: bool
-    """The scene has obstacles."""
-    movable_to_tool: int
-    """Number of movable joints between the root and the tool's link."""
+    obstacles: bool  # the scene has obstacles
+    movable_to_tool: int  # number of movable joints between the root and the tool's link
     links: int
-    """Number of links."""
-    reach: float
-    """Largest distance of the tool from the root's origin [m]."""
+    reach: float  # largest distance of the tool from the root's origin [m]
     nearest: Mapping[str, NearestTrain]
     """Nearest train robot by the name of the measure; empty if there is no other train robot."""
     baselines: Mapping[str, BaselineResult] = field(default_factory=dict)

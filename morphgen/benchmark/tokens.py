@@ -52,12 +52,9 @@ class Field:
     """A field of a token: consecutive numbers with one meaning."""
 
     name: str
-    start: int
-    """Index of the first number."""
-    size: int
-    """Count of numbers."""
-    content: str
-    """Description for users."""
+    start: int  # index of the first number
+    size: int  # count of numbers
+    content: str  # description for users
 
     @property
     def columns(self) -> slice:
@@ -437,12 +434,9 @@ def _write_joint(row: Array, joint: Joint | None) -> None:
 class _Token:
     """The token of one link, with what its error messages name."""
 
-    what: str
-    """Name of the tokens, for messages."""
-    index: int
-    """Row of the token, and index of its link."""
-    numbers: Array
-    """The numbers of the token, shape (48,)."""
+    what: str  # name of the tokens, for messages
+    index: int  # row of the token, and index of its link
+    numbers: Array  # the numbers of the token, shape (48,)
 
     def decode(self, field: Field, decode: Callable[[Array], T]) -> T:
         """Decode a field."""

@@ -67,10 +67,8 @@ from morphgen.typing import Array
 FITTED_TOLERANCE = 1e-3
 """Tolerance of what depends on primitives that may be fitted on this machine: the token numbers of
 a link's primitive, the reach [m] and similarities."""
-_MAX_SHOWN = 100
-"""Largest number of characters of a cell in a message."""
-_NUMBERS = ("reach", *MEASURES)
-"""Columns that are compared with ``FITTED_TOLERANCE``."""
+_MAX_SHOWN = 100  # largest number of characters of a cell in a message
+_NUMBERS = ("reach", *MEASURES)  # columns that are compared with `FITTED_TOLERANCE`
 _NEAREST = {nearest_column(name): name for name in MEASURES}
 """Measure by the column of its nearest train robot."""
 
@@ -160,8 +158,7 @@ def _row_differences(
 class Difference:
     """One difference between a split and its robots."""
 
-    where: str
-    """Name of the robot, or of a file."""
+    where: str  # name of the robot, or of a file
     why: str
 
 
@@ -170,11 +167,9 @@ class Verification:
     """Result of a verification."""
 
     split: Split
-    id: str
-    """Id of the split, computed from its robots."""
+    id: str  # id of the split, computed from its robots
     differences: tuple[Difference, ...]
-    content: str = ""
-    """For a release: SHA-256 of ``SHA256SUMS``, which lists all files."""
+    content: str = ""  # for a release: SHA-256 of `SHA256SUMS`, which lists all files
 
 
 def verify(

@@ -20,8 +20,7 @@ Kind = Literal["box", "cylinder", "sphere"]
 """A kind of primitive that the fitter chooses from."""
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
 
-_DECIMALS = 9
-"""Decimals of rotations; fits differ beyond them from machine to machine."""
+_DECIMALS = 9  # decimals of rotations; fits differ beyond them from machine to machine
 _BOX_SYMMETRIES = np.array(
     [
         symmetry

@@ -22,8 +22,7 @@ from morphgen.typing import Array
 
 _MAX_PAIRS = 2000
 """Largest number of landmark pairs that are tried, each as a rotation and as a mirroring."""
-_NUM_SAMPLES = 32
-"""Number of vertices that a candidate is tested on before all are."""
+_NUM_SAMPLES = 32  # number of vertices that a candidate is tested on before all are
 _ROUGH_TOLERANCE = 30.0
 """Largest error of a candidate before it is refined, relative to the tolerance."""
 

@@ -31,28 +31,22 @@ from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
 from morphgen.model.mesh import is_flat
 from morphgen.typing import Array
 
-_DECIMALS = 6
-"""Decimals of dimensions and positions [m]."""
-_SLACK = 1e-10
-"""Shortfall of a dimension that is not rounded up [m]."""
-_NUM_DIRECTIONS = 400
-"""Number of axis directions over the half sphere that are evaluated."""
+_DECIMALS = 6  # decimals of dimensions and positions [m]
+_SLACK = 1e-10  # shortfall of a dimension that is not rounded up [m]
+_NUM_DIRECTIONS = 400  # number of axis directions over the half sphere that are evaluated
 _NUM_FEATURES = 200
 """Number of normals of the hull's largest faces, and of its longest edges, that are evaluated."""
 _SAME_MINIMUM = math.cos(math.radians(4))
 """Cosine of the angle between axes below which two rotations lead to the same minimum."""
 _FIRST_STEP, _SHRINK = 0.05, 0.6
 """Largest rotation of the first step [rad], and its factor after a step without improvement."""
-_MIN_GAIN = 1e-9
-"""Smallest relative improvement of the volume that counts."""
-_LINK_AXES_EXCESS = 1e-5
-"""Relative excess of volume up to which the link's own axes are preferred."""
+_MIN_GAIN = 1e-9  # smallest relative improvement of the volume that counts
+_LINK_AXES_EXCESS = 1e-5  # relative excess of volume up to which the link's own axes are preferred
 _MAX_PRODUCTS = 100_000
 """Number of points times rotations that are evaluated together; bounds memory."""
 _ON_BALL = 1e-12
 """Relative excess of the squared distance below which a point counts as on the ball."""
-_MAX_PIVOTS = 100
-"""Largest number of points that are added to the support of a ball."""
+_MAX_PIVOTS = 100  # largest number of points that are added to the support of a ball
 NUM_CLUSTERINGS = 3
 """Number of partitions of a solid that are tried for each number of primitives."""
 _MAX_GROWTHS = 20
@@ -86,8 +80,7 @@ def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
 class _Hull:
     """Vertices of a convex hull along the link's axes, centred and scaled to a box of size 1."""
 
-    all_points: Array
-    """All vertices, shape (n, 3)."""
+    all_points: Array  # all vertices, shape (n, 3)
     many_points: Array
     """Vertices that are outermost in 2000 directions: enough for the end of the search."""
     few_points: Array
@@ -193,18 +186,12 @@ class _Search:
 
     volumes: Callable[[Array], Array]
     """Volumes around points given along the axes of ``n`` rotations, shape (n, 3, m)."""
-    axes: slice
-    """Columns of a rotation that change the volume."""
-    dof: int
-    """Number of axes that a rotation is varied about, the first ones."""
-    spins: Array
-    """Rotations about z that are evaluated with every direction, shape (s, 3, 3)."""
-    num_starts: int
-    """Number of rotations that are refined."""
-    num_moves: int
-    """Number of small rotations that are tried per step and start."""
-    num_steps: int
-    """Number of steps of the pattern search."""
+    axes: slice  # columns of a rotation that change the volume
+    dof: int  # number of axes that a rotation is varied about, the first ones
+    spins: Array  # rotations about z that are evaluated with every direction, shape (s, 3, 3)
+    num_starts: int  # number of rotations that are refined
+    num_moves: int  # number of small rotations that are tried per step and start
+    num_steps: int  # number of steps of the pattern search
 
     def measure(self, rotations: Array, points: Array) -> Array:
         """Return the volumes of rotations, shape (n,), in batches."""

@@ -40,8 +40,7 @@ SPHERES = 8
 """Default number of spheres per link."""
 _SPHERE_CACHE = "spheres-1"
 """Folders in the cache begin so; the number rises when the same shapes get other spheres."""
-_CACHE = f"fits-{FITTER_VERSION}"
-"""Folder of the fits in the user's cache."""
+_CACHE = f"fits-{FITTER_VERSION}"  # folder of the fits in the user's cache
 _LOGGER = logging.getLogger(__name__)
 
 

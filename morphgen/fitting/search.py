@@ -36,8 +36,7 @@ MIN_POINTS = 8
 """Smallest number of points of a cluster."""
 _NUM_CLUSTERS = (1, 2, 3)
 """Numbers of clusters of the uncovered points, each of which may get a further primitive."""
-_MIN_HALF_EXTENT = 1e-3
-"""Smallest half extent of a guess, relative to the solid's size."""
+_MIN_HALF_EXTENT = 1e-3  # smallest half extent of a guess, relative to the solid's size
 _BOX, _CYLINDER, _SPHERE = map(KINDS.index, ("box", "cylinder", "sphere"))
 _AXES_TO_Z = (
     np.eye(3),
@@ -69,18 +68,15 @@ _TAU = (0.02, 0.006)
 """Softness of the membership in the first ascent of several [sizes of the solid]."""
 _MIN_RADIUS = 1e-3
 """Smallest radius of a guess and after a change of all radii [sizes of the solid]."""
-_MAX_DISTANCES = 96_000
-"""Number of distances that are evaluated together; bounds memory."""
+_MAX_DISTANCES = 96_000  # number of distances that are evaluated together; bounds memory
 
 
 @dataclass(frozen=True)
 class Cloud:
     """Sample points over a solid and its surroundings."""
 
-    points: Array
-    """Points, shape (n, 3)."""
-    inside: NDArray[np.bool_]
-    """Which points are inside the solid, shape (n,)."""
+    points: Array  # points, shape (n, 3)
+    inside: NDArray[np.bool_]  # which points are inside the solid, shape (n,)
     weights: Array
     """Volume that each point represents, shape (n,); for an ascent also one per candidate."""
 
@@ -93,12 +89,9 @@ class Cloud:
 class Candidates:
     """``n`` candidates of ``k`` primitives each."""
 
-    kinds: NDArray[np.int64]
-    """Indices into ``KINDS``, shape (n, k)."""
-    centres: Array
-    """Centres, shape (n, k, 3)."""
-    quaternions: Array
-    """Rotations (w, x, y, z) of any norm, shape (n, k, 4)."""
+    kinds: NDArray[np.int64]  # indices into `KINDS`, shape (n, k)
+    centres: Array  # centres, shape (n, k, 3)
+    quaternions: Array  # rotations (w, x, y, z) of any norm, shape (n, k, 4)
     halves: Array
     """Half extents, shape (n, k, 3). A cylinder has its radius first and half its length third; a
     sphere's radius is the first."""
@@ -349,10 +342,8 @@ class SampledSolid(Cloud):
     """
 
     solid: Solid
-    R_link_box: Array
-    """Axes of the smallest bounding box in the link frame, shape (3, 3)."""
-    centre: Array
-    """Centre of the smallest bounding box in the link frame [m], shape (3,)."""
+    R_link_box: Array  # axes of the smallest bounding box in the link frame, shape (3, 3)
+    centre: Array  # centre of the smallest bounding box in the link frame [m], shape (3,)
 
     @cached_property
     def link_points(self) -> Array:
@@ -385,12 +376,9 @@ class SampledSolid(Cloud):
 class SearchResult:
     """The best primitives of a search."""
 
-    shapes: tuple[Shape, ...]
-    """Primitives in the link frame."""
-    iou: float
-    """Intersection over union on the sample points of the search."""
-    candidate: Candidates
-    """The same primitives in the frame of the search, one row."""
+    shapes: tuple[Shape, ...]  # primitives in the link frame
+    iou: float  # intersection over union on the sample points of the search
+    candidate: Candidates  # the same primitives in the frame of the search, one row
 
 
 def sample_solid(solid: Solid, seed: int) -> SampledSolid:

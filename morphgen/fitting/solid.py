@@ -47,20 +47,16 @@ MIN_CAVITY = 0.1
 """Volume of a cavity, relative to that of the walls, from which a shell is filled."""
 NUM_RAYS = 64
 """Number of rays from a point that its openness is measured with."""
-_WELD_DISTANCE = 1e-5
-"""Distance below which vertices are welded, relative to the size of the mesh."""
-_NUM_PROBES = 4096
-"""Number of sample points that measure enclosed volumes and cavities."""
+_WELD_DISTANCE = 1e-5  # distance below which vertices are welded, relative to the size of the mesh
+_NUM_PROBES = 4096  # number of sample points that measure enclosed volumes and cavities
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
     """The inside of a link's shapes, in the link frame [m]."""
 
-    mesh: trimesh.Trimesh
-    """Triangles with outward normals, perhaps open or overlapping."""
-    method: Method
-    """The worst method that any of the shapes needed."""
+    mesh: trimesh.Trimesh  # triangles with outward normals, perhaps open or overlapping
+    method: Method  # the worst method that any of the shapes needed
     decimated_from: int | None = None
     """Number of triangles before decimation; None if the mesh was not decimated."""
 

@@ -50,28 +50,20 @@ Parameters = tuple[float, ...]
 """Parameters of a primitive in a frame [m]. Box: lower and upper side along x, then y, then z.
 Cylinder along z: centre x, y, radius, lower and upper end. Sphere: centre x, y, z, radius."""
 
-_FEW = 6
-"""Number of primitives up to which each pair of them gives an initial candidate, too."""
+_FEW = 6  # number of primitives up to which each pair of them gives an initial candidate, too
 _LOG2_POINTS, _LOG2_POINTS_OF_MANY = 11, 8
 """log2 of the number of points drawn per primitive, for links of few and of many primitives."""
 _GRID = 48
 """Number of intervals of the link's extent, whose ends are tried besides faces and centres."""
-_NUM_REFINED = 16
-"""Number of initial candidates that are improved."""
-_MAX_SWEEPS = 10
-"""Largest number of coordinate descent sweeps over the parameters of a candidate."""
-_NUM_UPRIGHT_FRAMES = 3
-"""Number of frames of a link whose primitives are all along its axes."""
+_NUM_REFINED = 16  # number of initial candidates that are improved
+_MAX_SWEEPS = 10  # largest number of coordinate descent sweeps over the parameters of a candidate
+_NUM_UPRIGHT_FRAMES = 3  # number of frames of a link whose primitives are all along its axes
 _TILTS = (20.0, 10.0, 5.0, 2.5)
 """Tilts [deg] tried on a candidate if the axes of the link's primitives differ."""
-_MIN_GAIN = 0.005
-"""Gain in IoU for which a tilted candidate is taken."""
-_TOTAL_WEIGHT = 2**40
-"""The link's volume as an integer."""
-_DECIMALS = 9
-"""Decimals of axes and of positions of sides [m] that are compared."""
-_LENGTH_DECIMALS = 6
-"""Decimals of lengths in the result [m]."""
+_MIN_GAIN = 0.005  # gain in IoU for which a tilted candidate is taken
+_TOTAL_WEIGHT = 2**40  # the link's volume as an integer
+_DECIMALS = 9  # decimals of axes and of positions of sides [m] that are compared
+_LENGTH_DECIMALS = 6  # decimals of lengths in the result [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +71,10 @@ class _Link:
     """The union of a link's primitives as sample points."""
 
     primitives: Sequence[Shape]
-    points: Array
-    """Points inside of the union, in the link frame [m], shape (3, n)."""
+    points: Array  # points inside of the union, in the link frame [m], shape (3, n)
     weights: NDArray[np.int64]
     """Volume that each point represents; the sum is ``_TOTAL_WEIGHT``, shape (n,)."""
-    volume: float
-    """Volume of the union [m^3]."""
+    volume: float  # volume of the union [m^3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +82,8 @@ class _Frame:
     """A link in a rotated frame with the same origin."""
 
     link: _Link
-    R_link_frame: Array
-    """Rotation, shape (3, 3)."""
-    points: Array
-    """The link's points in this frame [m], shape (3, n)."""
+    R_link_frame: Array  # rotation, shape (3, 3)
+    points: Array  # the link's points in this frame [m], shape (3, n)
     extents: Array
     """Lower and upper end along each axis of every primitive, of each pair if they are few, and of
     the whole link [m], shape (k, 3, 2)."""

@@ -97,8 +97,7 @@ class _ScriptedChooser(FirstChooser):
     """Follows a list of decisions, then chooses the first option; records the option counts."""
 
     decisions: list[int]
-    options: list[int] = field(default_factory=list)
-    """Number of options of every decision."""
+    options: list[int] = field(default_factory=list)  # number of options of every decision
 
     def alternative(self, key: str, weights: list[float]) -> int:
         possible = [i for i, weight in enumerate(weights) if weight > 0]
@@ -211,11 +210,9 @@ _TESTED: tuple[Draw, ...] = (
 class Variable:
     """A value that a grammar draws."""
 
-    location: str
-    """``let NAME``, or the symbol, part and parameter, such as ``ee: plane.size``."""
+    location: str  # `let NAME`, or the symbol, part and parameter, such as `ee: plane.size`
     distribution: Distribution
-    text: str
-    """The distribution as written in the grammar."""
+    text: str  # the distribution as written in the grammar
 
 
 def check_grammar(grammar: Grammar, library: Library) -> list[str]:

@@ -27,8 +27,7 @@ class ScopedPart:
 
     label: str
     part: Part
-    mount_yaw: float
-    """Rotation about the axis of the parent's port [rad]."""
+    mount_yaw: float  # rotation about the axis of the parent's port [rad]
 
     def scoped(self, name: str) -> str:
         """Return the robot's name for a link or joint of the part."""
@@ -90,8 +89,7 @@ class _Assembly:
         self.links: list[Link] = []
         self.joints: list[Joint] = []
         self.home: list[float] = []
-        self.tools: list[tuple[str, Frame]] = []
-        """Tool frames with the labels of their parts."""
+        self.tools: list[tuple[str, Frame]] = []  # tool frames with the labels of their parts
 
     def attach(
         self, node: Derivation, parent: str | None, T_parent_port: Pose, *, owns_tool: bool

@@ -34,13 +34,11 @@ NUMBER: /[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?/
 class Derivation:
     """A part with its parameters, and the parts attached to its ports."""
 
-    label: str
-    """Prefix of the part's names in the robot, such as ``left_ee``; unique in the tree."""
+    label: str  # prefix of the part's names in the robot, such as `left_ee`; unique in the tree
     part: str
     parameters: tuple[tuple[str, float], ...] = ()
     """Every parameter of the part: (name, value in SI units)."""
-    children: tuple[tuple[str, Derivation], ...] = ()
-    """(port, derivation attached to it)."""
+    children: tuple[tuple[str, Derivation], ...] = ()  # (port, derivation attached to it)
 
     def __str__(self) -> str:
         values = ", ".join(f"{name}={format_number(value)}" for name, value in self.parameters)

@@ -78,12 +78,9 @@ class RandomChooser:
 class RecordedChooser:
     """Repeats recorded choices where they are valid, and records all choices made."""
 
-    fallback: Chooser
-    """Makes the choices that are not recorded or not valid."""
-    recorded: Choices = field(default_factory=dict)
-    """Choices to repeat."""
-    choices: dict[str, float] = field(default_factory=dict)
-    """All choices made so far."""
+    fallback: Chooser  # makes the choices that are not recorded or not valid
+    recorded: Choices = field(default_factory=dict)  # choices to repeat
+    choices: dict[str, float] = field(default_factory=dict)  # all choices made so far
 
     def alternative(self, key: str, weights: list[float]) -> int:
         """Return the recorded index if it exists."""
@@ -121,14 +118,11 @@ DEFAULT_PORTS = ("top", "flange", "end")
 class _Node:
     """A part of an unfinished derivation."""
 
-    label: str
-    """Prefix of the part's names in the robot, unique in the derivation."""
+    label: str  # prefix of the part's names in the robot, unique in the derivation
     part: str
-    values: dict[str, float]
-    """Parameters of the part in SI units."""
+    values: dict[str, float]  # parameters of the part in SI units
     ports: tuple[str, ...]
-    children: list[tuple[str, _Node]] = field(default_factory=list)
-    """(port, part attached to it)."""
+    children: list[tuple[str, _Node]] = field(default_factory=list)  # (port, part attached to it)
 
     def derivation(self) -> Derivation:
         children = tuple((port, child.derivation()) for port, child in self.children)

@@ -35,17 +35,12 @@ SUFFIX = ".grammar"
 class Grammar:
     """The statements of a grammar file and its includes."""
 
-    name: str
-    """Name of the file without its suffix."""
-    start: str
-    """The symbol that derivations begin with: the first one of the file."""
+    name: str  # name of the file without its suffix
+    start: str  # the symbol that derivations begin with: the first one of the file
     productions: tuple[Production, ...]
-    lets: tuple[Let, ...] = ()
-    """Named values that are drawn once per robot."""
-    wheres: tuple[Expression, ...] = ()
-    """Conditions that every robot meets."""
-    digest: str = ""
-    """SHA-256 of the texts that the grammar was read from, hexadecimal."""
+    lets: tuple[Let, ...] = ()  # named values that are drawn once per robot
+    wheres: tuple[Expression, ...] = ()  # conditions that every robot meets
+    digest: str = ""  # SHA-256 of the texts that the grammar was read from, hexadecimal
 
     def production(self, symbol: str) -> Production | None:
         """Return the production of a symbol; None if the name is a part."""

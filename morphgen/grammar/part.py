@@ -52,17 +52,13 @@ class Part:
     """A part with given parameters."""
 
     manifest: Manifest
-    values: Mapping[str, float]
-    """Values of all parameters, SI units."""
+    values: Mapping[str, float]  # values of all parameters, SI units
     fragment: Robot
     """Links and joints of the part. Names are those of the source, without characters that some
     loaders refuse."""
-    T_root_mount: Pose
-    """Pose of the mount, the frame that is attached to the parent's port."""
-    ports: Mapping[str, Frame]
-    """Frames that other parts can be attached to, by name."""
-    tool: Frame | None
-    """Frame at the working point; None for a part without one."""
+    T_root_mount: Pose  # pose of the mount, the frame that is attached to the parent's port
+    ports: Mapping[str, Frame]  # frames that other parts can be attached to, by name
+    tool: Frame | None  # frame at the working point; None for a part without one
 
 
 def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> Part:
@@ -82,8 +78,7 @@ class _Request:
     """A part with the values of its parameters."""
 
     path: Path
-    stamps: tuple[tuple[int, int], ...]
-    """States of the manifest's file and of the source's."""
+    stamps: tuple[tuple[int, int], ...]  # states of the manifest's file and of the source's
     values: tuple[tuple[str, float], ...]
     manifest: Manifest = field(compare=False)
 
@@ -262,8 +257,7 @@ def _without_meshes(shapes: tuple[Shape, ...], names: Collection[str]) -> tuple[
     )
 
 
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-"""Names that derivations and grammars can hold."""
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")  # names that derivations and grammars can hold
 
 
 def part_manifest(

@@ -134,11 +134,9 @@ class _Slot:
     """A part of a request, such as ``base``, ``arm`` or ``left.ee``."""
 
     kind: PartKind
-    port: str
-    """Name of the limb, such as ``left``; empty for the main limb."""
+    port: str  # name of the limb, such as `left`; empty for the main limb
     part: str = ""
-    values: dict[str, str] = field(default_factory=dict)
-    """Parameters as the user wrote them."""
+    values: dict[str, str] = field(default_factory=dict)  # parameters as the user wrote them
 
     @property
     def key(self) -> str:
@@ -286,8 +284,7 @@ def _limbs(
 ) -> list[tuple[str, Derivation]]:
     """Return (port of the base, derivation) of each limb, arms with their end-effectors."""
     limbs: list[tuple[str, Derivation]] = []
-    attached: set[str] = set()
-    """Keys of end-effectors that an arm carries."""
+    attached: set[str] = set()  # keys of end-effectors that an arm carries
     for key, slot in slots.items():
         if slot.kind != "arm":
             continue

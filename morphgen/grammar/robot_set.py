@@ -66,14 +66,10 @@ class SetConfig:
     grammar_name: str
     grammar_text: str
     seed: int
-    where: tuple[str, ...]
-    """Conditions in addition to the grammar's own."""
-    light: bool
-    """Whether to write only the URDF and the derivation of a robot."""
-    picture: bool
-    """Whether to render ``preview.png``."""
-    library: tuple[Path, ...]
-    """Folders of a user's own parts."""
+    where: tuple[str, ...]  # conditions in addition to the grammar's own
+    light: bool  # whether to write only the URDF and the derivation of a robot
+    picture: bool  # whether to render `preview.png`
+    library: tuple[Path, ...]  # folders of a user's own parts
 
     def settings(self) -> Record:
         """Return the content of ``set.json``; a set is only continued with equal settings."""
@@ -90,12 +86,9 @@ class SetConfig:
 class SetReport:
     """Result of ``make_set``."""
 
-    made: int
-    """Robots made by this run."""
-    kept: int
-    """Robots that existed before."""
-    rejected: dict[str, int]
-    """Number of rejected draws of the whole set, by reason."""
+    made: int  # robots made by this run
+    kept: int  # robots that existed before
+    rejected: dict[str, int]  # number of rejected draws of the whole set, by reason
     duplicates: list[tuple[str, str]]
     """Robots with the derivation of an earlier one: (name, name of the earlier one)."""
 
@@ -290,8 +283,7 @@ def _finished(config: SetConfig) -> dict[int, tuple[Path, int]]:
 def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     """Write all records in order of their indices, and summarize them."""
     rejected: Counter[str] = Counter()
-    first_names: dict[str, str] = {}
-    """Name of the first robot of each derivation, by hash."""
+    first_names: dict[str, str] = {}  # name of the first robot of each derivation, by hash
     duplicates = []
     partial = partial_path(config.folder / INDEX)
     locations = _finished(config)

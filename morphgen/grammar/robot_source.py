@@ -34,12 +34,10 @@ RobotLike: TypeAlias = Robot | str | PathLike[str]
 class RobotSource:
     """Origin of a robot: either a path or the words of a request."""
 
-    label: str
-    """The path or the words, as printed in messages and tables."""
+    label: str  # the path or the words, as printed in messages and tables
     path: Path | None = None
     """A bundle's folder, a robot's folder in a light set, a URDF, a xacro or an MJCF."""
-    words: tuple[str, ...] = ()
-    """Words of ``morphgen compose``."""
+    words: tuple[str, ...] = ()  # words of `morphgen compose`
 
 
 def find_robots(

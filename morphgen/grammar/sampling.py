@@ -48,13 +48,10 @@ class Sample:
     index: int
     robot: Robot
     properties: RobotProperties
-    findings: tuple[Finding, ...]
-    """Findings of ``morphgen.checks.check``; only of severity ``info``."""
+    findings: tuple[Finding, ...]  # findings of `morphgen.checks.check`; only of severity `info`
     derivation: Derivation
-    choices: Choices
-    """Every random choice by its key, such as ``robot/1.plane.size``."""
-    rejected: Mapping[str, int]
-    """Number of rejected draws before this robot, by reason."""
+    choices: Choices  # every random choice by its key, such as `robot/1.plane.size`
+    rejected: Mapping[str, int]  # number of rejected draws before this robot, by reason
 
 
 def sample_robots(

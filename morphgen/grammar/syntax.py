@@ -153,8 +153,7 @@ def _message(error: UnexpectedInput, text: str, origin: str) -> str:
 class SourceLocation:
     """Line and column in a text."""
 
-    origin: str
-    """File or other name of the text."""
+    origin: str  # file or other name of the text
     line: int
     column: int
 
@@ -171,10 +170,8 @@ class Expression:
     ``or`` or ``not``."""
     operands: tuple[Expression, ...]
     location: SourceLocation
-    text: str = ""
-    """The name, the function's name, or the unit of a number."""
-    value: float = 0.0
-    """Value of a number in the unit as written, not in SI units."""
+    text: str = ""  # the name, the function's name, or the unit of a number
+    value: float = 0.0  # value of a number in the unit as written, not in SI units
     levels: int = field(init=False, repr=False, compare=False)
     """Depth of the tree, at most ``MAX_NESTING``, so that recursive functions are safe."""
 
@@ -212,12 +209,9 @@ class Item:
 
     name: str
     location: SourceLocation
-    port: str = ""
-    """Port that the item is attached to; empty for the default port."""
-    arguments: tuple[tuple[str, Expression], ...] = ()
-    """Parameters of a part: (name, value)."""
-    repetition: tuple[int, int] | None = None
-    """Smallest and largest number of copies."""
+    port: str = ""  # port that the item is attached to; empty for the default port
+    arguments: tuple[tuple[str, Expression], ...] = ()  # parameters of a part: (name, value)
+    repetition: tuple[int, int] | None = None  # smallest and largest number of copies
 
 
 @dataclass(frozen=True)
@@ -225,8 +219,7 @@ class Alternative:
     """A sequence of items that a symbol can be rewritten to."""
 
     items: tuple[Item, ...]
-    weight: Expression | None = None
-    """Relative probability of the alternative; None for 1."""
+    weight: Expression | None = None  # relative probability of the alternative; None for 1
 
 
 @dataclass(frozen=True)
@@ -247,8 +240,7 @@ class Production:
 class Include:
     """An include of another grammar's statements."""
 
-    target: str
-    """Name or path of the grammar, as written."""
+    target: str  # name or path of the grammar, as written
     location: SourceLocation
 
 

@@ -21,10 +21,8 @@ from morphgen.model.robot import TOOL, Robot
 class Distribution:
     """Probability distribution of a value."""
 
-    kind: str
-    """One of ``DISTRIBUTIONS``."""
-    arguments: tuple[float, ...]
-    """Arguments as in ``DISTRIBUTIONS``, in SI units."""
+    kind: str  # one of `DISTRIBUTIONS`
+    arguments: tuple[float, ...]  # arguments as in `DISTRIBUTIONS`, in SI units
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -104,8 +102,7 @@ class Scope:
     names: Mapping[str, tuple[float, str]]
     """Values of names in SI units, with their units; the unit of a pure number is empty."""
     draw: Draw
-    key: str
-    """Key of the expression in the derivation; it is passed to ``draw``."""
+    key: str  # key of the expression in the derivation; it is passed to `draw`
 
 
 def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
@@ -230,14 +227,10 @@ class RobotProperties:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self.mass = robot.mass
-        """Total mass [kg]."""
-        self.dof = robot.dof
-        """Number of independent joints."""
-        self.links = len(robot.links)
-        """Number of links, including the root."""
-        self.movable = len(robot.movable_joints)
-        """Number of movable joints, including mimic joints."""
+        self.mass = robot.mass  # total mass [kg]
+        self.dof = robot.dof  # number of independent joints
+        self.links = len(robot.links)  # number of links, including the root
+        self.movable = len(robot.movable_joints)  # number of movable joints, including mimic joints
 
     @cached_property
     def reach(self) -> float:
