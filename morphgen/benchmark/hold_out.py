@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import product
 from typing import TypeAlias, cast
 
@@ -487,18 +488,12 @@ MAX_REJECTED = 500
 """Number of rejected robots after which the search fails."""
 
 
-@dataclass(frozen=True)
-class ComposeDraft:
-    """Compose drafts; can be pickled and sent to a worker process."""
-
-    factory: RobotFactory
-
-    def __call__(self, draft: _Draft) -> Candidate | str:
-        """Return the composed robot, or why it cannot be a member."""
-        try:
-            return self.factory(draft.recipe)
-        except UnfitRobotError as error:
-            return error.reason
+def _composed(factory: RobotFactory, draft: _Draft) -> Candidate | str:
+    """Return the composed robot, or why it cannot be a member; runs in worker processes."""
+    try:
+        return factory(draft.recipe)
+    except UnfitRobotError as error:
+        return error.reason
 
 
 @dataclass
@@ -507,7 +502,7 @@ class _HoldOutSearch:
 
     request: SplitRequest
     maker: _DraftMaker
-    compose: ComposeDraft
+    factory: RobotFactory
     pool: dict[int, _Draft]
     robots: dict[int, Candidate] = field(default_factory=dict)
     """Composed robots by their number in the pool."""
@@ -534,7 +529,7 @@ class _HoldOutSearch:
         num_known = num_chosen - len(unknown)
         drafts = [self.pool[number] for number in unknown]
         with part_of(None, num_known):
-            results = list(parallel_map(self.compose, drafts, jobs))
+            results = list(parallel_map(partial(_composed, self.factory), drafts, jobs))
         for number, result in zip(unknown, results, strict=True):
             if isinstance(result, str):
                 self.rejected[number] = result
@@ -807,7 +802,7 @@ def hold_out(
     maker = _DraftMaker(rules, library, request.seed)
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
     pool = dict(enumerate(_make_pool(request, maker, patterns, grammars)))
-    search = _HoldOutSearch(request, maker, ComposeDraft(factory), pool)
+    search = _HoldOutSearch(request, maker, factory, pool)
     test, train = search.run(jobs)
     robots = [*train, *test]
     names = unique_names(robot.derivation for robot in robots)

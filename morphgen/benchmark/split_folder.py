@@ -20,6 +20,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from importlib.resources import files
 from os import PathLike
@@ -69,13 +70,12 @@ from morphgen.formats.files import (
     folder_hashes,
     locked_folder,
     partial_path,
-    replacing_folder,
     write_atomic,
 )
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_npz
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_set import DERIVATION, light_urdf
+from morphgen.grammar.robot_set import light_files, write_light
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.typing import Array
@@ -342,9 +342,7 @@ _REL_TOL, _ABS_TOL = 1e-6, 1e-9
 def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
     """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation."""
     if light:
-        with replacing_folder(folder) as partial:
-            for name, text in _light_files(robot).items():
-                (partial / name).write_text(text, encoding="utf-8")
+        write_light(robot, folder)
         return
     write_bundle(robot, folder, check(robot), picture=picture, edits_kept=False)
 
@@ -369,19 +367,15 @@ def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
     return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
 
 
-def _light_files(robot: Robot) -> dict[str, str]:
-    return {URDF: light_urdf(robot), DERIVATION: f"{robot.provenance['derivation']}\n"}
-
-
 def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
-    files = _light_files(robot)
-    for name, text in files.items():
+    expected = light_files(robot)
+    for name, text in expected.items():
         path = folder / name
         if not path.is_file():
             yield f"file {name} is missing"
         elif path.read_bytes() != text.encode():
             yield f"file {name} is not the robot's"
-    yield from _extra(folder, files)
+    yield from _extra(folder, expected)
 
 
 def _differences(folder: Path, robot: Robot) -> Iterator[str]:
@@ -450,8 +444,8 @@ def build_split(
             (split_folder / SUMS_FILE).unlink(missing_ok=True)
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
                 shutil.rmtree(leftover, ignore_errors=True)
-            writer = _RobotWriter(library, split_folder, settings, split.max_links)
-            results = parallel_map(writer, members, jobs)
+            write = partial(_write_member, library, split_folder, settings, split.max_links)
+            results = parallel_map(write, members, jobs)
             robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
             _finish(split_folder, split, settings, robots)
     num_written = sum(robot.is_new for robot in robots.values())
@@ -474,27 +468,20 @@ class _WrittenRobot:
     hashes: dict[str, str]
 
 
-@dataclass(frozen=True, eq=False)
-class _RobotWriter:
-    """Write the folder of a member; sent to worker processes."""
-
-    library: Library
-    split_folder: Path
-    settings: BuildSettings
-    max_links: int
-
-    def __call__(self, member: Member) -> _WrittenRobot:
-        robot = compose_member(member, self.library)
-        require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
-        folder = bundle_folder(self.split_folder / ROBOTS_DIR, member.name)
-        light, picture = self.settings.light, self.settings.picture
-        is_kept = not differences(folder, robot, light=light) and is_current(
-            folder, light=light, picture=picture
-        )
-        if not is_kept:
-            write_robot(robot, folder, light=light, picture=picture)
-        data = robot_data(robot, self.library, self.max_links)
-        return _WrittenRobot(not is_kept, data, folder_hashes(folder))
+def _write_member(
+    library: Library, split_folder: Path, settings: BuildSettings, max_links: int, member: Member
+) -> _WrittenRobot:
+    """Write the folder of a member, unless an earlier build has; runs in worker processes."""
+    robot = compose_member(member, library)
+    require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
+    folder = bundle_folder(split_folder / ROBOTS_DIR, member.name)
+    light, picture = settings.light, settings.picture
+    is_kept = not differences(folder, robot, light=light) and is_current(
+        folder, light=light, picture=picture
+    )
+    if not is_kept:
+        write_robot(robot, folder, light=light, picture=picture)
+    return _WrittenRobot(not is_kept, robot_data(robot, library, max_links), folder_hashes(folder))
 
 
 def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:

@@ -9,6 +9,7 @@ import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
@@ -137,10 +138,10 @@ def survey_split(
     members, n = [*train, *test], len(train)
     total = len(members) + n
     with part_of(total):
-        robots = list(parallel_map(_Measurement(library, split.max_links), members, jobs))
+        robots = list(parallel_map(partial(_measure, library, split.max_links), members, jobs))
     known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
     with part_of(total, len(members)):
-        compare = _Comparison(known[:n], known[n:], within_train)
+        compare = partial(_compare, known[:n], known[n:], within_train)
         results = list(parallel_map(compare, range(n), jobs))
     similarity = np.array([to_test for to_test, _ in results])
     pairs = np.full((n, n, len(MEASURES)), np.nan)
@@ -165,38 +166,29 @@ def _unique(members: Sequence[Member]) -> tuple[list[Member], list[int]]:
     return list(firsts.values()), [order[member.derivation] for member in members]
 
 
-@dataclass(frozen=True, eq=False)
-class _Measurement:
-    """Picklable function that composes and measures a member."""
-
-    library: Library
-    max_links: int
-
-    def __call__(self, member: Member) -> MeasuredRobot | Fault:
-        try:
-            parsed = parse_derivation(member.derivation)
-            missing = {node.part for node in parsed.walk()} - self.library.paths.keys()
-            if missing:
-                hints = (f"{part!r}{nearest(part, self.library.paths)}" for part in sorted(missing))
-                return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
-            robot = compose(parsed, self.library, member.name)
-            return measure_robot(robot, self.library.folders, self.max_links)
-        except MorphgenError as error:
-            return Fault("body-broken", str(error))
+def _measure(library: Library, max_links: int, member: Member) -> MeasuredRobot | Fault:
+    """Compose and measure a member."""
+    try:
+        parsed = parse_derivation(member.derivation)
+        missing = {node.part for node in parsed.walk()} - library.paths.keys()
+        if missing:
+            hints = (f"{part!r}{nearest(part, library.paths)}" for part in sorted(missing))
+            return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
+        robot = compose(parsed, library, member.name)
+        return measure_robot(robot, library.folders, max_links)
+    except MorphgenError as error:
+        return Fault("body-broken", str(error))
 
 
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """Picklable function that compares a train robot with the test robots and those before it."""
-
-    train: tuple[Features | None, ...]
-    test: tuple[Features | None, ...]
-    within_train: bool
-
-    def __call__(self, index: int) -> tuple[Array, Array]:
-        before = self.train[:index] if self.within_train else ()
-        robot = self.train[index]
-        return _similarity(robot, self.test), _similarity(robot, before)
+def _compare(
+    train: Sequence[Features | None],
+    test: Sequence[Features | None],
+    within_train: bool,
+    index: int,
+) -> tuple[Array, Array]:
+    """Compare a train robot with the test robots, and with the train robots before it."""
+    before = train[:index] if within_train else ()
+    return _similarity(train[index], test), _similarity(train[index], before)
 
 
 def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Array:

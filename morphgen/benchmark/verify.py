@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import csv
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,28 +73,32 @@ _NEAREST = {nearest_column(name): name for name in MEASURES}
 """Measure by the column of its nearest train robot."""
 
 
-def release_differences(
-    folder: Path,
-    split: Split,
-    library: Library,
-    *,
-    jobs: int = 1,
-) -> Iterator[tuple[str, str]]:
-    """Yield what a release states otherwise than its split: a file, and what is wrong with it."""
+@dataclass(frozen=True)
+class Difference:
+    """One difference between a split and its robots."""
+
+    where: str  # name of the robot, or of a file
+    why: str
+
+
+def _release_differences(
+    folder: Path, split: Split, library: Library, jobs: int
+) -> Iterator[Difference]:
+    """Yield what a release states otherwise than its split."""
     try:
         release = read_release(folder)
         if (release.name, release.id) != (split.name, split_id(split)):
             why = f"it is of split {release.name}, id {release.id}, not of {SPLIT_FILE}"
-            yield RELEASE_FILE, why
+            yield Difference(RELEASE_FILE, why)
         expected = [part.as_dict() for part in licenced_parts(split, library)]
         if _without_sources(read_json(folder / LICENCES_FILE)) != _without_sources(expected):
-            yield LICENCES_FILE, "its licences are not those of the parts"
+            yield Difference(LICENCES_FILE, "its licences are not those of the parts")
     except MorphgenError as error:
-        yield RELEASE_FILE, str(error)
+        yield Difference(RELEASE_FILE, str(error))
     if (folder / DIFFICULTY_FILE).exists():  # releases of versions before 0.3 have none
         survey = survey_split(split, library, within_train=True, jobs=jobs)
         for why in _difficulty_differences(folder / DIFFICULTY_FILE, survey):
-            yield DIFFICULTY_FILE, why
+            yield Difference(DIFFICULTY_FILE, why)
 
 
 def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
@@ -155,14 +159,6 @@ def _row_differences(
 
 
 @dataclass(frozen=True)
-class Difference:
-    """One difference between a split and its robots."""
-
-    where: str  # name of the robot, or of a file
-    why: str
-
-
-@dataclass(frozen=True)
 class Verification:
     """Result of a verification."""
 
@@ -201,8 +197,7 @@ def verify(
     if is_built:
         differences += _folder_differences(folder, split_file.split, library, jobs)
         if is_release(folder):
-            found = release_differences(folder, split_file.split, library, jobs=jobs)
-            differences += itertools.starmap(Difference, found)
+            differences += _release_differences(folder, split_file.split, library, jobs)
     else:
         differences += compare_robots(split_file.split, library, jobs=jobs)
     content = file_sha256(folder / SUMS_FILE) if is_built and is_release(folder) else ""
@@ -220,8 +215,7 @@ def require_unchanged(folder: Path, name: str) -> None:
 
 def compare_robots(split: Split, library: Library, *, jobs: int = 1) -> tuple[Difference, ...]:
     """Compose every robot of a split and compare its hash; see ``verify``."""
-    inspector = _Inspector(library, split.max_links)
-    return tuple(_robot_differences(split, _inspect(split, inspector, jobs)))
+    return tuple(_robot_differences(split, _inspect(split, library, None, jobs)))
 
 
 _Inspection = tuple[list[str], RobotData | None]
@@ -229,35 +223,39 @@ _Inspection = tuple[list[str], RobotData | None]
 
 
 @dataclass(frozen=True, eq=False)
-class _Inspector:
-    """Compose a member, and compare it with its folder; sent to worker processes."""
+class _BuiltFolder:
+    """A split folder whose robots are compared."""
 
-    library: Library
-    max_links: int
-    split_folder: Path | None = None
-    light: bool = False
-    paths: Mapping[str, str] = field(default_factory=dict)
-
-    def __call__(self, member: Member) -> _Inspection:
-        try:
-            robot = compose_member(member, self.library)
-            if self.split_folder is None:
-                return [], None
-            folder = self.split_folder / self.paths[member.robot_hash]
-            # Members with the same robot share the folder of the first one, which is compared.
-            is_first = folder.name == member.name
-            lines = differences(folder, robot, light=self.light) if is_first else []
-            return lines, robot_data(robot, self.library, self.max_links)
-        except MorphgenError as error:
-            return [str(error)], None
+    path: Path
+    light: bool
+    robot_paths: Mapping[str, str]  # folder of each robot by its hash
 
 
-def _inspect(split: Split, inspector: _Inspector, jobs: int) -> dict[tuple[str, str], _Inspection]:
+def _inspect_member(
+    library: Library, max_links: int, built: _BuiltFolder | None, member: Member
+) -> _Inspection:
+    """Compose a member, and compare it with its folder; runs in worker processes."""
+    try:
+        robot = compose_member(member, library)
+        if built is None:
+            return [], None
+        folder = built.path / built.robot_paths[member.robot_hash]
+        # Members with the same robot share the folder of the first one, which is compared.
+        is_first = folder.name == member.name
+        lines = differences(folder, robot, light=built.light) if is_first else []
+        return lines, robot_data(robot, library, max_links)
+    except MorphgenError as error:
+        return [str(error)], None
+
+
+def _inspect(
+    split: Split, library: Library, built: _BuiltFolder | None, jobs: int
+) -> dict[tuple[str, str], _Inspection]:
     """Inspect each different robot once; return the results by derivation and hash."""
     members = [member for _, member in reversed(sided_members(split))]
     firsts = {(member.derivation, member.robot_hash): member for member in members}
-    inspections = parallel_map(inspector, list(firsts.values()), jobs)
-    return dict(zip(firsts, inspections, strict=True))
+    inspect = partial(_inspect_member, library, split.max_links, built)
+    return dict(zip(firsts, parallel_map(inspect, list(firsts.values()), jobs), strict=True))
 
 
 def _robot_differences(
@@ -281,8 +279,7 @@ def _folder_differences(
         return
     files = list(_file_differences(folder))
     yield from files
-    inspector = _Inspector(library, split.max_links, folder, build.light, paths)
-    inspected = _inspect(split, inspector, jobs)
+    inspected = _inspect(split, library, _BuiltFolder(folder, build.light, paths), jobs)
     # A changed file explains the differences of its robot.
     explained = {difference.where for difference in files}
     for difference in _robot_differences(split, inspected):

@@ -70,7 +70,7 @@ class Solid:
             inside[near] = winding > 0.5
         if self.method == "filled":
             unsure = near & ~inside
-            inside[unsure] = self._cavities.openness(points[unsure]) < MAX_OPENNESS
+            inside[unsure] = openness(self._rays, points[unsure]) < MAX_OPENNESS
         return inside
 
     def distance(self, points: Array) -> Array:
@@ -98,8 +98,8 @@ class Solid:
         return float(np.linalg.norm(self.mesh.extents))
 
     @cached_property
-    def _cavities(self) -> Cavities:
-        return Cavities(self.mesh)
+    def _rays(self) -> RayMeshIntersector:
+        return RayMeshIntersector(self.mesh)
 
     @cached_property
     def _vertices(self) -> Array:
@@ -226,23 +226,17 @@ def _probes(solid: Solid) -> Array:
     return np.random.default_rng(0).uniform(low, high, (_NUM_PROBES, 3))
 
 
-class Cavities:
-    """Measure how open to the outside points near a mesh are, by casting rays."""
+def openness(rays: RayMeshIntersector, points: Array) -> Array:
+    """Return the shares of directions in which rays from points (n, 3) hit no triangle, shape (n,).
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._rays = RayMeshIntersector(mesh)
-
-    def openness(self, points: Array) -> Array:
-        """Return the shares of directions in which rays from points (n, 3) hit no triangle (n,).
-
-        It is at least one half for a point outside of the convex hull.
-        """
-        if not len(points):
-            return np.zeros(0)
-        hits = self._rays.intersects_any(
-            np.repeat(points, NUM_RAYS, axis=0), np.tile(_directions(), (len(points), 1))
-        )
-        return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
+    It is at least one half for a point outside of the convex hull.
+    """
+    if not len(points):
+        return np.zeros(0)
+    hits = rays.intersects_any(
+        np.repeat(points, NUM_RAYS, axis=0), np.tile(_directions(), (len(points), 1))
+    )
+    return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
 
 
 def _directions() -> Array:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -92,8 +93,6 @@ def _version(package: str) -> str:
 
 def _reach(part: Part) -> float:
     """Return the largest distance from the mount to a port or tool over all configurations [m]."""
-    from dataclasses import replace
-
     from morphgen.model.kinematics import reach
     from morphgen.model.robot import Frame, Joint, Link
 

@@ -130,7 +130,7 @@ class RobotMaker:
         sample = sample_robot(grammar, library, index, seed=config.seed, where=where)
         folder = config.folder / sample.robot.name
         if config.light:
-            _write_light(sample, folder)
+            write_light(sample.robot, folder)
         else:
             write_bundle(sample.robot, folder, sample.findings, picture=config.picture)
         return _record(sample)
@@ -209,11 +209,16 @@ def _record(sample: Sample) -> Record:
     }
 
 
-def _write_light(sample: Sample, folder: Path) -> None:
+def write_light(robot: Robot, folder: Path) -> None:
     """Write the folder of a robot in a light set."""
     with replacing_folder(folder) as partial:
-        (partial / URDF).write_text(light_urdf(sample.robot), encoding="utf-8")
-        (partial / DERIVATION).write_text(f"{sample.derivation}\n", encoding="utf-8")
+        for name, text in light_files(robot).items():
+            (partial / name).write_text(text, encoding="utf-8")
+
+
+def light_files(robot: Robot) -> dict[str, str]:
+    """Return the texts of a composed robot's files in a light set, by name."""
+    return {URDF: light_urdf(robot), DERIVATION: f"{robot.provenance['derivation']}\n"}
 
 
 def light_urdf(robot: Robot) -> str:

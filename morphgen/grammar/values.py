@@ -7,7 +7,6 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 from morphgen.errors import GrammarError
 from morphgen.grammar.manifest import UNITS
@@ -88,11 +87,8 @@ DISTRIBUTIONS: Mapping[str, str] = {
 """Arguments of each distribution; ``normal`` is clipped, ``randint`` includes both bounds."""
 
 
-class Draw(Protocol):
-    """Selects the value of a distribution."""
-
-    def __call__(self, key: str, distribution: Distribution) -> float:
-        """Return a possible value; the key names the random choice in the derivation."""
+Draw = Callable[[str, Distribution], float]
+"""Selects a possible value of a distribution; the key names the choice in the derivation."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ import pytest
 
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
-from morphgen.benchmark import hold_out as hold_out_search
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.generate import SplitRequest
+from morphgen.benchmark.generate import RobotFactory, SplitRequest
 from morphgen.benchmark.hold_out import (
     held_out_parts,
     hold_out,
@@ -159,13 +158,13 @@ def test_repeated_robots_of_a_grammar_are_not_drawn():
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):
-    compose = hold_out_search.ComposeDraft.__call__
+    make = RobotFactory.__call__
 
-    def with_equal_hashes(self, draft):
-        robot = compose(self, draft)
+    def with_equal_hashes(self, recipe):
+        robot = make(self, recipe)
         return replace(robot, hash="0" * 32) if "cube" in robot.name else robot
 
-    monkeypatch.setattr(hold_out_search.ComposeDraft, "__call__", with_equal_hashes)
+    monkeypatch.setattr(RobotFactory, "__call__", with_equal_hashes)
     message = r"--train 9: only 7 different robots without arm=lwr exist \(2 rejected: 2 with the s"
     with pytest.raises(BenchmarkError, match=message):
         made(["arm=lwr"], 9, patterns=("arm={arm3,arm5,arm_ed,lwr} ee={cube,plane,stick}",))
