@@ -12,19 +12,9 @@ from numpy.typing import NDArray
 from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.similarity import (
-    NEAR_THRESHOLDS,
-    NearThresholds,
-    is_same_reach,
-)
+from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.benchmark.split import SIDES, Member, Side, Split, sided_members
-from morphgen.benchmark.survey import (
-    Fault,
-    SplitSurvey,
-    SurveyedRobot,
-    nearest_train,
-    survey_split,
-)
+from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, nearest_train, survey_split
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 
@@ -84,11 +74,7 @@ class Audit:
 
 
 def audit(
-    split: Split,
-    library: Library,
-    *,
-    near: NearThresholds = NEAR_THRESHOLDS,
-    jobs: int = 1,
+    split: Split, library: Library, *, near: NearThresholds = NEAR_THRESHOLDS, jobs: int = 1
 ) -> Audit:
     """Find leaks between train and test robots, and violations of the regime.
 

@@ -387,12 +387,7 @@ def assemble_drawn(
 
 
 def interpolation(
-    request: SplitRequest,
-    grammar: Grammar,
-    library: Library,
-    *,
-    hull: str = "any",
-    jobs: int = 1,
+    request: SplitRequest, grammar: Grammar, library: Library, *, hull: str = "any", jobs: int = 1
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have the structure of a train robot.
 
@@ -477,11 +472,7 @@ NUM_ATTEMPTS = 50
 
 
 def composition(
-    request: SplitRequest,
-    patterns: Sequence[str],
-    library: Library,
-    *,
-    jobs: int = 1,
+    request: SplitRequest, patterns: Sequence[str], library: Library, *, jobs: int = 1
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have only trained parts, in an untrained combination.
 

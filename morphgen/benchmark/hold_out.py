@@ -295,10 +295,7 @@ class _DraftMaker:
 
 
 def _make_pool(
-    request: SplitRequest,
-    maker: _DraftMaker,
-    patterns: Sequence[str],
-    grammars: Sequence[Grammar],
+    request: SplitRequest, maker: _DraftMaker, patterns: Sequence[str], grammars: Sequence[Grammar]
 ) -> list[_Draft]:
     """Return every robot that may be drawn, each derivation once."""
     drafts: dict[str, _Draft] = {}
@@ -391,11 +388,7 @@ def _with_values(
 
 
 def _replace_values(
-    derivation: Derivation,
-    choices: Sequence[_Choice],
-    rng: np.random.Generator,
-    *,
-    inside: bool,
+    derivation: Derivation, choices: Sequence[_Choice], rng: np.random.Generator, *, inside: bool
 ) -> Derivation:
     values: dict[str, dict[str, float]] = {}
     for choice in choices:
@@ -741,10 +734,7 @@ def _train_findings(
 
 
 def _test_findings(
-    rules: Sequence[HoldOutRule],
-    train: Sequence[Parsed],
-    test: Sequence[Parsed],
-    library: Library,
+    rules: Sequence[HoldOutRule], train: Sequence[Parsed], test: Sequence[Parsed], library: Library
 ) -> Iterator[Finding]:
     trained = frozenset[str]().union(*(parts(derivation) for _, derivation in train))
     for member, derivation in test:

@@ -98,11 +98,7 @@ def default_name(choice: RobotChoice, tasks: Sequence[str], obstacles: bool, see
 
 
 def choose_robots(
-    choice: RobotChoice,
-    request: SplitRequest,
-    library: Library,
-    *,
-    jobs: int = 1,
+    choice: RobotChoice, request: SplitRequest, library: Library, *, jobs: int = 1
 ) -> tuple[Split, ...]:
     """Return a split for each size of a request."""
     grammars, train, test = (
@@ -119,10 +115,5 @@ def choose_robots(
             bound = parse_bound(choice.similarity) if choice.similarity else None
             return extrapolation(request, train, test, library, similarity=bound, jobs=jobs)
         return hold_out(
-            request,
-            choice.hold_out,
-            library,
-            patterns=choice.robots,
-            grammars=grammars,
-            jobs=jobs,
+            request, choice.hold_out, library, patterns=choice.robots, grammars=grammars, jobs=jobs
         )

@@ -317,9 +317,7 @@ def _task_findings(test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]
     trained_tasks = {robot.member.task for robot in train}
     if test.member.task not in trained_tasks:
         yield test.finding(
-            "task-unseen",
-            f"no train robot learns to {test.member.task}",
-            "train some robot at it",
+            "task-unseen", f"no train robot learns to {test.member.task}", "train some robot at it"
         )
 
 

@@ -474,10 +474,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
 """The measures by name."""
 
 
-def similarity_matrix(
-    robots: Sequence[Features],
-    measure: str,
-) -> Array:
+def similarity_matrix(robots: Sequence[Features], measure: str) -> Array:
     """Compare all pairs of robots.
 
     Returns:

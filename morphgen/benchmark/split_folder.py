@@ -32,14 +32,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import (
-    SIDES,
-    Member,
-    Split,
-    compose_member,
-    sided_members,
-    split_id,
-)
+from morphgen.benchmark.split import SIDES, Member, Split, compose_member, sided_members, split_id
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.benchmark.survey import robot_stats
 from morphgen.benchmark.tokens import (

@@ -127,11 +127,7 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
 
 
 def survey_split(
-    split: Split,
-    library: Library,
-    *,
-    within_train: bool = False,
-    jobs: int = 1,
+    split: Split, library: Library, *, within_train: bool = False, jobs: int = 1
 ) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once in each side."""
     (train, rows), (test, columns) = _unique(split.train), _unique(split.test)
@@ -207,12 +203,7 @@ MEASURED = ("mass", "reach")
 COSINE = "cosine"
 
 
-def statistics(
-    split: Split,
-    library: Library,
-    *,
-    jobs: int = 1,
-) -> dict[str, object]:
+def statistics(split: Split, library: Library, *, jobs: int = 1) -> dict[str, object]:
     """Compute the statistics that the file of a split contains; see ``summarize_survey``."""
     return summarize_survey(survey_split(split, library, jobs=jobs))
 
@@ -339,11 +330,7 @@ class RobotDifficulty:
 
 
 def split_difficulty(
-    split: Split,
-    library: Library,
-    *,
-    results: BaselineResults | None = None,
-    jobs: int = 1,
+    split: Split, library: Library, *, results: BaselineResults | None = None, jobs: int = 1
 ) -> tuple[RobotDifficulty, ...]:
     """Compose, measure and compare the robots of a split; see ``survey_difficulty``."""
     survey = survey_split(split, library, within_train=True, jobs=jobs)

@@ -168,12 +168,7 @@ class Verification:
     content: str = ""  # for a release: SHA-256 of `SHA256SUMS`, which lists all files
 
 
-def verify(
-    name_or_path: str | Path,
-    library: Library,
-    *,
-    jobs: int = 1,
-) -> Verification:
+def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Verification:
     """Compare a split with the robots that its derivations give today.
 
     The id of the split and the hash of each robot are tested. In a split folder every file is

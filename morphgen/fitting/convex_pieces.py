@@ -108,10 +108,7 @@ def as_convex(robot: Robot, folders: Sequence[Path] = ()) -> Robot:
     return replace(
         convex,
         fits=_fits_of_pieces(robot, convex, folders),
-        provenance={
-            **convex.provenance,
-            "convex": {"coacd": version("coacd"), **SETTINGS},
-        },
+        provenance={**convex.provenance, "convex": {"coacd": version("coacd"), **SETTINGS}},
     )
 
 

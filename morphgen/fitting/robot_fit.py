@@ -100,11 +100,7 @@ class FitReport:
 
 
 def fit_links(
-    robot: Robot,
-    options: FitOptions,
-    *,
-    only: Collection[str] | None = None,
-    jobs: int = 1,
+    robot: Robot, options: FitOptions, *, only: Collection[str] | None = None, jobs: int = 1
 ) -> FitReport:
     """Fit the collision shapes of every link, or its visuals if it has no collision shapes.
 

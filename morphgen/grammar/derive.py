@@ -324,11 +324,7 @@ def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
 
 
 def argument(
-    item: Item,
-    name: str,
-    expression: Expression,
-    parameters: Mapping[str, Parameter],
-    scope: Scope,
+    item: Item, name: str, expression: Expression, parameters: Mapping[str, Parameter], scope: Scope
 ) -> float:
     """Return the value of an item's argument in SI units."""
     if name not in parameters:

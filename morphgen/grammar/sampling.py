@@ -55,12 +55,7 @@ class Sample:
 
 
 def sample_robots(
-    grammar: Grammar,
-    library: Library,
-    n: int,
-    *,
-    seed: int = 0,
-    where: Sequence[Expression] = (),
+    grammar: Grammar, library: Library, n: int, *, seed: int = 0, where: Sequence[Expression] = ()
 ) -> Iterator[Sample]:
     """Draw robots one after the other.
 

@@ -28,9 +28,7 @@ from morphgen.benchmark.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Mesh, Pose, Shape
-from morphgen.model.kinematics import (
-    reach,
-)
+from morphgen.model.kinematics import reach
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.model.tree import scale_links
 from morphgen.progress import show_progress

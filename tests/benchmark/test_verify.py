@@ -222,7 +222,7 @@ def test_changed_masks_names_and_missing_numbers_of_tokens_are_reported(whole):
     changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), 0))
     changed_tokens(whole, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
     assert difference_keys(whole) == [
-        ("gantry-cylinder", "tokens.npz: its mask is not that of its links"),
+        ("gantry-cylinder", "tokens.npz: its mask is not that of its links")
     ]
     changed_tokens(whole, lambda arrays: arrays["names"].__setitem__(0, "other"))
     assert difference_keys(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]

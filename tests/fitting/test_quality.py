@@ -147,10 +147,7 @@ def test_disjoint_shapes_have_no_overlap():
 
 @pytest.mark.parametrize(
     "primitives",
-    [
-        [CUBE],
-        [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))],
-    ],
+    [[CUBE], [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))]],
 )
 def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
     slotted = solid(

@@ -8,13 +8,7 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from morphgen.errors import FitError, MeshError
-from morphgen.fitting.solid import (
-    DECIMATED_FACES,
-    MAX_FACES,
-    openness,
-    solid_of,
-    solid_of_mesh,
-)
+from morphgen.fitting.solid import DECIMATED_FACES, MAX_FACES, openness, solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)

@@ -43,8 +43,7 @@ def _no_library_of_the_users_own(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.slow] if n in DETAILED else []) for n in PARTS],
+    "name", [pytest.param(n, marks=[pytest.mark.slow] if n in DETAILED else []) for n in PARTS]
 )
 def test_every_part_composes_into_a_robot_without_errors(name):
     derivation = parse_request(PARTS[name].format(name).split(), LIBRARY)

@@ -165,8 +165,7 @@ def test_a_grammar_whose_text_exceeds_the_limits_is_not_printed():
 
 
 @pytest.mark.parametrize(
-    "target",
-    ["/etc/passwd", "../outside.grammar", "a/../../outside.grammar", "link.grammar"],
+    "target", ["/etc/passwd", "../outside.grammar", "a/../../outside.grammar", "link.grammar"]
 )
 def test_an_include_cannot_leave_the_folder_of_its_grammar(tmp_path, target):
     inside = tmp_path / "inside"

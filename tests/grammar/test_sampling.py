@@ -19,13 +19,7 @@ from morphgen.grammar.analysis import check_grammar, count_structures
 from morphgen.grammar.derivation import difference
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
-from morphgen.grammar.sampling import (
-    Sample,
-    SamplingError,
-    mutate,
-    sample_robot,
-    sample_robots,
-)
+from morphgen.grammar.sampling import Sample, SamplingError, mutate, sample_robot, sample_robots
 from morphgen.grammar.syntax import parse_condition
 
 
