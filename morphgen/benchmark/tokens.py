@@ -85,7 +85,7 @@ POSITION = Field(
 )
 LAYOUT = (INDEX, PARENT, TOOL_FLAG, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITION)
 """The fields of a token, in order."""
-LAYOUT_ARRAYS: Mapping[str, NDArray[Any]] = {
+LAYOUT_ARRAYS: Mapping[str, Any] = {  # np.savez takes a bool among its arrays, for mypy
     "layout": np.array([field.name for field in LAYOUT]),
     "columns": np.array([(field.start, field.columns.stop) for field in LAYOUT]),
 }
