@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -14,7 +14,7 @@ import viser
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
-from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.robot_files import (
     Thumbnail,
@@ -22,7 +22,7 @@ from morphgen.viewer.robot_files import (
     measure_picture,
     thumbnail_of_picture,
 )
-from morphgen.viewer.robot_rows import UNITS, Row
+from morphgen.viewer.robot_rows import FILTERS, UNITS, Row, passes
 
 SCALES = ("common", "own")
 """Scales of pictures: the same for all robots, or for each one that fills its picture."""
@@ -117,71 +117,42 @@ def draw_cards(gallery: Gallery) -> None:
     gallery.grid.content = markup.framed(*notices, summary, content)
 
 
-FILTERS = ("search", "category", "role", "findings", *robot_rows.NUMBERS)
-"""Keys of the filter's controls, in the address, too."""
 _ALL = "all"
 _LABELS = {"dof": "DoF", "links": "Links", "reach": "Reach (m)", "mass": "Mass (kg)"}
 _COUNTS = ("dof", "links")
 """Facts that are integers."""
-_SORT_KEYS = {
-    label: key
-    for name in robot_rows.SORTS
-    for label, key in ((name, name), (f"{name}, largest first", f"-{name}"))
-}
-"""Keys of ``sort_rows`` by their label in the dropdown."""
-_ROUNDING = 1e-9
-"""Browsers round the ends of a range."""
+_SORTS = [key for name in robot_rows.SORTS for key in (name, f"-{name}")]
+"""Keys of the orders: ascending and descending."""
 
 
 def add_filter(gallery: Gallery) -> None:
     """Add the controls in the state that the address gives; note values that it cannot have."""
-    gui, state = gallery.session.client.gui, gallery.session.address.state
-    gallery.controls["search"] = gui.add_text("Search", state.get("search", ""))
-    scales = (gallery.scale, *(name for name in SCALES if name != gallery.scale))
-    _add_dropdown(gallery, "scale", "Scale", dict(zip(scales, scales, strict=True)))
-    _add_dropdown(gallery, "sort", "Sort by", _SORT_KEYS)
-    is_filtered = not state.keys().isdisjoint({*FILTERS[1:], "size"})
+    session, gui = gallery.session, gallery.session.client.gui
+    search = gallery.controls["search"] = gui.add_text("Search", "")
+    session.keep("search", lambda: search.value, lambda text: set_value(search, text))
+    _add_dropdown(gallery, "scale", "Scale", sorted(SCALES, key=lambda name: name != gallery.scale))
+    _add_dropdown(gallery, "sort", "Sort by", _SORTS)
+    is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
     with gui.add_folder("Filter", expand_by_default=is_filtered):
         for key in ("category", "role"):
-            choices = [_ALL, *robot_rows.fact_choices(gallery.rows, key)]
-            _add_dropdown(gallery, key, key.capitalize(), dict(zip(choices, choices, strict=True)))
-        findings = (_ALL, "with", "without")
-        _add_dropdown(gallery, "findings", "Findings", dict(zip(findings, findings, strict=True)))
+            choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
+            _add_dropdown(gallery, key, key.capitalize(), choices)
+        _add_dropdown(gallery, "findings", "Findings", (_ALL, "with", "without"))
         for fact in robot_rows.NUMBERS:
             _add_range(gallery, fact)
-        sizes = list(map(str, robot_rows.PAGE_SIZES))
-        _add_dropdown(gallery, "size", "On a page", dict(zip(sizes, sizes, strict=True)))
+        _add_dropdown(gallery, "size", "On a page", tuple(map(str, robot_rows.PAGE_SIZES)))
 
 
 def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
     """Return the robots that pass the filter, on all pages, in the order of the set."""
-    return robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
-
-
-def shown_rows(gallery: Gallery) -> list[robot_rows.Row]:
-    """Return the robots that pass the filter, on all pages, in the order that is shown."""
-    return robot_rows.sort_rows(passing_rows(gallery), control_state(gallery)["sort"] or "order")
-
-
-def control_state(gallery: Gallery) -> dict[str, str]:
-    """Return the values of the controls for the address; empty texts for the first choices."""
-    state = dict.fromkeys((*FILTERS, "scale", "sort", "size"), "")
-    for key, control in gallery.controls.items():
-        if key in robot_rows.NUMBERS:
-            state[key] = _range_text(gallery, key)
-        elif key == "search":
-            state[key] = control.value
-        else:
-            is_first = control.value == control.options[0]
-            value = _SORT_KEYS[control.value] if key == "sort" else control.value
-            state[key] = "" if is_first else value
-    return state
+    state = gallery.session.state()
+    return robot_rows.sort_rows((row for row in gallery.rows if passes(row, state)), "order")
 
 
 def clear_filter(gallery: Gallery, key: str) -> None:
-    """Let every robot pass a condition of the filter."""
-    for name, control in gallery.controls.items():
-        if name not in FILTERS or key not in ("", name):
+    """Let every robot pass a condition of the filter, or all conditions without a key."""
+    for name in (key,) if key else FILTERS:
+        if (control := gallery.controls.get(name)) is None:
             continue
         if name in robot_rows.NUMBERS:
             control.value = (control.min, control.max)
@@ -192,10 +163,10 @@ def clear_filter(gallery: Gallery, key: str) -> None:
 def empty_text(gallery: Gallery) -> str:
     """Return what excludes all robots, as HTML with links that clear each condition."""
     lines = []
-    for key, value in control_state(gallery).items():
+    for key, value in gallery.session.state().items():
         if key not in FILTERS or not value:
             continue
-        alone = sum(map(_filter({key: value}).passes, gallery.rows))
+        alone = sum(passes(row, {key: value}) for row in gallery.rows)
         count = "no robot" if not alone else "1 robot" if alone == 1 else f"{alone} robots"
         name = _LABELS.get(key, key)
         clear = f'<a data-do="clear filter" data-value="{key}">clear</a>'
@@ -231,7 +202,7 @@ def parse_range(
         raise AddressError(f"{where} is no range, so it was left out; expected LOW..HIGH")
     if limits is None:
         raise AddressError(f"{where} was left out: no robot here has a known {fact}")
-    if low > limits[1] + _ROUNDING or high < limits[0] - _ROUNDING:
+    if low > limits[1] + robot_rows.ROUNDING or high < limits[0] - robot_rows.ROUNDING:
         ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
         raise AddressError(
             f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
@@ -239,45 +210,25 @@ def parse_range(
     return max(low, limits[0]), min(high, limits[1])
 
 
-def _current_filter(gallery: Gallery) -> robot_rows.Filter:
-    """Return the filter that the controls are set to."""
-    return _filter(control_state(gallery))
-
-
-def _filter(state: Mapping[str, str]) -> robot_rows.Filter:
-    """Return the filter of values of the address."""
-    ranges = {}
-    for fact in robot_rows.NUMBERS:
-        if text := state.get(fact):
-            low, _, high = text.partition("..")
-            ranges[fact] = (float(low) - _ROUNDING, float(high) + _ROUNDING)
-    search, category, role, findings = (state.get(key, "") for key in FILTERS[:4])
-    return robot_rows.Filter(search, category, role, findings, ranges)
-
-
-def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Mapping[str, str]) -> None:
-    """Add a dropdown if there is a choice."""
-    value = gallery.session.address.state.get(key, "")
-    labels = {key: label for label, key in keys.items()}
-    if value and value not in labels:
-        valid = _listed(list(labels))
+def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str]) -> None:
+    """Add a dropdown if there is a choice; the first is the default."""
+    session, value = gallery.session, gallery.session.address.state.get(key, "")
+    session.keep(key, str)  # an empty text, which removes a value that is left out
+    if value and value not in keys:
+        valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
         gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
+    labels = [f"{name[1:]}, largest first" if name[0] == "-" else name for name in keys]
     if len(keys) > 1:
-        initial = labels.get(value, next(iter(keys)))
-        gallery.controls[key] = gallery.session.client.gui.add_dropdown(
-            label, tuple(keys), initial_value=initial
-        )
-
-
-def _listed(values: Sequence[str]) -> str:
-    return ", ".join(values[:12]) + (", ..." if len(values) > 12 else "")
+        dropdown = gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
+        session.keep_choice(key, dropdown, tuple(keys))
 
 
 def _add_range(gallery: Gallery, fact: str) -> None:
     """Add a slider with two ends for a fact that varies."""
-    limits = robot_rows.fact_range(gallery.rows, fact)
+    session, limits = gallery.session, robot_rows.fact_range(gallery.rows, fact)
+    session.keep(fact, str)
     try:
-        ends = parse_range(fact, gallery.session.address.state.get(fact, ""), limits)
+        ends = parse_range(fact, session.address.state.get(fact, ""), limits)
     except AddressError as error:
         gallery.notices.append(str(error))
         ends = limits
@@ -286,9 +237,10 @@ def _add_range(gallery: Gallery, fact: str) -> None:
     step = 1.0 if fact in _COUNTS else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
     initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
-    gui = gallery.session.client.gui
+    gui = session.client.gui
     gallery.histograms[fact] = gui.add_html("")
     gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
+    session.keep(fact, lambda: _range_text(gallery, fact))
 
 
 def _range_text(gallery: Gallery, fact: str) -> str:
@@ -406,7 +358,10 @@ def add_controls(gallery: Gallery) -> None:
     """Add the controls, in the state that the address gives, and show the first robots."""
     session = gallery.session
     add_filter(gallery)
+    session.keep("n", lambda: "" if gallery.page_number == 1 else str(gallery.page_number))
     gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
+    session.title = gallery.title
+    session.apply_state()
     buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
 
     def turn_page() -> None:
@@ -429,11 +384,10 @@ def add_controls(gallery: Gallery) -> None:
 
 def show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
-    session, rows, state = gallery.session, shown_rows(gallery), control_state(gallery)
-    size = int(gallery.controls["size"].value)
+    session, size = gallery.session, int(gallery.controls["size"].value)
+    rows = robot_rows.sort_rows(passing_rows(gallery), session.state()["sort"] or "order")
     gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
-    page = "" if gallery.page_number == 1 else str(gallery.page_number)
-    session.update_address(gallery.title, n=page, **state)
+    session.show_state()
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
     gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"

@@ -66,33 +66,29 @@ class Row:
     """Height at the middle of the robot that its picture shows [m]."""
 
 
-@dataclass(frozen=True)
-class Filter:
-    """Conditions on rows; empty ones hold for every row."""
+FILTERS = ("search", "category", "role", "findings", *NUMBERS)
+"""Keys of conditions on rows, as addresses have them: words that must all occur, a category, a
+role, ``with`` or ``without`` findings, and ranges ``LOW..HIGH``, which no unknown number is in."""
+ROUNDING = 1e-9
+"""Browsers round the ends of a range."""
 
-    search: str = ""
-    """Words that must all occur in the name, category, role, task or findings."""
-    category: str = ""
-    role: str = ""
-    findings: str = ""
-    """``with``, ``without``, or empty for both."""
-    ranges: Mapping[str, tuple[float, float]] | None = None
-    """Smallest and largest value by fact; rows whose fact is unknown do not pass."""
 
-    def passes(self, row: Row) -> bool:
-        """Return whether a row meets all conditions."""
-        text = " ".join((row.name, row.category, row.role, row.task, *(row.findings or ())))
-        if not all(word in text.lower() for word in self.search.lower().split()):
-            return False
-        if self.category not in ("", row.category) or self.role not in ("", row.role):
-            return False
-        if self.findings and bool(row.findings) != (self.findings == "with"):
-            return False
-        for fact, (low, high) in (self.ranges or {}).items():
+def passes(row: Row, state: Mapping[str, str]) -> bool:
+    """Return whether a row meets the conditions of an address; empty ones hold for every row."""
+    text = " ".join((row.name, row.category, row.role, row.task, *(row.findings or ()))).lower()
+    if not all(word in text for word in state.get("search", "").lower().split()):
+        return False
+    if not all(state.get(key, "") in ("", getattr(row, key)) for key in ("category", "role")):
+        return False
+    if (findings := state.get("findings")) and bool(row.findings) != (findings == "with"):
+        return False
+    for fact in NUMBERS:
+        if limits := state.get(fact):
+            low, _, high = limits.partition("..")
             value = getattr(row, fact)
-            if value is None or not low <= value <= high:
+            if value is None or not float(low) - ROUNDING <= value <= float(high) + ROUNDING:
                 return False
-        return True
+    return True
 
 
 def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:

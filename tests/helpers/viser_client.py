@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import socket
 import time
 import uuid
@@ -30,9 +31,9 @@ CAMERA = {
 class PlainClient:
     """Connects, reports an address when the server asks for it, and stores all messages."""
 
-    def __init__(self, port, query="", *, origin=None, host=None, address="127.0.0.1"):
+    def __init__(self, port, query="", *, origin=None, host=None, address="127.0.0.1", dark=False):
         name = f"[{address}]" if ":" in address else address
-        self.query, self.messages = query, []
+        self.query, self.dark, self.messages = query, dark, []
         self.websocket = connect(
             f"ws://{host or f'{name}:{port}'}",
             origin=Origin(origin) if origin else None,
@@ -79,6 +80,17 @@ class PlainClient:
         """All texts that the page has shown: HTML, notifications, labels."""
         return "\n".join(_texts(self.messages))
 
+    @property
+    def sources(self):
+        """The JavaScript that the page has got, in its order."""
+        return [m["source"] for m in self.messages if m["type"] == "RunJavascriptMessage"]
+
+    @property
+    def addresses(self):
+        """The addresses that the page has shown, with the numbers of their pages."""
+        found = re.findall(r'\.address\((\d+), "((?:[^"\\\\]|\\\\.)*)"', "\n".join(self.sources))
+        return [(int(number), json.loads(f'"{query}"')) for number, query in found]
+
     def shows(self, text):
         """Wait until the page shows a text."""
         self.until(lambda: text in self.text)
@@ -97,16 +109,14 @@ class PlainClient:
             self._take(self.websocket.recv(timeout=0.5))
         return identity
 
-    def change(self, control, value):
-        """Change a control's value."""
+    def change(self, control, value=True):
+        """Change a control's value, or press a button."""
         self.send({"type": "GuiUpdateMessage", "uuid": control, "updates": {"value": value}})
 
     def upload(self, name, content, *, size=None, parts=None):
         """Upload a file on the first page, in parts as a browser does."""
         button = self.control("UploadButton", "Open a URDF, an MJCF or a zip")
-        self.control(
-            "Text", "Search"
-        )  # comes after the button, when the server accepts its uploads
+        self.control("Text", "Search")  # comes after the button: the server accepts its uploads
         transfer, step = uuid.uuid4().hex, 512 * 1024
         pieces = [content[at : at + step] for at in range(0, len(content), step)]
         begin = {
@@ -127,8 +137,7 @@ class PlainClient:
         """Wait until the server makes the page open another one; return its query."""
 
         def found():
-            sources = [m["source"] for m in self.messages if m["type"] == "RunJavascriptMessage"]
-            orders = [each for each in sources if "?.visit(" in each]
+            orders = [each for each in self.sources if "?.visit(" in each]
             return orders and json.JSONDecoder().raw_decode(orders[-1].split("(", 1)[1])[0]
 
         return self.until(found)
@@ -139,12 +148,12 @@ class PlainClient:
         for message in msgspec.msgpack.decode(plain)["messages"]:
             self.messages.append(message)
             if message["type"] == "LocalStorageGetItemRequestMessage":
-                answer = {"request_uuid": message["request_uuid"], "error": None}
                 self.send(
                     {
                         "type": "LocalStorageGetItemResponseMessage",
-                        "value": json.dumps({"query": self.query, "dark": False}),
-                        **answer,
+                        "request_uuid": message["request_uuid"],
+                        "value": json.dumps({"query": self.query, "dark": self.dark}),
+                        "error": None,
                     }
                 )
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
@@ -15,10 +16,8 @@ from morphgen.viewer.comparison import (
     compare_robots,
     fit_quality,
     fit_table,
-    format_moves,
     joint_roles,
     normalized_positions,
-    parse_moves,
     similarity_table,
     with_roles,
 )
@@ -72,14 +71,17 @@ def test_fits_have_an_iou():
     assert "not fitted yet" in fit_table(robot, {})
 
 
-def test_moves_of_roles_are_kept_in_an_address():
-    roles = ["joint 1", "joint 2", "finger 1"]
-    state = format_moves({"joint 1": -0.5}, roles)
-    assert state == {"joint1": "-0.5", "joint2": "", "finger1": ""}
-    assert parse_moves(state | {"joint2": "x", "finger1": "-3"}, roles, -1.0) == {
-        "joint 1": -0.5,
-        "finger 1": -1.0,
-    }
+def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(shared_viewer):
+    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&show=primitives"
+    with PlainClient(shared_viewer.port, query) as client:
+        client.shows("compare=robots/some-arm&joint1=-1&show=primitives")
+        client.change(client.control("Slider", "joint 2"), 0.5)
+        client.shows("joint1=-1&show=primitives&joint2=0.5")
+        client.change(client.control("ButtonGroup", "Go to"), "middle")
+        client.shows("joint1=0&show=primitives&joint2=0&joint3=0&finger1=0")
+        client.change(client.control("ButtonGroup", "Go to"), "home")
+        shown = (0, "?compare=robots/some-arm&show=primitives")
+        client.until(lambda: client.addresses[-1] == shown)
 
 
 def test_figures_link_to_robots_and_escape_names():

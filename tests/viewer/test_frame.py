@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import re
 from urllib.parse import quote
 
 import pytest
@@ -66,24 +65,15 @@ class Script:
 
     def __init__(self, client, port):
         self.client, self.port = client, port
-        (source,) = client.until(lambda: [s for s in self.sources() if "?.connect(" in s][-1:])
+        (source,) = client.until(lambda: [s for s in client.sources if "?.connect(" in s][-1:])
         self.token = json.JSONDecoder().raw_decode(source.split("(", 1)[1])[0]
 
-    def sources(self):
-        kind = "RunJavascriptMessage"
-        return [m["source"] for m in self.client.messages if m["type"] == kind]
-
-    def send(self, action, value, visit=0, token=None):
+    def send(self, action, value, visit=0, token=None, *, dark=False):
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        path = f"/morphgen/{token or self.token}?{action}={quote(value)}&visit={visit}&dark="
+        state = f"visit={visit}&dark={'yes' if dark else ''}"
+        path = f"/morphgen/{token or self.token}?{action}={quote(value)}&{state}"
         connection.request("GET", path)
         return connection.getresponse().status
-
-    def addresses(self):
-        """Return the addresses that the page has shown, with the numbers of their pages."""
-        text = "\n".join(self.sources())
-        found = re.findall(r'\.address\((\d+), "((?:[^"\\\\]|\\\\.)*)"', text)
-        return [(int(number), json.loads(f'"{query}"')) for number, query in found]
 
 
 def test_a_script_opens_another_page_in_place(viewer):
@@ -94,7 +84,7 @@ def test_a_script_opens_another_page_in_place(viewer):
         (first,) = on.sessions.values()
         assert script.send("open", f"?robot={A}", visit=1) == 200
         client.control("Checkbox", "x-ray")
-        client.until(lambda: (1, "?robot=words:arm=ur5%20ee=plane") in script.addresses())
+        client.until(lambda: (1, "?robot=words:arm=ur5%20ee=plane") in client.addresses)
         (second,) = on.sessions.values()
         assert first.closed.is_set()
         assert second.events is first.events
@@ -112,14 +102,14 @@ def test_a_script_chooses_robots(viewer):
         client.until(
             lambda: (
                 f"?library=&chosen={quote(A, safe='/=:')}&chosen={B}"
-                in dict(script.addresses()).values()
+                in dict(client.addresses).values()
             )
         )
         script.send("open", "?gallery=robots/prims", visit=1)
-        client.until(lambda: any(n == 1 and query.endswith(B) for n, query in script.addresses()))
+        client.until(lambda: any(n == 1 and query.endswith(B) for n, query in client.addresses))
         script.send("drop", A)
         script.send("clear", "")
-        client.until(lambda: script.addresses()[-1] == (1, "?gallery=robots/prims"))
+        client.until(lambda: client.addresses[-1] == (1, "?gallery=robots/prims"))
         script.send("choose", "x" * MAX_CHOSEN)
         client.shows("choose fewer")
         script.send("explode", "")
@@ -149,13 +139,7 @@ def test_compare_without_robots_offers_a_picker(shared_viewer):
     with PlainClient(on.port, "?compare=") as client:
         client.shows("Compare two to four robots")
         client.change(client.control("Text", "or words"), "arm=ur5 ee=plane")
-        client.send(
-            {
-                "type": "GuiUpdateMessage",
-                "uuid": client.control("Button", "Add"),
-                "updates": {"value": True},
-            }
-        )
+        client.change(client.control("Button", "Add"))
         assert client.sent_to() == "?compare=words:arm=ur5%20ee=plane"
 
 
@@ -169,10 +153,19 @@ def test_chosen_robots_become_the_sides_of_a_split(shared_viewer):
 
 def test_a_page_opens_the_tabs_of_its_address(viewer):
     with PlainClient(viewer().port, "?gallery=robots/prims&tab=A,B") as client:
+        client.shows('?.openTabs(["A", "B"])')
+        assert client.addresses[-1] == (0, "?gallery=robots/prims&tab=A,B")
 
-        def orders():
-            sources = [m["source"] for m in client.messages if m["type"] == "RunJavascriptMessage"]
-            return "".join(sources)
 
-        client.until(lambda: '?.openTabs(["A", "B"])' in orders())
-        assert "gallery=robots/prims&tab=A,B" in orders()
+def test_the_dark_theme_is_remembered(viewer):
+    on = viewer()
+    with PlainClient(on.port, "?library=", dark=True) as client:
+        script = Script(client, on.port)
+        client.shows(">light</a>")  # the way back
+        (theme, *_) = [m for m in client.messages if m["type"] == "ThemeConfigurationMessage"]
+        assert theme["dark_mode"] is True
+        client.messages.clear()
+        script.send("open", "?split=", visit=1, dark=True)
+        client.shows(">light</a>")
+        script.send("open", "?split=", visit=2)
+        client.shows(">dark</a>")

@@ -11,7 +11,7 @@ from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Link, Robot
-from morphgen.viewer.comparison import parse_moves, with_roles
+from morphgen.viewer.comparison import with_roles
 from morphgen.viewer.pages.population import format_selection, parse_selection, selection_text
 from morphgen.viewer.population import (
     ReadRobot,
@@ -133,16 +133,13 @@ def test_points_are_projected_to_the_picture():
     np.testing.assert_allclose(depth, 5)
 
 
-def test_selections_and_shares_survive_the_address():
+def test_selections_survive_the_address():
     selected = np.array([True, True, True, False, False, True, False])
     assert format_selection(selected) == "0-2,5"
     np.testing.assert_array_equal(parse_selection("0-2,5", 7), selected)
     assert not parse_selection("", 7).any()
     assert parse_selection("5-99,x,3-", 7).tolist() == [False] * 5 + [True] * 2
     assert format_selection(np.zeros(3, bool)) == ""
-    roles = ("joint 1", "joint 2", "finger 1")
-    state = {"joint1": "0.25", "joint2": "7", "finger1": "x"}
-    assert parse_moves(state, roles, 0.0) == {"joint 1": 0.25, "joint 2": 1.0}
 
 
 def test_the_text_of_a_selection_has_links_facts_and_ranges():

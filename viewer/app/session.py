@@ -7,11 +7,12 @@ import sys
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, TypeVar
 
 import msgspec
 import viser
@@ -78,29 +79,26 @@ Work = Callable[[], object]
 T = TypeVar("T")
 
 
-class Status(Protocol):
-    """Part of a page that shows HTML."""
-
-    content: str
-
-
 class SessionClosed(RuntimeError):  # noqa: N818
     """The browser has left the session's page, or has disconnected."""
 
 
-def _new_events() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "morphgen-events")
+@dataclass(frozen=True)
+class StateValue:
+    """A value of a page that its address keeps, as text."""
 
-
-def _new_background() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "morphgen-background")
+    write: Callable[[], str]
+    """Returns the value; empty for the default, which the address leaves out."""
+    apply: Callable[[str], object] | None
+    """Takes over the value of an address; None if the page has read it before it was built."""
 
 
 @dataclass(eq=False)
 class Session:
     """A page in a browser. A thread handles the user's actions one after the other.
 
-    The next page in the same browser has a session of its own, see ``next_session``.
+    The next page in the same browser has a session of its own, see ``next_session``. It shares the
+    fields of the browser; those that are not arguments begin anew with each page.
     """
 
     browser: viser.ClientHandle
@@ -119,28 +117,32 @@ class Session:
     """Number of the page in this browser, counted from the load of the browser's page."""
     cache: SharedResults = field(default_factory=SharedResults)
     """Results of slow work, shared by all browsers."""
-    closed: threading.Event = field(default_factory=threading.Event)
-    """Set when the browser has left the page or disconnected; long work has to check it."""
-    events: ThreadPoolExecutor = field(default_factory=_new_events)
+    events: ThreadPoolExecutor = field(
+        default_factory=partial(ThreadPoolExecutor, 1, "morphgen-events")
+    )
     """Thread of all pages in this browser, so that a page's work ends before the next begins."""
-    background: ThreadPoolExecutor = field(default_factory=_new_background)
-    pending: set[str] = field(default_factory=set)
+    closed: threading.Event = field(init=False, default_factory=threading.Event)
+    """Set when the browser has left the page or disconnected; long work has to check it."""
+    background: ThreadPoolExecutor = field(
+        init=False, default_factory=partial(ThreadPoolExecutor, 1, "morphgen-background")
+    )
+    pending: set[str] = field(init=False, default_factory=set)
     """Keys of queued work that has not started yet."""
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    close_callbacks: list[Work] = field(default_factory=list)
-    status: Status | None = None
+    lock: threading.Lock = field(init=False, default_factory=threading.Lock)
+    close_callbacks: list[Work] = field(init=False, default_factory=list)
+    status: viser.GuiHtmlHandle | None = field(init=False, default=None)
     """Line of the page that shows the current activity."""
-    title: str = "morphgen"
+    title: str = field(init=False, default="morphgen")
     """Title of the browser's tab."""
-    tabs: str = ""
+    tabs: str = field(init=False, default="")
     """Titles of the open tabs, separated by commas; those that are open at first are left out."""
-    actions: dict[str, Callable[[str], object]] = field(default_factory=dict)
+    actions: dict[str, Callable[[str], object]] = field(init=False, default_factory=dict)
     """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
     called with the element's ``data-value``."""
-    on_choice: Work | None = None
+    on_choice: Work | None = field(init=False, default=None)
     """Called after the user has chosen other robots."""
-    state: Callable[[], Mapping[str, str]] = dict
-    """Returns the page's state as its controls have it; see ``show_state``."""
+    values: dict[str, StateValue] = field(init=False, default_factory=dict)
+    """The page's state by its keys in the address; see ``keep``."""
 
     @property
     def client(self) -> viser.ClientHandle:
@@ -152,18 +154,7 @@ class Session:
     def next_session(self, visit: int, *, dark: bool, width: int) -> Session:
         """Close the session; return one for another page in the same browser."""
         self.close()
-        return Session(
-            self.browser,
-            self.files,
-            self.workers,
-            self.address,
-            dark,
-            width,
-            self.chosen,
-            visit,
-            self.cache,
-            events=self.events,
-        )
+        return replace(self, visit=visit, dark=dark, width=width)
 
     def enqueue(self, work: Work, key: str = "", *, even_closed: bool = False) -> None:
         """Run work on the session's event thread, after everything that was enqueued before."""
@@ -298,14 +289,45 @@ class Session:
             call("address", self.visit, address.query, title) + call("bar", bar, self.dark)
         )
 
-    def update_address(self, title: str, **state: str) -> None:
-        """Change the page's state in the URL; see ``Address.with_state``."""
-        self.address = self.address.with_state(**state)
-        self.show_address(title)
+    def keep(
+        self, key: str, write: Callable[[], str], apply: Callable[[str], object] | None = None
+    ) -> None:
+        """Keep a value of the page in its address; see ``StateValue``."""
+        self.values[key] = StateValue(write, apply)
+
+    def keep_choice(
+        self, key: str, dropdown: viser.GuiDropdownHandle[str], keys: Sequence[str]
+    ) -> None:
+        """Keep the chosen option of a dropdown by a key of each; the first is the default.
+
+        An unknown key in the address changes nothing.
+        """
+
+        def write() -> str:
+            i = dropdown.options.index(dropdown.value)
+            return keys[i] if i else ""
+
+        def apply(text: str) -> None:
+            if text in keys:
+                set_value(dropdown, dropdown.options[keys.index(text)])
+
+        self.keep(key, write, apply)
+
+    def state(self) -> dict[str, str]:
+        """Return the page's state as its controls have it, by key; defaults are empty."""
+        return {key: value.write() for key, value in self.values.items()}
+
+    def apply_state(self) -> None:
+        """Take over the state that the page's address has, in the order of ``keep``."""
+        asked = self.address.state  # a new value may show the state, which changes the address
+        for key, value in list(self.values.items()):
+            if key in asked and value.apply is not None:
+                value.apply(asked[key])
 
     def show_state(self) -> None:
         """Show the page's state in the address and its title in the browser's tab."""
-        self.update_address(self.title, **self.state())
+        self.address = self.address.with_state(**self.state())
+        self.show_address(self.title)
 
     def show_state_later(self) -> None:
         """Show the page's state soon; many changes in a short time are shown once."""

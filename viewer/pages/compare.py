@@ -15,6 +15,7 @@ from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup
 from morphgen.viewer.app.address import MAX_COMPARED, Address
 from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.comparison import RoleSliders
 from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.scene import robot as scene_robot
@@ -43,10 +44,7 @@ class ComparePage:
     uris: tuple[str, ...]
     robots: list[Robot]
     views: list[scene_robot.RobotView]
-    sliders: dict[str, viser.GuiSliderHandle[float]] = field(default_factory=dict)
-    """Sliders by role of the joints."""
-    moved: dict[str, float] = field(default_factory=dict)
-    """Positions of the roles that the user moved; the others stay at each robot's home."""
+    sliders: RoleSliders = field(init=False)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
 
 
@@ -82,11 +80,15 @@ def show(session: Session) -> None:
     session.on_change(box, toggle_primitives)
     session.set_status("")
     session.title = "compare " + ", ".join(robot.name for robot in robots)
-    session.state = lambda: {
-        "show": PRIMITIVES if box.value else "",
-        **comparison.format_moves(page.moved, tuple(page.sliders)),
-    }
-    _apply_address(page, box)
+
+    def apply_show(text: str) -> None:
+        if text == PRIMITIVES:
+            set_value(box, True)
+            session.run_in_background(lambda: _show_fits(page, on=True))
+
+    session.keep("show", lambda: PRIMITIVES if box.value else "", apply_show)
+    session.apply_state()
+    _move(page)
     session.show_state()
     session.run_in_background(lambda: _compare(page))
 
@@ -148,46 +150,25 @@ def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
     session.on_change(button, add)
 
 
-def _apply_address(page: ComparePage, box: viser.GuiCheckboxHandle) -> None:
-    """Restore the moved joints and the primitives from the page's address."""
-    state = page.session.address.state
-    page.moved = comparison.parse_moves(state, tuple(page.sliders), -1.0)
-    for role, value in page.moved.items():
-        set_value(page.sliders[role], value)
-    _move(page)
-    if state.get("show") == PRIMITIVES:
-        set_value(box, True)
-        page.session.run_in_background(lambda: _show_fits(page, on=True))
-
-
 def _add_move_tab(page: ComparePage) -> None:
     """Add a slider for each role of joints, and buttons that move all of them."""
-    gui, session = page.session.client.gui, page.session
-    buttons = gui.add_button_group("Go to", ("home", "middle"))
+    session = page.session
+    buttons = session.client.gui.add_button_group("Go to", ("home", "middle"))
+    sliders = page.sliders = RoleSliders(session, -1.0, lambda: _move(page))
 
     def go_to_target() -> None:
-        page.moved = {} if buttons.value == "home" else dict.fromkeys(page.sliders, 0.0)
-        for role, slider in page.sliders.items():
-            set_value(slider, page.moved.get(role, _home_value(page, role)))
-        _move(page)
-
-    def read_sliders() -> None:
-        for role, slider in page.sliders.items():
-            if role in page.moved or slider.value != _home_value(page, role):
-                page.moved[role] = slider.value
-        _move(page)
+        if buttons.value == "home":
+            sliders.set({})
+        else:
+            sliders.set_all(0.0)
 
     session.on_change(buttons, go_to_target)
     for role in comparison.all_roles(page.robots):
         names = ", ".join(
             robot.name for robot in page.robots if role in comparison.joint_roles(robot)
         )
-        value = _home_value(page, role)
-        slider = gui.add_slider(
-            role, -1.0, 1.0, 0.01, value, hint=f"-1 is the lower limit, 1 the upper; of {names}"
-        )
-        page.sliders[role] = slider
-        session.on_change(slider, read_sliders, "move")
+        hint = f"-1 is the lower limit, 1 the upper; of {names}"
+        sliders.add(role, _home_value(page, role), hint)
 
 
 def _home_value(page: ComparePage, role: str) -> float:
@@ -201,7 +182,8 @@ def _move(page: ComparePage) -> None:
     """Move every robot: moved roles to their positions, other joints to their home."""
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
-            view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))
+            q = comparison.with_roles(robot, np.array(robot.home), page.sliders.moved)
+            view.set_configuration(q)
     page.session.show_state_later()
 
 

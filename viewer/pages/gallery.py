@@ -118,7 +118,6 @@ def show_chosen(session: Session) -> None:
 
     def divide() -> None:
         _set_sides(gallery.rows, num_train.value)
-        session.address = session.address.with_state(train=str(num_train.value))
         show_page(gallery, 1)
 
     def sides() -> tuple[list[Row], list[Row]]:
@@ -128,6 +127,7 @@ def show_chosen(session: Session) -> None:
         address = replace(session.address, subjects=session.chosen or ("",))
         session.open_address(address, instead=True)
 
+    session.keep("train", lambda: str(num_train.value))
     _set_sides(gallery.rows, initial)
     add_controls(gallery)
     add_split_form(session, lambda: sides, expanded=True)

@@ -378,11 +378,11 @@ class PlayPage:
         self.position = step
         self.session.show_state_later()
 
-    def state(self) -> dict[str, str]:
+    def paused_at(self) -> str:
         """Return the time at which the episode is paused, for the address."""
         if self.position is None or self.source is None:
-            return {"t": ""}
-        return {"t": f"{self.position * self.source.episode.period:.4g}"}
+            return ""
+        return f"{self.position * self.source.episode.period:.4g}"
 
     def show_failure(self, reason: str) -> None:
         """Show why there is no episode."""
@@ -472,7 +472,7 @@ def _add_player(session: Session) -> tuple[PlayPage, Player]:
     page = PlayPage(session, time, fault, score, plots)
     player = Player(page)
     session.on_close(player.stop)
-    session.state = page.state
+    session.keep("t", page.paused_at)
     commands: dict[str, Callable[[], None]] = {
         "play": player.play,
         "pause": player.pause,

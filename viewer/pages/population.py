@@ -15,8 +15,8 @@ from morphgen.benchmark.split import SIDES
 from morphgen.errors import BenchmarkError
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, parse_count
-from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.comparison import format_moves, parse_moves
+from morphgen.viewer.app.session import Session
+from morphgen.viewer.comparison import RoleSliders
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.population import (
     NUM_SAMPLED,
@@ -67,13 +67,11 @@ class PopulationPage:
     population: Population
     scene: scene_population.PopulationScene
     arrange: viser.GuiDropdownHandle[str]
-    sliders: dict[str, viser.GuiSliderHandle[float]]
-    """Sliders by role of the joints."""
-    selection: viser.GuiHtmlHandle
     selected: NDArray[np.bool_]
     """Mask of the selected robots, shape (n,)."""
-    moved: dict[str, float] = field(default_factory=dict)
-    """Share of its range by each role that the user moved; other joints are at home."""
+    sliders: RoleSliders = field(init=False)
+    """Sliders of the joints' shares of their ranges."""
+    selection: viser.GuiHtmlHandle = field(init=False)
 
     @property
     def arrangement(self) -> str:
@@ -84,6 +82,10 @@ class PopulationPage:
     def rows(self) -> list[Row]:
         """Rows of the selected robots."""
         return [self.population.rows[i] for i in np.flatnonzero(self.selected)]
+
+    def apply_selection(self, text: str) -> None:
+        """Select the robots that an address names."""
+        self.selected = parse_selection(text, len(self.population))
 
 
 def show(session: Session) -> None:
@@ -122,33 +124,26 @@ def _show_population(
     session: Session, source: Source, population: Population, faults: list[tuple[str, str]]
 ) -> None:
     """Draw the robots, add the controls, and apply the address."""
-    client, gui, state = session.client, session.client.gui, session.address.state
+    client, gui = session.client, session.client.gui
     session.set_status("sending the shapes to the browser")
     positions = grid(population.home_bounds).positions
     scene = scene_population.add_population(client, population, positions, population.home)
     gui.add_html(markup.framed(_summary(source, population, faults)))
-    label = ARRANGEMENTS.get(state.get("arrange", ""), ARRANGEMENTS["grid"])
-    arrange = gui.add_dropdown("Arrange", tuple(ARRANGEMENTS.values()), initial_value=label)
+    arrange = gui.add_dropdown("Arrange", tuple(ARRANGEMENTS.values()))
     home = gui.add_button("Home", icon=viser.Icon.HOME)
-    moved = parse_moves(state, population.roles, 0.0)
-    page = PopulationPage(
-        session,
-        population,
-        scene,
-        arrange,
-        _add_sliders(session, population, moved),
-        gui.add_html(""),
-        parse_selection(state.get("select", ""), len(population)),
-        moved,
-    )
+    page = PopulationPage(session, population, scene, arrange, np.zeros(len(population), np.bool_))
+    session.keep_choice("arrange", arrange, tuple(ARRANGEMENTS))
+    session.keep("select", lambda: format_selection(page.selected), page.apply_selection)
+    page.sliders = RoleSliders(session, 0.0, lambda: _move(page))
+    _add_sliders(page)
+    page.selection = gui.add_html("")
     _add_actions(page)
     session.on_change(arrange, lambda: _arrange(page), "arrange")
-    session.on_change(home, lambda: _go_home(page))
-    for slider in page.sliders.values():
-        session.on_change(slider, lambda: _read_sliders(page), "move")
+    session.on_change(home, lambda: page.sliders.set({}))
     _connect_pointer(page)
     session.set_status("")
-    session.title, session.state = session.address.subject, functools.partial(_state, page)
+    session.title = session.address.subject
+    session.apply_state()
     _arrange(page)
     _show_selection(page)
 
@@ -169,31 +164,17 @@ def _summary(source: Source, population: Population, faults: list[tuple[str, str
     )
 
 
-def _add_sliders(
-    session: Session, population: Population, moved: dict[str, float]
-) -> dict[str, viser.GuiSliderHandle[float]]:
+def _add_sliders(page: PopulationPage) -> None:
     """Add a slider for each role of joints."""
-    gui, sliders = session.client.gui, {}
+    population = page.population
     for title, initial in (("Joints from the base to the tool", "j"), ("Fingers and others", "f")):
         roles = [role for role in population.roles if role[0] == initial]
         if not roles:
             continue
-        with gui.add_folder(title, expand_by_default=initial == "j"):
+        with page.session.client.gui.add_folder(title, expand_by_default=initial == "j"):
             for role in roles:
                 number = int((population.role == population.roles.index(role)).any(axis=1).sum())
-                hint = f"share of its range, of {number} robots"
-                value = moved.get(role, MIDDLE)
-                sliders[role] = gui.add_slider(role, 0.0, 1.0, 0.01, value, hint=hint)
-    return sliders
-
-
-def _state(page: PopulationPage) -> dict[str, str]:
-    """Return the page's state for the address."""
-    return {
-        "arrange": "" if page.arrangement == "grid" else page.arrangement,
-        "select": format_selection(page.selected),
-        **format_moves(page.moved, tuple(page.sliders)),
-    }
+                page.sliders.add(role, MIDDLE, f"share of its range, of {number} robots")
 
 
 def _arrange(page: PopulationPage) -> None:
@@ -222,23 +203,7 @@ def _arrange(page: PopulationPage) -> None:
 
 def _configurations(page: PopulationPage) -> NDArray[np.float64]:
     """Return the configurations of all robots, shape (n, J) [rad or m]."""
-    return move_roles(page.population, page.population.home, page.moved)
-
-
-def _go_home(page: PopulationPage) -> None:
-    """Move all robots home."""
-    page.moved = {}
-    for slider in page.sliders.values():
-        set_value(slider, MIDDLE)
-    _move(page)
-
-
-def _read_sliders(page: PopulationPage) -> None:
-    """Move the joints whose slider the user has moved."""
-    for role, slider in page.sliders.items():
-        if role in page.moved or slider.value != MIDDLE:
-            page.moved[role] = slider.value
-    _move(page)
+    return move_roles(page.population, page.population.home, page.sliders.moved)
 
 
 def _move(page: PopulationPage) -> None:

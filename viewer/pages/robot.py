@@ -22,21 +22,16 @@ from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, robot_tables
 from morphgen.viewer.app.address import Address
-from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.web_page import robot_page
 from morphgen.viewer.pages.robot_show import (
-    ANGLES,
     NO_LINK,
     RobotPage,
     add_move_tab,
     add_toggles,
-    apply_toggle,
     connect_links,
-    page_state,
-    parse_joints,
+    keep_state,
     select_link,
-    set_angles,
-    set_configuration,
     set_findings,
     show_card,
     update_scene,
@@ -92,8 +87,8 @@ def show(session: Session) -> None:
         _add_downloads_tab(page)
     session.set_status("")
     connect_links(page)
-    session.title, session.state = robot.name, functools.partial(page_state, page)
-    _apply_address(page)
+    session.title = robot.name
+    keep_state(page)
     session.run_in_background(lambda: _check_robot(page))
 
 
@@ -132,26 +127,6 @@ def _links(robot: Robot, uri: str) -> str:
         play = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
         links.append(f"see it {' · '.join(play)}")
     return f"<br>{' · '.join(links)}"
-
-
-def _apply_address(page: RobotPage) -> None:
-    """Restore the configuration, the toggles, the unit and the link from the page's address."""
-    state = page.session.address.state
-    shown = state.get("show", "visual").split(",")
-    changed = [name for name, box in page.toggles.items() if box.value != (name in shown)]
-    for name in changed:
-        set_value(page.toggles[name], name in shown)
-    for name in changed:  # after all are set: the address has the state of all
-        apply_toggle(page, name)
-    if state.get("angles") in ANGLES:
-        set_angles(page, state["angles"])
-    if state.get("link") in page.robot.link_index:
-        select_link(page, state["link"])
-    q = parse_joints(state.get("q", ""), page.robot)
-    if q is not None:
-        set_configuration(page, q)
-    else:
-        page.session.show_state()
 
 
 def _add_links_tab(page: RobotPage) -> None:

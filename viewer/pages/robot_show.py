@@ -56,10 +56,14 @@ class Workspace:
     position: viser.GuiSliderHandle[float]
     """Position y of the slice [m]."""
     legend: viser.GuiHtmlHandle
-    asked: str
+    asked: str = ""
     """Position of the slice in the address; anything but a number means zero."""
     points: Array | None = None
     """Tool positions, shape (n, 3) [m]; None until they are sampled."""
+
+    def ask(self, position: str) -> None:
+        """Remember the position that an address has until the workspace is there."""
+        self.asked = position
 
     @property
     def state(self) -> str:
@@ -159,17 +163,49 @@ def update_scene(page: RobotPage) -> None:
     page.session.show_state_later()
 
 
-def page_state(page: RobotPage) -> dict[str, str]:
-    """Return the configuration, toggles, unit and selected link for the page's address."""
-    at_home = np.allclose(page.q, page.robot.home)
-    toggles = ",".join(name for name, box in page.toggles.items() if box.value)
-    return {
-        "q": "" if at_home else format_joints(page.q),
-        "show": "" if toggles == "visual" else toggles or "none",
-        "angles": "" if page.angles == "rad" else page.angles,
-        "link": page.selected,
-        "slice": page.workspace.state if page.workspace and is_on(page, "workspace") else "",
-    }
+def keep_state(page: RobotPage) -> None:
+    """Keep the page's state in its address, and take over what the address has."""
+    session, workspace = page.session, page.workspace
+    if workspace is not None:
+        session.keep(
+            "slice",
+            lambda: workspace.state if is_on(page, "workspace") else "",
+            workspace.ask,  # before the toggle shows it
+        )
+    session.keep("show", lambda: _shown(page), lambda text: _show(page, text.split(",")))
+    session.keep(
+        "angles",
+        lambda: "" if page.angles == "rad" else page.angles,
+        lambda unit: set_angles(page, unit),
+    )
+    session.keep("link", lambda: page.selected, lambda name: select_link(page, name))
+    session.keep(
+        "q",
+        lambda: "" if np.allclose(page.q, page.robot.home) else format_joints(page.q),
+        lambda text: _apply_joints(page, text),
+    )
+    session.apply_state()
+    session.show_state()
+
+
+def _shown(page: RobotPage) -> str:
+    """Return the checked toggles for the address."""
+    shown = ",".join(name for name, box in page.toggles.items() if box.value)
+    return "" if shown == "visual" else shown or "none"
+
+
+def _show(page: RobotPage, names: Sequence[str]) -> None:
+    """Check the named toggles and no others."""
+    changed = [name for name, box in page.toggles.items() if box.value != (name in names)]
+    for name in changed:
+        set_value(page.toggles[name], name in names)
+    for name in changed:  # after all are set: what is drawn may depend on several
+        apply_toggle(page, name)
+
+
+def _apply_joints(page: RobotPage, text: str) -> None:
+    if (q := parse_joints(text, page.robot)) is not None:
+        set_configuration(page, q)
 
 
 def format_joints(q: Array) -> str:
@@ -202,10 +238,10 @@ _MAX_TURN = 0.4
 
 
 def select_link(page: RobotPage, name: str) -> None:
-    """Select a link: outline, card and slider; an empty name selects none."""
+    """Select a link: outline, card and slider; an empty or unknown name selects none."""
     for node in page.outline:
         node.remove()
-    page.selected = name
+    page.selected = name = name if name in page.robot.link_index else ""
     page.outline = []
     if name:
         page.outline = scene_overlays.draw_outline(page.view, page.robot.link_index[name])
@@ -381,7 +417,7 @@ def free_configuration(
 
 def set_angles(page: RobotPage, unit: str) -> None:
     """Show the angles of the sliders in another unit, ``rad`` or ``deg``."""
-    if page.angle_choice is None or unit == page.angles:
+    if page.angle_choice is None or unit not in ANGLES or unit == page.angles:
         return
     page.angles = unit
     set_value(page.angle_choice, unit)
@@ -472,8 +508,7 @@ def add_toggles(page: RobotPage) -> None:
         session.on_change(box, functools.partial(apply_toggle, page, name))
     if has_tool(page.robot):
         position = gui.add_slider("slice at y [m]", -1.0, 1.0, _STEP, 0.0, visible=False)
-        asked = session.address.state.get("slice", "")
-        page.workspace = Workspace(position, gui.add_html(""), asked)
+        page.workspace = Workspace(position, gui.add_html(""))
         session.on_change(position, lambda: _cut_workspace(page), "slice")
 
 
