@@ -194,6 +194,5 @@ def send_bundles(session: Session, uris: Sequence[str]) -> None:
                 f"the first {i + 1} of {len(uris)} robots have {size / 2**20:.0f} MB; at most "
                 f"{MAX_EXPORT // 2**20} MB are exported: select fewer, or copy their folders"
             )
-    content = zip_files("robots", files)
-    session.client.send_file_download("robots.zip", content, save_immediately=True)
+    session.send_file("robots.zip", zip_files("robots", files))
     session.set_status("")

@@ -206,12 +206,11 @@ def add_split_form(
 
         def compose_sides() -> Sides:
             """Compose the robots in the worker processes."""
-            with session.progress("composing {} robots"):
+            with session.activity("composing {} robots"):
                 train, test = (
                     make_members(rows, task.value, obstacles.value, session.files, session.workers)
                     for rows in choose_sides()
                 )
-            session.set_status("")
             return train, test
 
         return compose_sides
@@ -242,4 +241,4 @@ def add_save_form(
         text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
         session.notify("Saved", shown)
 
-    session.on_change(button, lambda: session.run_in_background(save))
+    session.on_press(button, save)

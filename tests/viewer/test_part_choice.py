@@ -1,7 +1,10 @@
 """Conversion between the controls of the compose panel and compose arguments."""
 
+from urllib.parse import unquote
+
 import pytest
 
+from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
@@ -11,8 +14,7 @@ from morphgen.viewer.pages.compose_grammar import first_parts
 from morphgen.viewer.pages.compose_parts import (
     NO_PART,
     choice_of,
-    controls_of,
-    node_controls,
+    parameters_of,
     parse_choice,
     slots_of,
     with_parameter,
@@ -50,14 +52,25 @@ def test_parts_offer_slots_and_each_can_be_filled(words, slots):
         parse_words(filled.words.split(), LIBRARY)
 
 
-def test_every_parameter_has_a_control_with_its_range():
-    manifest = LIBRARY.manifest("arm3")
-    controls = {control.key: control for control in controls_of("arm", manifest)}
-    assert controls.keys() == {"arm.length", "arm.radius", "arm.wrist", "arm.mount_yaw"}
-    length = controls["arm.length"]
-    assert (length.low, length.high, length.default, length.label) == (0.1, 0.5, 0.3, "length (m)")
-    assert controls["arm.wrist"].step == 1.0
-    assert "arm.mount_yaw" not in {c.key for c in controls_of("base", LIBRARY.manifest("pedestal"))}
+def sliders(client, last):
+    client.control("Slider", last)
+    messages = [m["props"] for m in client.messages if m["type"] == "GuiSliderMessage"]
+    return {props["label"]: props for props in messages}
+
+
+def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
+    with PlainClient(
+        shared_viewer.port, "?compose=arm=arm3 base=pedestal arm.length=0.4"
+    ) as client:
+        shown = sliders(client, "mount yaw (rad)")
+        names = list(shown)
+        assert names.index("mount yaw (rad)") > names.index("wrist")  # the base has no mount
+        length = shown["length (m)"]
+        assert (length["min"], length["max"]) == (0.1, 0.5)
+        assert shown["wrist"]["step"] == 1.0
+        client.shows('"?compose=base=pedestal%20arm=arm3%20arm.length=0.4"')
+        client.change(client.control("Slider", "length (m)"), 0.3)
+        client.shows('"?compose=base=pedestal%20arm=arm3"')  # the default
 
 
 TEMPLATES = [
@@ -74,9 +87,9 @@ def test_every_part_accepts_both_ends_of_every_control(manifest):
     slot = manifest.kind
     words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
     choice = parse_choice(words.split(), LIBRARY)
-    for control in controls_of(slot, manifest):
-        for value in (control.low, control.high):
-            text = with_value(choice, control, value).words
+    for key, parameter in parameters_of(slot, manifest).items():
+        for value in (parameter.minimum, parameter.maximum):
+            text = with_value(choice, f"{slot}.{key}", value, parameter.default).words
             parse_words(text.split(), LIBRARY)
 
 
@@ -98,9 +111,8 @@ def test_changing_the_base_keeps_limbs_with_matching_ports():
 
 def test_default_values_are_omitted():
     choice = parse_choice(["arm=arm3", "arm.length=0.2"], LIBRARY)
-    control = next(c for c in controls_of("arm", LIBRARY.manifest("arm3")) if c.key == "arm.length")
-    assert with_value(choice, control, control.default).words == "base=fixed arm=arm3"
-    assert with_value(choice, control, 0.4).words == "base=fixed arm=arm3 arm.length=0.4"
+    assert with_value(choice, "arm.length", 0.3, 0.3).words == "base=fixed arm=arm3"
+    assert with_value(choice, "arm.length", 0.4, 0.3).words == "base=fixed arm=arm3 arm.length=0.4"
 
 
 def test_derivation_is_built_part_by_part():
@@ -132,6 +144,11 @@ def test_parameters_of_any_derivation_can_be_changed():
     derivation = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.2)]")
     changed = with_parameter(derivation, "beam1", "length", 0.3)
     assert str(changed) == "post=post(height=0.05)[top: beam1=beam(length=0.3)]"
-    node = derivation.children[0][1]
-    (control,) = node_controls(node, LIBRARY, is_root=False)
-    assert (control.key, control.label) == ("length", "length (m)")
+
+
+def test_a_derivation_has_a_slider_for_each_of_its_values(shared_viewer):
+    query = "?compose=derivation:post=post(height=0.05)[top: beam1=beam(length=0.2)]"
+    with PlainClient(shared_viewer.port, query) as client:
+        assert list(sliders(client, "length (m)"))[:2] == ["height (m)", "length (m)"]
+        client.change(client.control("Slider", "length (m)"), 0.3)
+        client.until(lambda: "beam(length=0.3)" in unquote(client.addresses[-1][1]))

@@ -7,9 +7,9 @@ import sys
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -168,23 +168,30 @@ class Session:
         """Run a function in a worker process and return its result."""
         return self.workers.result(self.workers.submit(work, *arguments))
 
-    def progress(self, text: str) -> AbstractContextManager[None]:
-        """Show the progress of a block; the text has a field for the number of items."""
+    @contextmanager
+    def activity(self, text: str) -> Iterator[None]:
+        """Show what a block does; with a ``{}`` for the number of items, show its progress."""
 
         def show(done: float, total: int | None) -> None:
             if total:
                 self.set_status(text.format(total), done / total)
 
-        return show_progress(show)
+        try:
+            if "{}" in text:
+                with show_progress(show):
+                    yield
+            else:
+                self.set_status(text)
+                yield
+        finally:
+            self.set_status("")
 
     def cached(self, key: str, make: Callable[[], T], text: str) -> T:
-        """Return the result of slow work, which is done once for all browsers; see ``progress``."""
+        """Return the result of slow work, which is done once for all browsers; see ``activity``."""
 
         def made() -> T:
-            with self.progress(text):
-                result = make()
-            self.set_status("")
-            return result
+            with self.activity(text):
+                return make()
 
         return self.cache.get(key, made)
 
@@ -217,6 +224,10 @@ class Session:
 
         attach = getattr(handle, "on_click", None) or handle.on_update
         attach(changed)
+
+    def on_press(self, button: Any, work: Work) -> None:  # noqa: ANN401
+        """Run slow work in the background whenever the user presses a button."""
+        self.on_change(button, lambda: self.run_in_background(work))
 
     def on_close(self, work: Work) -> None:
         """Call quick work when the browser leaves the page; immediately if it already has."""
@@ -274,6 +285,10 @@ class Session:
             auto_close_seconds=None if error else 6.0,
             color="red" if error else None,
         )
+
+    def send_file(self, name: str, content: bytes) -> None:
+        """Let the browser save a file."""
+        self.client.send_file_download(name, content, save_immediately=True)
 
     def report_error(self, error: object) -> None:
         """Show on the page why an action failed."""

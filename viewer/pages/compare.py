@@ -217,13 +217,12 @@ def _compare(page: ComparePage) -> None:
     if len(names) == 1:
         page.texts["similarity"].content = markup.framed(markup.dim(ONE_ROBOT))
         return
-    session.set_status("comparing")
     try:
         folders = session.files.library_folders
-        similarity = session.run_in_worker(comparison.compare_robots, page.robots, folders)
+        with session.activity("comparing"):
+            similarity = session.run_in_worker(comparison.compare_robots, page.robots, folders)
         content = f"<h3>Similarity</h3>{comparison.similarity_table(names, similarity)}"
     except MorphgenError as error:
         tag = markup.tag("cannot be compared", "warning")
         content = f"{tag}{escape(session.files.redact(error))}"
     page.texts["similarity"].content = markup.framed(content)
-    session.set_status("")

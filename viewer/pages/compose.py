@@ -225,12 +225,8 @@ def _add_downloads_tab(page: ComposePage) -> None:
     write = gui.add_button(f"Write to {ROBOTS}/", icon=viser.Icon.DEVICE_FLOPPY)
     download = gui.add_button("Bundle (.zip)", icon=viser.Icon.DOWNLOAD)
     page.command = gui.add_html("")
-    session.on_change(
-        write, lambda: session.run_in_background(lambda: _write_bundle(page, name.value))
-    )
-    session.on_change(
-        download, lambda: session.run_in_background(lambda: _send_bundle(page, name.value))
-    )
+    session.on_press(write, lambda: _write_bundle(page, name.value))
+    session.on_press(download, lambda: _send_bundle(page, name.value))
 
 
 def _named_robot(page: ComposePage, name: str) -> Robot:
@@ -245,9 +241,8 @@ def _write_bundle(page: ComposePage, name: str) -> None:
     session, robot = page.session, _named_robot(page, name)
     folder = bundle_folder(session.files.roots[0] / ROBOTS, robot.name)
     target = str(folder.relative_to(session.files.roots[0]))
-    session.set_status(f"writing {target}")
-    session.run_in_worker(_write_checked, robot, folder)
-    session.set_status("")
+    with session.activity(f"writing {target}"):
+        session.run_in_worker(_write_checked, robot, folder)
     session.notify("Written", target)
 
 
@@ -260,11 +255,9 @@ def _send_bundle(page: ComposePage, name: str) -> None:
     """Send a zip of the robot's bundle to the browser."""
     session, robot = page.session, _named_robot(page, name)
     folder = bundle_folder(Path(), robot.name).name  # validates the name
-    session.set_status("packing the bundle")
-    files = session.run_in_worker(new_bundle_files, robot)
-    content = zip_files(folder, files)
-    session.client.send_file_download(f"{folder}.zip", content, save_immediately=True)
-    session.set_status("")
+    with session.activity("packing the bundle"):
+        files = session.run_in_worker(new_bundle_files, robot)
+        session.send_file(f"{folder}.zip", zip_files(folder, files))
 
 
 GHOST_OPACITY = 0.16
@@ -488,9 +481,8 @@ def _breed(tab: EvolveTab) -> None:
             _show_generation(tab)
 
     def make() -> None:
-        session.set_status("mutating")
-        generation = session.run_in_worker(mutants, grammar, folders, parent.choices, seed)
-        session.set_status("")
+        with session.activity("mutating"):
+            generation = session.run_in_worker(mutants, grammar, folders, parent.choices, seed)
         session.enqueue(lambda: show(generation))
 
     session.run_in_background(make, "breed")
@@ -506,11 +498,12 @@ def _show_generation(tab: EvolveTab) -> None:
 
 
 def _show_in_address(tab: EvolveTab) -> None:
+    """Show in the address which mutants there are, and the choices that gave their parent."""
+    state = {"evolve": str(tab.seed.value) if tab.generation else ""}
     if tab.generation and tab.parent is not None:
-        state = {"choices": pack_choices(tab.parent.choices), "seed": "", "number": ""}
-        tab.session.address = tab.session.address.with_state(**state)
-    evolve = str(tab.seed.value) if tab.generation else ""
-    tab.session.update_address(tab.session.title, evolve=evolve)
+        state |= {"choices": pack_choices(tab.parent.choices), "seed": "", "number": ""}
+    tab.session.address = tab.session.address.with_state(**state)
+    tab.session.show_address(tab.session.title)
 
 
 def _clear_generation(tab: EvolveTab) -> None:

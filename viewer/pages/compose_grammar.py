@@ -45,83 +45,65 @@ _REPLACED = ("arm", "ee")
 _NO_PART = "none"
 
 
-@dataclass(eq=False)
-class _Writer:
-    """Productions of the grammar that is being written."""
-
-    library: Library
-    productions: dict[str, str] = field(default_factory=dict)
-    """Right sides by symbol."""
-
-    def add(self, name: str, right: str) -> str:
-        """Add a production; return its symbol, which is the name or, if taken, a similar one."""
-        symbol, k = name, 1
-        while self.productions.get(symbol, right) != right or symbol in self.library.names():
-            k += 1
-            symbol = f"{name}{k}"
-        self.productions[symbol] = right
-        return symbol
-
-
 def grammar_around(derivation: Derivation, library: Library) -> str:
     """Return the text of a grammar whose typical robot is that of a derivation.
 
     Parameters have normal distributions about their values within their limits. Arms and
     end-effectors have those of the library with the same ports as alternatives.
     """
-    writer = _Writer(library, {"robot": ""})
-    writer.productions["robot"] = " ".join(_sequence(writer, derivation, "", is_root=True))
-    return "".join(f"{symbol} -> {right}\n" for symbol, right in writer.productions.items())
+    productions = {"robot": ""}
+
+    def add(name: str, right: str) -> str:
+        """Add a production; return its symbol: the name, or a similar one if it is taken."""
+        symbol, k = name, 1
+        while productions.get(symbol, right) != right or symbol in library.names():
+            k += 1
+            symbol = f"{name}{k}"
+        productions[symbol] = right
+        return symbol
+
+    def sequence(node: Derivation, prefix: str) -> list[str]:
+        """Return the items that stand for a part and everything attached to it."""
+        alternatives = _alternatives(node, library, is_root=node is derivation)
+        items, trunk = [add(node.label.removeprefix(prefix), "\n  | ".join(alternatives))], []
+        ports = library.manifest(node.part).ports
+        main = next((port for port in DEFAULT_PORTS if port in ports), "")
+        for port, child in node.children:
+            if port == main:
+                trunk = sequence(child, prefix)
+                continue
+            limb = sequence(child, f"{prefix}{port}_")
+            item = limb[0] if len(limb) == 1 else add(f"{port}_limb", " ".join(limb))
+            items.append(f"{port}:{item}")
+        return items + trunk
+
+    productions["robot"] = " ".join(sequence(derivation, ""))
+    return "".join(f"{symbol} -> {right}\n" for symbol, right in productions.items())
 
 
-def _sequence(
-    writer: _Writer, node: Derivation, prefix: str, *, is_root: bool = False
-) -> list[str]:
-    """Return the items that stand for a part and everything attached to it."""
-    manifest = writer.library.manifest(node.part)
-    alternatives = _alternatives(node, manifest, writer.library, is_root=is_root)
-    items = [writer.add(node.label.removeprefix(prefix), "\n  | ".join(alternatives))]
-    main = next((port for port in DEFAULT_PORTS if port in manifest.ports), "")
-    trunk: list[str] = []
-    for port, child in node.children:
-        if port == main:
-            trunk = _sequence(writer, child, prefix)
-            continue
-        limb = _sequence(writer, child, f"{prefix}{port}_")
-        item = limb[0] if len(limb) == 1 else writer.add(f"{port}_limb", " ".join(limb))
-        items.append(f"{port}:{item}")
-    return items + trunk
-
-
-def _alternatives(
-    node: Derivation, manifest: Manifest, library: Library, *, is_root: bool
-) -> list[str]:
+def _alternatives(node: Derivation, library: Library, *, is_root: bool) -> list[str]:
     """Return a part with distributions about its parameters, and the parts that may replace it."""
-    values = dict(node.parameters)
-    parameters = {
-        name: parameter
+    manifest, values = library.manifest(node.part), dict(node.parameters)
+    arguments = {
+        name: _distribution(values[name], parameter)
         for name, parameter in manifest.parameters.items()
+        # Parameters of a base often concern only ports that are free, such as their distance.
         if not is_root or _has_effect(node, manifest, name, parameter)
     }
-    arguments = {name: _distribution(values[name], p) for name, p in parameters.items()}
     arguments |= {
         name: format_number(value)
         for name, value in values.items()
         if name not in arguments and (name == MOUNT_YAW or name in manifest.parameters)
     }
-    alternatives = [_item(node.part, arguments)]
-    if is_root or manifest.kind not in _REPLACED or node.part == _NO_PART:
-        return alternatives
-    for other in library.manifests():
-        is_fitting = other.kind == manifest.kind and {*other.ports} == {*manifest.ports}
-        if is_fitting and other.name not in (node.part, _NO_PART):
-            alternatives.append(
-                _item(
-                    other.name,
-                    {name: _distribution(p.default, p) for name, p in other.parameters.items()},
-                )
-            )
-    return alternatives
+    items = [_item(node.part, arguments)]
+    if not is_root and manifest.kind in _REPLACED and node.part != _NO_PART:
+        for other in library.manifests(manifest.kind):
+            if {*other.ports} == {*manifest.ports} and other.name not in (node.part, _NO_PART):
+                typical = {
+                    name: _distribution(p.default, p) for name, p in other.parameters.items()
+                }
+                items.append(_item(other.name, typical))
+    return items
 
 
 def _has_effect(node: Derivation, manifest: Manifest, name: str, parameter: Parameter) -> bool:
@@ -358,7 +340,6 @@ def show_grammar(tab: GrammarTab, mode: Mode) -> None:
         typical = make_individual(grammar, session.files.library, {}, tab.name)
         individual, command, state = _make_robot(tab, grammar, typical)
     except (MorphgenError, RecursionError) as error:
-        session.set_status("")
         _update_address(tab, {})
         _show_fault(tab, error)
         return
@@ -384,9 +365,8 @@ def _make_robot(
     note = f"# with the text of the tab Grammar in {name}\n" if is_text else ""
     if tab.mode == "drawn":
         seed, number = tab.seed.value, tab.number.value
-        session.set_status(f"drawing robot {number} of seed {seed}")
-        sample = sample_robot(grammar, library, number, seed=seed)
-        session.set_status("")
+        with session.activity(f"drawing robot {number} of seed {seed}"):
+            sample = sample_robot(grammar, library, number, seed=seed)
         command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
         individual = Individual(sample.robot, sample.derivation, sample.choices)
         return individual, command, {"seed": str(seed), "number": str(number)}

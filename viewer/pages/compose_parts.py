@@ -46,20 +46,6 @@ class PartChoice:
         )
 
 
-@dataclass(frozen=True)
-class Control:
-    """A slider for a parameter."""
-
-    key: str
-    """Slot and parameter, such as ``ee.size``."""
-    label: str
-    low: float
-    high: float
-    step: float
-    default: float
-    hint: str
-
-
 def parse_choice(words: Sequence[str], library: Library) -> PartChoice:
     """Parse words of ``morphgen compose``."""
     parts: dict[str, str] = {}
@@ -122,32 +108,6 @@ def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
     return dict(manifest.parameters if is_base else manifest.attached_parameters)
 
 
-def controls_of(slot: str, manifest: Manifest) -> list[Control]:
-    """Return a slider for every parameter of a part in a slot."""
-    parameters = parameters_of(slot, manifest)
-    return [_control(f"{slot}.{name}", name, parameters[name]) for name in parameters]
-
-
-def node_controls(node: Derivation, library: Library, *, is_root: bool) -> list[Control]:
-    """Return a slider for every parameter of a part of a derivation; the keys are their names."""
-    manifest = library.manifest(node.part)
-    parameters = manifest.parameters if is_root else manifest.attached_parameters
-    used = dict(node.parameters)
-    return [_control(name, name, parameters[name]) for name in parameters if name in used]
-
-
-def _control(key: str, name: str, parameter: Parameter) -> Control:
-    return Control(
-        key,
-        name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
-        parameter.minimum,
-        parameter.maximum,
-        1.0 if parameter.integer else slider_step(parameter.minimum, parameter.maximum),
-        parameter.default,
-        parameter.summary or name,
-    )
-
-
 def choice_of(derivation: Derivation, library: Library) -> PartChoice | None:
     """Return the parts that give a derivation; None if words cannot describe it."""
     words = []
@@ -188,11 +148,11 @@ def with_part(choice: PartChoice, slot: str, part: str, library: Library) -> Par
     return PartChoice(parts, values)
 
 
-def with_value(choice: PartChoice, control: Control, value: float) -> PartChoice:
+def with_value(choice: PartChoice, key: str, value: float, default: float) -> PartChoice:
     """Return the choice with another value of a parameter; default values are left out."""
-    values = {key: other for key, other in choice.values.items() if key != control.key}
-    if abs(value - control.default) > 1e-9:
-        values[control.key] = float(format_number(value))
+    values = {other: number for other, number in choice.values.items() if other != key}
+    if abs(value - default) > 1e-9:
+        values[key] = float(format_number(value))
     return replace(choice, values=values)
 
 
@@ -275,8 +235,9 @@ def _add_slots(tab: PartsTab) -> None:
             if slot != "base":
                 _add_part_dropdown(tab, slot)
             if part := tab.choice.parts.get(slot):
-                for control in controls_of(slot, library.manifest(part, kind_of(slot))):
-                    _add_choice_slider(tab, control)
+                parameters = parameters_of(slot, library.manifest(part, kind_of(slot)))
+                for name, parameter in parameters.items():
+                    _add_choice_slider(tab, f"{slot}.{name}", name, parameter)
 
 
 def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
@@ -287,22 +248,32 @@ def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
     tab.session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
 
 
-def _add_choice_slider(tab: PartsTab, control: Control) -> None:
+def _add_choice_slider(tab: PartsTab, key: str, name: str, parameter: Parameter) -> None:
     def change(value: float) -> None:
-        tab.choice = with_value(tab.choice, control, value)
+        tab.choice = with_value(tab.choice, key, value, parameter.default)
         _show_choice(tab)
 
-    value = tab.choice.values.get(control.key, control.default)
-    _add_slider(tab.session, control, value, control.key, change)
+    value = tab.choice.values.get(key, parameter.default)
+    _add_slider(tab.session, name, parameter, value, key, change)
 
 
 def _add_slider(
-    session: Session, control: Control, value: float, key: str, change: Callable[[float], None]
+    session: Session,
+    name: str,
+    parameter: Parameter,
+    value: float,
+    key: str,
+    change: Callable[[float], None],
 ) -> None:
     """Add the slider of a part's parameter."""
-    low, high = control.low, control.high
+    low, high = parameter.minimum, parameter.maximum
     slider = session.client.gui.add_slider(
-        control.label, low, high, control.step, min(max(value, low), high), hint=control.hint
+        name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
+        low,
+        high,
+        1.0 if parameter.integer else slider_step(low, high),
+        min(max(value, low), high),
+        hint=parameter.summary or name,
     )
     session.on_change(slider, lambda: change(slider.value), key)
 
@@ -343,13 +314,14 @@ def add_parameters_tab(
     with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
         fault = gui.add_html("")
         for node in root.walk():
-            controls = node_controls(node, library, is_root=node is root)
-            if controls:
+            manifest, values = library.manifest(node.part), dict(node.parameters)
+            parameters = manifest.parameters if node is root else manifest.attached_parameters
+            if names := [name for name in parameters if name in values]:
                 with gui.add_folder(part_title(node.label, node.part)):
-                    for control in controls:
-                        key, value = control.key, dict(node.parameters)[control.key]
-                        set_value = functools.partial(change, node.label, key)
-                        _add_slider(session, control, value, f"{node.label}.{key}", set_value)
+                    for name in names:
+                        set_value = functools.partial(change, node.label, name)
+                        key = f"{node.label}.{name}"
+                        _add_slider(session, name, parameters[name], values[name], key, set_value)
     return show
 
 

@@ -505,7 +505,7 @@ def _add_downloads(page: PlayPage) -> None:
     for label, suffix, make in downloads:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
         send = functools.partial(_send, page, suffix, make)
-        session.on_change(button, functools.partial(session.run_in_background, send))
+        session.on_press(button, send)
 
 
 def _send(page: PlayPage, suffix: str, make: Callable[[Episode], bytes]) -> None:
@@ -514,11 +514,9 @@ def _send(page: PlayPage, suffix: str, make: Callable[[Episode], bytes]) -> None
         raise MorphgenError("there is no episode yet")
     episode = snapshot(page.source.episode)
     seconds = episode.num_steps * episode.period
-    page.session.set_status(f"making the {suffix} of {seconds:.2f} s")
-    content = make(episode)
     name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
-    page.session.client.send_file_download(name, content, save_immediately=True)
-    page.session.set_status("")
+    with page.session.activity(f"making the {suffix} of {seconds:.2f} s"):
+        page.session.send_file(name, make(episode))
 
 
 def _description(episode: Episode) -> str:

@@ -310,12 +310,11 @@ def _add_actions(page: PopulationPage) -> None:
         session.choose((*session.chosen, *(row.uri for row in _require_selection(page))))
 
     def export_robots() -> None:
-        uris = [row.uri for row in _require_selection(page)]
-        session.run_in_background(lambda: send_bundles(session, uris))
+        send_bundles(session, [row.uri for row in _require_selection(page)])
 
     session.on_change(select, change_selection)
     session.on_change(choose, choose_robots)
-    session.on_change(export, export_robots)
+    session.on_press(export, export_robots)
 
 
 def _require_selection(page: PopulationPage) -> list[Row]:

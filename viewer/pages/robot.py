@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import shlex
 from collections.abc import Callable
@@ -146,13 +145,12 @@ def _add_links_tab(page: RobotPage) -> None:
 def _check_robot(page: RobotPage) -> None:
     """Show the findings of the checks, and build the self-collision checker."""
     session, redact = page.session, page.session.files.redact
-    session.set_status("checking")
-    findings = list(check(page.robot, tool_required=has_tool(page.robot)))
-    if ":" not in page.uri and (folder := session.files.path(page.uri)).is_dir():
-        findings += file_findings(folder) if (folder / CARD).is_file() else ()
-    session.enqueue(lambda: _show_findings(page, findings))
-    page.texts["findings"].content = markup.framed(markup.findings_table(findings, redact))
-    session.set_status("")
+    with session.activity("checking"):
+        findings = list(check(page.robot, tool_required=has_tool(page.robot)))
+        if ":" not in page.uri and (folder := session.files.path(page.uri)).is_dir():
+            findings += file_findings(folder) if (folder / CARD).is_file() else ()
+        session.enqueue(lambda: _show_findings(page, findings))
+        page.texts["findings"].content = markup.framed(markup.findings_table(findings, redact))
     try:
         page.checker = SelfCollisionChecker(page.robot)
     except MorphgenError as error:
@@ -184,7 +182,7 @@ def _add_downloads_tab(page: RobotPage) -> None:
     with_page = gui.add_checkbox("bundle with a web page", initial_value=False, hint=hint)
     for label, send in downloads:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
-        session.on_change(button, functools.partial(session.run_in_background, send))
+        session.on_press(button, send)
     gui.add_html(markup.framed(markup.command(_command(page))))
 
 
@@ -203,19 +201,17 @@ def _command(page: RobotPage) -> str:
 
 def _send_made(page: RobotPage, suffix: str, make: Callable[..., bytes], option: object) -> None:
     """Send a file that a worker makes of the robot."""
-    page.session.set_status(f"making the {suffix}")
-    _send(page, suffix, page.session.run_in_worker(make, page.robot, option))
-    page.session.set_status("")
+    with page.session.activity(f"making the {suffix}"):
+        _send(page, suffix, page.session.run_in_worker(make, page.robot, option))
 
 
 def _send_bundle(page: RobotPage, *, with_page: bool) -> None:
-    page.session.set_status("packing the bundle")
-    files = page.session.run_in_worker(bundle_files, page.uri, page.session.files)
-    if with_page:
-        files[WEB_PAGE] = page.session.run_in_worker(robot_page, page.robot, page.session.dark)
-    name = page.robot.name or "robot"
-    _send(page, ".zip", zip_files(name, files))
-    page.session.set_status("")
+    session = page.session
+    with session.activity("packing the bundle"):
+        files = session.run_in_worker(bundle_files, page.uri, session.files)
+        if with_page:
+            files[WEB_PAGE] = session.run_in_worker(robot_page, page.robot, session.dark)
+        _send(page, ".zip", zip_files(page.robot.name or "robot", files))
 
 
 def _send_file(page: RobotPage, file: str, suffix: str) -> None:
@@ -237,5 +233,4 @@ def _send_screenshot(page: RobotPage) -> None:
 
 def _send(page: RobotPage, suffix: str, content: bytes) -> None:
     """Send a file to the browser, named after the robot."""
-    name = f"{page.robot.name or 'robot'}{suffix}"
-    page.session.client.send_file_download(name, content, save_immediately=True)
+    page.session.send_file(f"{page.robot.name or 'robot'}{suffix}", content)

@@ -592,10 +592,9 @@ def _fit_primitives(page: RobotPage) -> None:
     robot = with_library_meshes(page.robot, session.files.library)
     primitives, missing = stored_primitives(robot, read_stored_fits(folders))
     if missing:
-        session.set_status(f"fitting primitives to {len(missing)} links; this takes a while")
-        fitted = session.run_in_worker(as_primitives, robot, folders)
+        with session.activity(f"fitting primitives to {len(missing)} links; this takes a while"):
+            fitted = session.run_in_worker(as_primitives, robot, folders)
         primitives = {link.name: link.collisions for link in fitted.links}
-    session.set_status("")
     page.layer_shapes["primitives"] = [primitives.get(link.name, ()) for link in robot.links]
     session.enqueue(lambda: _show_layer(page, "primitives"))
 
@@ -611,9 +610,8 @@ def _toggle_workspace(page: RobotPage, workspace: Workspace, on: bool) -> None:
 
 
 def _sample_workspace(page: RobotPage, workspace: Workspace) -> None:
-    page.session.set_status("sampling the workspace")
-    points = sample_workspace(page.robot)
-    page.session.set_status("")
+    with page.session.activity("sampling the workspace"):
+        points = sample_workspace(page.robot)
     page.session.enqueue(lambda: _show_workspace(page, workspace, points))
 
 

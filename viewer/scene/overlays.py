@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, gaussian_filter
+from scipy.spatial import cKDTree
 
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Box, Geometry
@@ -22,8 +24,8 @@ from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, grown_tri
 
 NUM_POINTS = 200_000
 """Configurations that are sampled for a workspace."""
-_AZIMUTHS, _HEIGHTS = 48, 24
-"""Directions of the shell: steps around the vertical, and steps of the vertical component."""
+_SHELL_SUBDIVISIONS = 3
+"""Subdivisions of the icosahedron whose 642 vertices are the directions of the shell."""
 _CELLS = 48
 """Cells of a slice along the longest side of the workspace."""
 
@@ -47,74 +49,37 @@ def sample_workspace(robot: Robot) -> Array:
 
 
 def shell(points: Array, y_max: float) -> Triangles:
-    """Return the outermost positions by direction from the middle, as far as y is above a limit.
+    """Return the outermost of positions (n, 3) [m] by direction from their middle.
 
-    points: Tool positions, shape (n, 3) [m].
-    y_max: Faces in front of this plane are left out, so that the inside is visible [m].
-
-    Returns:
-        Triangles in the frame of the points; directions without points have none.
+    Faces in front of the plane y = ``y_max`` [m] are left out, so that the inside is visible, and
+    so are directions without positions.
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    offset = points - middle
-    length = np.linalg.norm(offset, axis=1)
-    azimuth = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) % 1
-    height = (offset[:, 2] / np.maximum(length, 1e-9) + 1) / 2
-    column = np.minimum((azimuth * _AZIMUTHS).astype(int), _AZIMUTHS - 1)
-    row = np.minimum((height * _HEIGHTS).astype(int), _HEIGHTS - 1)
-    farthest = np.zeros((_HEIGHTS, _AZIMUTHS))
-    np.maximum.at(farthest, (row, column), length)
-    z = (np.arange(_HEIGHTS) + 0.5) / _HEIGHTS * 2 - 1
-    angle = (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS * 2 * np.pi
-    across = np.sqrt(1 - z**2)[:, None]
-    directions = np.stack(
-        [across * np.cos(angle), across * np.sin(angle), np.tile(z[:, None], _AZIMUTHS)], axis=-1
-    )
-    vertices = np.concatenate(
-        [
-            (middle + farthest[..., None] * directions).reshape(-1, 3),
-            middle + np.array([[0, 0, -1], [0, 0, 1]]) * farthest[[0, -1]].mean(axis=1)[:, None],
-        ]
-    )
-    faces = _grid_faces()
-    known = np.append(farthest.ravel() > 0, farthest[[0, -1]].max(axis=1) > 0)
-    behind = vertices[:, 1] >= y_max
-    faces = faces[(known & behind)[faces].all(axis=1)]
+    ball = trimesh.creation.icosphere(subdivisions=_SHELL_SUBDIVISIONS)
+    length = np.linalg.norm(points - middle, axis=1)
+    _, nearest = cKDTree(ball.vertices).query((points - middle) / np.maximum(length, 1e-9)[:, None])
+    farthest = np.zeros(len(ball.vertices))
+    np.maximum.at(farthest, nearest, length)
+    vertices = middle + farthest[:, None] * ball.vertices
+    is_kept = (farthest > 0) & (vertices[:, 1] >= y_max)
+    faces = ball.faces[is_kept[ball.faces].all(axis=1)]
     return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
 def cut(points: Array, y: float) -> Slice:
-    """Return the cells of a plane that the tool reaches.
-
-    points: Tool positions, shape (n, 3) [m].
-    y: Position of the plane [m].
-    """
+    """Return the cells of the plane y [m] near which some of the tool positions (n, 3) [m] are."""
     low, high = points.min(axis=0), points.max(axis=0)
     side = max(float((high - low).max()), 1e-3) / _CELLS
     near = points[np.abs(points[:, 1] - y) < side]
     shape = np.maximum(np.ceil((high - low) / side).astype(int), 1)[[0, 2]]
-    index = np.minimum(((near - low) / side).astype(int)[:, [0, 2]], shape - 1)
-    count = np.zeros(shape)
-    np.add.at(count, tuple(index.T), 1.0)
-    filled = gaussian_filter(count, 0.8)
+    ends = [(low[k], low[k] + n * side) for k, n in zip((0, 2), shape, strict=True)]
+    count, *_ = np.histogram2d(near[:, 0], near[:, 2], bins=shape, range=ends)
+    filled = gaussian_filter(count, 0.8)  # random samples leave holes
     i, k = np.nonzero(binary_closing(count > 0) | (count > 0))
     centres = np.stack(
         [low[0] + (i + 0.5) * side, np.full(len(i), y), low[2] + (k + 0.5) * side], axis=1
     )
     return Slice(centres, side, filled[i, k] / max(float(filled.max()), 1e-9))
-
-
-def _grid_faces() -> NDArray[np.intp]:
-    """Return the triangles between neighbouring directions, and those at both poles."""
-    index = np.arange(_HEIGHTS * _AZIMUTHS).reshape(_HEIGHTS, _AZIMUTHS)
-    right = np.roll(index, -1, axis=1)
-    quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], axis=-1).reshape(-1, 4)
-    south, north = index.size, index.size + 1
-    poles = [
-        np.stack([right[0], index[0], np.full(_AZIMUTHS, south)], axis=1),
-        np.stack([index[-1], right[-1], np.full(_AZIMUTHS, north)], axis=1),
-    ]
-    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], *poles])
 
 
 TRAIL_LENGTH = 400
