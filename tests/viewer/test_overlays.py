@@ -26,7 +26,7 @@ def ball():
 
 
 def test_the_shell_encloses_the_points(ball):
-    vertices, faces = workspace.shell(ball, -np.inf)
+    vertices, faces = workspace.shell(ball)
     a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
     volume = (a * np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)

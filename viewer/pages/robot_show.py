@@ -42,8 +42,9 @@ from morphgen.viewer.scene.overlays import (
     Overlays,
     remove_overlay,
     sample_workspace,
+    shell,
 )
-from morphgen.viewer.scene.stage import look_at
+from morphgen.viewer.scene.stage import Triangles, look_at
 
 _STEP = 0.01
 """Step of the slice [m]."""
@@ -60,6 +61,8 @@ class Workspace:
     """Position of the slice in the address; anything but a number means zero."""
     points: Array | None = None
     """Tool positions, shape (n, 3) [m]; None until they are sampled."""
+    shell: Triangles | None = None
+    """Shell of these positions."""
 
     def ask(self, position: str) -> None:
         """Remember the position that an address has until the workspace is there."""
@@ -612,6 +615,7 @@ def _toggle_workspace(page: RobotPage, workspace: Workspace, on: bool) -> None:
 def _sample_workspace(page: RobotPage, workspace: Workspace) -> None:
     with page.session.activity("sampling the workspace"):
         points = sample_workspace(page.robot)
+        workspace.shell = shell(points)
     page.session.enqueue(lambda: _show_workspace(page, workspace, points))
 
 
@@ -654,9 +658,10 @@ def _cut_workspace(page: RobotPage) -> None:
     workspace = page.workspace
     if workspace is None or workspace.points is None or not is_on(page, "workspace"):
         return
+    assert workspace.shell is not None  # comes with the points
     with page.session.client.atomic():
         y = workspace.position.value
-        scene_overlays.show_workspace(page.overlays, workspace.points, y)
+        scene_overlays.show_workspace(page.overlays, workspace.points, workspace.shell, y)
     page.session.show_state_later()
 
 

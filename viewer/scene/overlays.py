@@ -48,11 +48,10 @@ def sample_workspace(robot: Robot) -> Array:
     return frame_positions(robot, q.T).T
 
 
-def shell(points: Array, y_max: float) -> Triangles:
+def shell(points: Array) -> Triangles:
     """Return the outermost of positions (n, 3) [m] by direction from their middle.
 
-    Faces in front of the plane y = ``y_max`` [m] are left out, so that the inside is visible, and
-    so are directions without positions.
+    Directions without positions have no faces.
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     ball = trimesh.creation.icosphere(subdivisions=_SHELL_SUBDIVISIONS)
@@ -61,8 +60,7 @@ def shell(points: Array, y_max: float) -> Triangles:
     farthest = np.zeros(len(ball.vertices))
     np.maximum.at(farthest, nearest, length)
     vertices = middle + farthest[:, None] * ball.vertices
-    is_kept = (farthest > 0) & (vertices[:, 1] >= y_max)
-    faces = ball.faces[is_kept[ball.faces].all(axis=1)]
+    faces = ball.faces[(farthest > 0)[ball.faces].all(axis=1)]
     return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
@@ -229,18 +227,18 @@ def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> No
     overlays.nodes["inertia findings"] = nodes
 
 
-def show_workspace(overlays: Overlays, points: Array, y: float) -> None:
-    """Draw the shell of the tool's positions behind a vertical plane, and the slice in it.
+def show_workspace(overlays: Overlays, points: Array, outside: Triangles, y: float) -> None:
+    """Draw the shell of the tool's positions behind a vertical plane at y [m], and the slice in it.
 
-    points: Tool positions, shape (n, 3) [m].
-    y: Position of the plane [m].
+    points: Tool positions, shape (n, 3) [m]; ``outside`` is their shell.
     """
     remove_overlay(overlays, "workspace")
-    view, section = overlays.view, cut(points, y)
+    view, section, (vertices, faces) = overlays.view, cut(points, y), outside
     nodes: list[Any] = [
         view.scene.add_mesh_simple(
             f"{view.name}/workspace",
-            *shell(points, y),
+            vertices,
+            faces[(vertices[:, 1] >= y)[faces].all(axis=1)],
             color=_SHELL,
             opacity=0.22,
             side="double",
