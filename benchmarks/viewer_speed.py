@@ -349,8 +349,8 @@ def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
     from morphgen.viewer.app.app import serve
+    from morphgen.viewer.pages import population as page_population
     from morphgen.viewer.pages import robot_show as page_robot_show
-    from morphgen.viewer.scene import population as scene_population
 
     times: dict[str, list[float]] = {"robot": [], "population": []}
 
@@ -363,10 +363,10 @@ def _serve(told: Path) -> None:
         return call
 
     update_scene = timed(page_robot_show.update_scene, times["robot"])
-    move = timed(scene_population.move, times["population"])
+    move = timed(page_population.move, times["population"])
     with (
         patch.object(page_robot_show, "update_scene", update_scene),
-        patch.object(scene_population, "move", move),
+        patch.object(page_population, "move", move),
     ):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)

@@ -35,9 +35,8 @@ _RED_TO_GREEN = ((224, 49, 49), (250, 200, 30), (47, 158, 68))
 def joint_roles(robot: Robot) -> list[str]:
     """Return the role of every independent joint, in the order of q.
 
-    ``joint 1`` is the first joint on the path from the root to the tool; ``finger 1`` the first
-    that does not move the tool. A joint that moves the tool only through a mimic joint counts as
-    on the path.
+    ``joint 1`` is the first joint on the path from the root to the tool, perhaps through a mimic
+    joint; ``finger 1`` the first that does not move the tool.
     """
     on_path: list[int] = []
     if has_tool(robot):
@@ -114,13 +113,7 @@ def normalized_positions(robot: Robot, q: Array) -> Array:
 
 
 def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
-    """Return a configuration with the joints of some roles moved.
-
-    q: Independent joint positions, shape (dof,) [rad or m].
-
-    Returns:
-        The configuration clipped to the limits, shape (dof,).
-    """
+    """Return a configuration (dof,) with the joints of some roles moved, clipped to the limits."""
     low, high = joint_limits(robot).T
     target = np.array(q, dtype=np.float64)
     for i, role in enumerate(joint_roles(robot)):
@@ -130,10 +123,7 @@ def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
 
 
 def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str, Array]:
-    """Return the similarity of every pair by measure, shape (n, n). Runs in a worker.
-
-    It takes seconds if primitives have to be fitted.
-    """
+    """Return the similarity of every pair by measure, shape (n, n). Runs in a worker."""
     library = Library(folders)
     shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
     # Splits fix the number of links; here the largest robot does.
@@ -165,10 +155,9 @@ def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> s
 
 
 def fit_quality(robot: Robot, folders: Sequence[Path]) -> FitQuality:
-    """Return how well stored primitives replace the collision shapes of links.
+    """Return how well stored primitives replace the collision shapes of links, where there are any.
 
-    A link whose collision shapes are primitives already has IoU 1; a link without stored fit is
-    left out.
+    A link whose collision shapes are primitives already has IoU 1.
     """
     stored = read_stored_fits(folders)
     quality: FitQuality = {}

@@ -86,6 +86,10 @@ class _About:
     bodies: tuple[_Body, ...]
 
 
+_SHARED = ("task", "policy", "seed", "obstacles", "simulator", "period")
+"""Fields of an episode that ``about`` has, in the order of both."""
+
+
 class EpisodeError(MorphgenError):
     """A file is not an episode, or its robot has changed."""
 
@@ -156,34 +160,17 @@ def snapshot(episode: Episode) -> Episode:
     tracks = []
     for track in episode.tracks:
         n = min(track.num_steps, len(track.score))
+        at_moments = {"q": track.q[: n + 1], "block": track.block[: n + 1]}
+        of_steps = {name: getattr(track, name)[:n] for name in ("score", "distance", "success")}
         poses = {name: poses[: n + 1] for name, poses in track.marker_poses.items()}
-        tracks.append(
-            replace(
-                track,
-                q=track.q[: n + 1],
-                block=track.block[: n + 1],
-                marker_poses=poses,
-                score=track.score[:n],
-                distance=track.distance[:n],
-                success=track.success[:n],
-            )
-        )
+        tracks.append(replace(track, marker_poses=poses, **at_moments, **of_steps))
     return replace(episode, tracks=tracks)
 
 
 def episode_bytes(episode: Episode) -> bytes:
     """Return an episode's file; the same episode gives the same bytes."""
-    about = _About(
-        FORMAT,
-        version("morphgen"),
-        episode.task,
-        episode.policy,
-        episode.seed,
-        episode.obstacles,
-        episode.simulator,
-        episode.period,
-        tuple(map(_body, episode.tracks)),
-    )
+    shared = (getattr(episode, name) for name in _SHARED)
+    about = _About(FORMAT, version("morphgen"), *shared, tuple(map(_body, episode.tracks)))
     arrays: dict[str, Any] = {"about": np.array(json.dumps(msgspec.to_builtins(about)))}
     for i, track in enumerate(episode.tracks):
         arrays |= {f"{i}/{name}": values for name, values in _arrays(track).items()}
@@ -213,15 +200,7 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
         msgspec.MsgspecError,
     ) as error:
         raise EpisodeError(f"{path} is not an episode of morphgen view: {error}") from error
-    return Episode(
-        about.task,
-        about.policy,
-        about.seed,
-        about.obstacles,
-        about.simulator,
-        about.period,
-        tracks,
-    )
+    return Episode(*(getattr(about, name) for name in _SHARED), tracks)
 
 
 def _body(track: Track) -> _Body:

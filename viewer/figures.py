@@ -43,11 +43,9 @@ def map_svg(
     uris: Sequence[str],
     pictures: Mapping[str, str],
 ) -> str:
-    """Return a map of robots in the plane; a click on a picture opens the robot.
+    """Return a map of robots at points (n, 2); a click on a picture opens the robot.
 
     Robots move apart where they would cover each other. Their frame and name show their side.
-
-    points: Shape (n, 2).
     """
     low, high = points.min(axis=0), points.max(axis=0)
     span = np.maximum(high - low, 1e-9)
@@ -99,10 +97,7 @@ def spread(points: Array) -> Array:
 
 
 def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:
-    """Return a square for each pair of robots, dark if they are similar; titles have the values.
-
-    values: Shape (n, n).
-    """
+    """Return a square for each pair of robots with its value (n, n), dark if they are similar."""
     n = len(names)
     left, cell = 120.0, (_WIDTH - 120.0) / max(n, 1)
     # Robots compared with themselves would stretch the scale.

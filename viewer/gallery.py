@@ -336,13 +336,7 @@ _PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
 def open_panels(
     gallery: Gallery, breadcrumbs: str, header: str, width: float = CONTROLS_WIDTH
 ) -> viser.PanelHandle:
-    """Open the panel of thumbnails at the left and the panel of controls at the right.
-
-    width: Width of the controls [pixels].
-
-    Returns:
-        The panel at the left.
-    """
+    """Open the panel of controls at the right, and return that of thumbnails at the left."""
     client = gallery.session.client
     gui = client.gui
     gallery.session.open_panel(width, breadcrumbs + (markup.framed(header) if header else ""))

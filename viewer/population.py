@@ -1,4 +1,4 @@
-"""Many robots as arrays, so that a few operations move all of them.
+"""Many robots as arrays, so that a few operations move all of them, and their scene in a browser.
 
 Every visual shape is an instance of a unit box, cylinder or sphere, or of a mesh; a capsule is
 three instances. Arrays over instances are sorted by what they are instances of.
@@ -7,11 +7,13 @@ three instances. Arrays over instances are sorted by what they are instances of.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+import trimesh
+import viser
 from numpy.typing import NDArray
 
 from morphgen.benchmark.split import SIDES, split_id
@@ -23,8 +25,9 @@ from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
 from morphgen.grammar.sampling import robot_name, sample_robot
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import joint_limits, reach
-from morphgen.model.kinematics_torch import KinematicTree, compile_tree
+from morphgen.model.kinematics_torch import KinematicTree, compile_tree, quaternion_from_matrix
 from morphgen.model.kinematics_torch import forward_kinematics as batch_forward_kinematics
+from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
 from morphgen.progress import report
 from morphgen.typing import Array
@@ -42,7 +45,15 @@ from morphgen.viewer.robot_uri import (
     resolve_split,
 )
 from morphgen.viewer.scene.robot import robot_bounds
-from morphgen.viewer.scene.stage import Rgb, shape_colour
+from morphgen.viewer.scene.stage import (
+    SHARP_ANGLE,
+    Rgb,
+    Triangles,
+    batch_colours,
+    mesh_arrays,
+    shape_colour,
+    triangles,
+)
 
 UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
 """Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""
@@ -158,13 +169,7 @@ def make_instances(robots: Sequence[Robot]) -> Instances:
 
 
 def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
-    """Return the pose of every instance in the root frame of its robot.
-
-    q: Independent joint positions, shape (n, J) [rad or m].
-
-    Returns:
-        Shape (m, 4, 4).
-    """
+    """Return the poses (m, 4, 4) of the instances in their robots' root frames at q (n, J)."""
     index = torch.arange(len(population))
     positions = torch.from_numpy(np.ascontiguousarray(q, dtype=np.float32))
     T_root_link = batch_forward_kinematics(population.tree, index, positions).numpy()
@@ -173,13 +178,7 @@ def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
 
 
 def move_roles(population: Population, q: Array, shares: dict[str, float]) -> Array:
-    """Return configurations with the joints of some roles moved.
-
-    q: Independent joint positions, shape (n, J) [rad or m].
-
-    Returns:
-        Shape (n, J).
-    """
+    """Return configurations (n, J) with some roles' joints moved to shares of their ranges."""
     values = np.array([shares.get(role, np.nan) for role in population.roles] + [np.nan])
     share = values[population.role]
     moved = population.lower + share * (population.upper - population.lower)
@@ -202,6 +201,109 @@ def _copies(shape: Shape) -> list[tuple[Prototype, Pose, Array]]:
             return [middle, *((UNIT_SPHERE, end, np.full(3, 2 * radius)) for end in ends)]
         case Mesh() as mesh:
             return [(mesh, pose, np.ones(3))]
+
+
+MAX_FACES = 3000
+"""Largest number of faces of a mesh that is drawn as it is [faces]; larger ones are simplified."""
+MAX_SHADOWS = 300
+"""Largest population that casts shadows [robots]: viser draws shadows up to 20 m from the camera,
+which is nearer than larger ones are seen from, and each would be drawn four times."""
+_CYLINDER_SECTIONS = 24
+_SPHERE_SUBDIVISIONS = 2
+_FADED_SHARE = 0.8
+"""Share of the background's colour in the robots that are not selected, while others are."""
+
+
+@dataclass(eq=False)
+class PopulationScene:
+    """A population in the scene of one browser."""
+
+    client: viser.ClientHandle
+    population: Population
+    handles: Mapping[Prototype, viser.BatchedMeshHandle]
+    positions: Array
+    """Positions of the roots on the ground, shape (n, 2) [m]."""
+    T_world_shape: NDArray[np.float32]
+    """Current pose of every instance, shape (m, 4, 4)."""
+    labels: list[viser.LabelHandle] = field(default_factory=list)
+
+
+def add_population(
+    client: viser.ClientHandle, population: Population, positions: Array, q: Array
+) -> PopulationScene:
+    """Draw a population with its roots at positions (n, 2) [m] and in configurations (n, J)."""
+    instances = population.instances
+    poses = world_poses(population, positions, q)
+    wxyzs = quaternions(poses)
+    handles = {}
+    for number, (prototype, part) in enumerate(instances.prototypes.items()):
+        is_mesh = isinstance(prototype, Mesh)
+        handles[prototype] = client.scene.add_batched_meshes_simple(
+            f"/population/{number}",
+            *surface(prototype),
+            batched_wxyzs=wxyzs[part],
+            batched_positions=poses[part, :3, 3],
+            batched_scales=instances.scale[part],
+            batched_colors=batch_colours(instances.colour[part]),
+            lod="auto" if is_mesh else "off",
+            cast_shadow=len(population) <= MAX_SHADOWS,
+            side="double" if is_mesh else "front",  # some meshes have their faces inside out
+        )
+    return PopulationScene(client, population, handles, positions, poses)
+
+
+def move(scene: PopulationScene, positions: Array, q: Array) -> None:
+    """Move all robots, see ``add_population``; the browser gets all changes in one message."""
+    poses = world_poses(scene.population, positions, q)
+    wxyzs, origins = quaternions(poses), poses[:, :3, 3]
+    with scene.client.atomic():
+        for prototype, part in scene.population.instances.prototypes.items():
+            handle = scene.handles[prototype]
+            handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
+    scene.positions, scene.T_world_shape = positions, poses
+
+
+def fade(scene: PopulationScene, selected: NDArray[np.bool_], background: Rgb) -> None:
+    """Fade the robots that are not in a selection (n,), unless it is empty."""
+    instances = scene.population.instances
+    colours = instances.colour.astype(np.float64)
+    if selected.any():
+        faded = (1 - _FADED_SHARE) * colours + _FADED_SHARE * np.array(background)
+        colours = np.where(selected[instances.robot][:, None], colours, faded)
+    with scene.client.atomic():
+        for prototype, part in instances.prototypes.items():
+            scene.handles[prototype].batched_colors = batch_colours(colours[part])
+
+
+def world_poses(population: Population, positions: Array, q: Array) -> NDArray[np.float32]:
+    """Return the pose of every instance in the world, shape (m, 4, 4); see ``move``."""
+    poses = shape_poses(population, q)
+    poses[:, :2, 3] += positions[population.instances.robot]
+    return poses
+
+
+def quaternions(poses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the rotations of poses (m, 4, 4) as quaternions (w, x, y, z), shape (m, 4)."""
+    return np.asarray(quaternion_from_matrix(torch.from_numpy(poses[:, :3, :3])).numpy())
+
+
+def surface(prototype: Prototype) -> Triangles:
+    """Return the surface of a prototype, simplified because it is drawn many times."""
+    match prototype:
+        case Box():
+            return triangles(prototype)
+        case Sphere(radius):
+            ball = trimesh.creation.icosphere(subdivisions=_SPHERE_SUBDIVISIONS, radius=radius)
+            return mesh_arrays(ball)
+        case Cylinder(radius, length):
+            tube = trimesh.creation.cylinder(radius, length, sections=_CYLINDER_SECTIONS)
+            return mesh_arrays(trimesh.graph.smooth_shade(tube, angle=SHARP_ANGLE))
+        case Mesh() as mesh:
+            loaded = load_mesh(mesh)
+            if len(loaded.faces) <= MAX_FACES:
+                return triangles(mesh)
+            simple = loaded.simplify_quadric_decimation(face_count=MAX_FACES)
+            return mesh_arrays(trimesh.graph.smooth_shade(simple, angle=SHARP_ANGLE))
 
 
 MAX_ROBOTS = 1000
@@ -269,11 +371,7 @@ def find_source(subject: str, files: FileAccess, seed: int, number: int) -> Sour
 def load_population(
     source: Source, files: FileAccess, workers: Workers
 ) -> tuple[Population, list[tuple[str, str]]]:
-    """Read the robots in the workers.
-
-    Returns:
-        The population of all robots that can be read; name and error of each other one.
-    """
+    """Read the robots in the workers; return also the name and error of those that are broken."""
     chunks = [source.rows[i : i + _CHUNK] for i in range(0, len(source.rows), _CHUNK)]
     calls = [
         workers.submit(read_robots, chunk, files, source.grammar, source.seed) for chunk in chunks
@@ -293,9 +391,9 @@ def load_population(
 def read_robots(
     rows: Sequence[Row], files: FileAccess, grammar_name: str = "", seed: int = 0
 ) -> list[ReadRobot | tuple[str, str]]:
-    """Read robots, or sample those of a grammar, and measure what rows lack. Runs in a worker.
+    """Read or sample robots and measure what their rows lack, or return name and error of each.
 
-    A robot that cannot be read gives its name and the error.
+    Runs in a worker.
     """
     grammar = resolve_grammar(grammar_name, files) if grammar_name else None
     results: list[ReadRobot | tuple[str, str]] = []
@@ -337,18 +435,12 @@ class Layout:
 
 
 def grid(home_bounds: Array) -> Layout:
-    """Arrange robots in rows from the far left to the near right, in their order.
-
-    home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
-    """
+    """Arrange robots of bounds (n, 2, 3) in rows from the far left to the near right, in order."""
     return Layout(_rows_of(home_bounds)[0])
 
 
 def rows_by_fact(rows: Sequence[Row], fact: str, home_bounds: Array) -> Layout:
-    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots.
-
-    home_bounds: Bounding boxes of the robots at home, shape (n, 2, 3) [m].
-    """
+    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots."""
     index = {row.uri: i for i, row in enumerate(rows)}
     order = [index[row.uri] for row in sort_rows(rows, fact)]
     places, firsts = _rows_of(home_bounds[order])
@@ -364,15 +456,10 @@ def rows_by_fact(rows: Sequence[Row], fact: str, home_bounds: Array) -> Layout:
 
 
 def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
-    """Return a place for each robot, row by row like words of a text, and each row's first robot.
+    """Return a place (n, 2) [m] for each robot, like words of a text, and each row's first robot.
 
     A robot takes its own width, and a row the depth of most of its robots, so that few large
     robots do not make the others small.
-
-    bounds: Bounding boxes of the robots around their roots, shape (n, 2, 3) [m].
-
-    Returns:
-        Positions of the roots, shape (n, 2) [m], and indices into them.
     """
     size = np.maximum(bounds[:, 1] - bounds[:, 0], 0.01)
     slot = size[:, 0] + _WORD_GAP * np.median(size[:, 0])

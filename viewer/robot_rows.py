@@ -92,10 +92,7 @@ def passes(row: Row, state: Mapping[str, str]) -> bool:
 
 
 def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
-    """Sort rows by a fact; a minus before its name sorts in descending order.
-
-    Rows whose fact is unknown come last either way; ties keep the order of the set.
-    """
+    """Sort rows by a fact, or descending by ``-fact``; unknown last, ties in the set's order."""
     name = key.removeprefix("-")
     if name not in SORTS:
         raise ValueError(f"cannot sort by {name!r}; valid: {', '.join(SORTS)}")
@@ -111,11 +108,7 @@ def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
 
 
 def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:
-    """Return one page of rows.
-
-    Returns:
-        The page's rows, its number, and the number of pages (at least 1).
-    """
+    """Return one page of rows, its number, and the number of pages (at least 1)."""
     count = max(math.ceil(len(rows) / size), 1)
     number = min(max(number, 1), count)
     return list(rows[(number - 1) * size : number * size]), number, count
@@ -257,12 +250,9 @@ def _set_rows(uri: str, folder: Path) -> Iterator[Row]:
             record["name"],
             f"{uri}/{record['name']}",
             grammar,
-            dof=record["dof"],
-            links=record["links"],
-            reach=record["reach"],
-            mass=record["mass"],
             findings=tuple(record["findings"]),
             order=record["index"],
+            **{fact: record[fact] for fact in NUMBERS},
         )
 
 
@@ -272,7 +262,7 @@ def _read_index(folder: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], .
     del stamp
     records = tuple(read_index(folder))
     for record in records:
-        if missing := {"dof", "links", "reach", "mass", "findings"} - record.keys():
+        if missing := {*NUMBERS, "findings"} - record.keys():
             raise UriError(f"{folder / INDEX}: a line has no {', '.join(sorted(missing))}")
     return records
 
@@ -292,12 +282,9 @@ def _bundle_row(uri: str, folder: Path, order: int) -> Row:
             folder.name,
             uri,
             "composed" if "derivation" in card else "imported",
-            dof=card["dof"],
-            links=card["links"],
-            reach=card["reach"],
-            mass=card["mass"],
             findings=tuple(sorted(problems)),
             order=order,
+            **{fact: card[fact] for fact in NUMBERS},
         )
     except (FormatError, OSError, KeyError, TypeError):
         return Row(folder.name, uri, findings=(UNREADABLE,), order=order)

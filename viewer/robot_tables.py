@@ -60,11 +60,6 @@ def part_title(label: str, part: str) -> str:
     return label if label == part else f"{label} ({part})"
 
 
-def short_name(joint: Joint, group: JointGroup) -> str:
-    """Return a joint's name without the label of its group."""
-    return joint.name.removeprefix(f"{group.label}_")
-
-
 def joint_hint(joint: Joint) -> str:
     """Return a joint's kind and limits in a line."""
     position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)

@@ -254,10 +254,8 @@ def with_library_meshes(robot: Robot, library: Library) -> Robot:
 
 
 def content_hash(uri: str, files: FileAccess) -> str:
-    """Return a hash that changes with the robot's description, its parts and morphgen's version.
-
-    Meshes and included xacro files are not looked at: who edits one restarts the viewer.
-    """
+    """Return a hash that changes with the robot's description, its parts and morphgen's version."""
+    # Not with meshes and included xacro files, which takes long: who edits one starts again.
     lines = [_VERSION]
     if derivation := resolve_derivation(uri, files):
         lines += [str(derivation), *_stamps(_part_files(derivation, files.library))]

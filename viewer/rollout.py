@@ -183,11 +183,10 @@ def list_checkpoints(files: FileAccess) -> list[str]:
 
 
 def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
-    """Return what the policy of a checkpoint was trained on.
+    """Return task, obstacles, and names and URIs of the robots of a checkpoint's training.
 
-    Returns:
-        Task of the first robot; whether any robot had obstacles, because then the policy observes
-        them; names and URIs of all robots, or none if they were drawn and their list is missing.
+    It has obstacles if any robot had, because then the policy observes them. There are no robots
+    if they were drawn and their list is missing.
     """
     path = _checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
@@ -319,10 +318,7 @@ class Player:
         self._thread.start()
 
     def load(self, make_source: Callable[[], EpisodeSource], *, start: float | None = None) -> None:
-        """Show another episode; of several that are requested meanwhile, the last.
-
-        start: Time at which it is paused [s]; by default it plays from its beginning.
-        """
+        """Show the episode that was requested last, paused at a time [s] or playing from 0."""
         self._command("load", lambda: self._load(make_source, start))
 
     def play(self) -> None:

@@ -11,7 +11,9 @@ from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Link, Robot
+from morphgen.viewer import population as population_arrays
 from morphgen.viewer.comparison import with_roles
+from morphgen.viewer.pages import population as population_page
 from morphgen.viewer.pages.population import format_selection, parse_selection, selection_text
 from morphgen.viewer.population import (
     ReadRobot,
@@ -19,14 +21,13 @@ from morphgen.viewer.population import (
     grid,
     make_population,
     move_roles,
+    quaternions,
     read_robots,
     rows_by_fact,
     shape_poses,
 )
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
-from morphgen.viewer.scene import population as scene_population
-from morphgen.viewer.scene.population import quaternions
 from morphgen.viewer.scene.robot import robot_bounds
 from morphgen.viewer.scene.stage import View, fit_camera, project_points
 
@@ -200,7 +201,8 @@ def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
-    monkeypatch.setattr(scene_population, "MAX_SHADOWS", 10)
+    for module in (population_arrays, population_page):
+        monkeypatch.setattr(module, "MAX_SHADOWS", 10)
     with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
         client.shows("without shadows: more than 10 robots")
         batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]

@@ -28,12 +28,9 @@ PAGES: Mapping[str, str] = {
 
 
 def load_page(name: str) -> Callable[[Any], None]:
-    """Import and return the function that builds a page for a ``Session``.
-
-    Pages are imported when they are first opened: ``play`` loads PyTorch and the simulators, which
-    takes seconds and much memory.
-    """
+    """Import and return the function that builds a page for a ``Session``."""
     module, _, function = PAGES[name].partition(":")
+    # Only now: ``play`` loads PyTorch and the simulators, which takes seconds and much memory.
     show: Callable[[Any], None] = getattr(import_module(module), function)
     return show
 
@@ -95,11 +92,7 @@ class Address:
 
 
 def parse_address(query: str) -> Address | None:
-    """Parse the query of a URL, with or without its question mark.
-
-    Returns:
-        The address; None if the query is empty, which stands for the viewer's start page.
-    """
+    """Parse the query of a URL; None if it is empty, which stands for the viewer's start page."""
     if len(query) > MAX_QUERY:
         raise AddressError(f"the address has {len(query)} characters; at most {MAX_QUERY} are read")
     # "+" stays a plus sign: addresses write spaces as %20.

@@ -57,10 +57,8 @@ class Viewer:
     workers: Workers
     uploads: TemporaryDirectory[str]
     """Folder of uploads; deleted with the viewer, at the latest when its process ends."""
-    sessions: dict[int, Session] = field(default_factory=dict)
-    """Current sessions of the connected browsers, by viser's client number."""
-    browsers: dict[str, int] = field(default_factory=dict)
-    """Numbers of the browsers by the secret token that their scripts send."""
+    sessions: dict[str, Session] = field(default_factory=dict)
+    """Current sessions of the connected browsers, by the secret token that their scripts send."""
     cache: SharedResults = field(default_factory=SharedResults)
     """Results of slow work that all sessions share."""
 
@@ -111,43 +109,37 @@ def _accept_browsers(viewer: Viewer) -> None:
     """Give every browser that connects a session."""
 
     async def connect(client: viser.ClientHandle) -> None:
-        session = Session(client, viewer.files, viewer.workers, viewer.start, cache=viewer.cache)
-        viewer.sessions[client.client_id] = session
-        MessageFilter(client, lambda reason: _report(viewer, client.client_id, reason))
         token = secrets.token_urlsafe(24)
-        viewer.browsers[token] = client.client_id
+        session = Session(client, viewer.files, viewer.workers, viewer.start, cache=viewer.cache)
+        viewer.sessions[token] = session
+
+        def report(reason: str) -> None:
+            """Show on the browser's page of that time why its message was rejected."""
+            if (current := viewer.sessions.get(token)) is not None:
+                current.report_error(reason)
+
+        MessageFilter(client, report)
         session.enqueue(lambda: open_first_page(session, token))
 
     async def disconnect(client: viser.ClientHandle) -> None:
-        session = viewer.sessions.pop(client.client_id, None)
-        for token in [key for key, number in viewer.browsers.items() if number == client.client_id]:
-            del viewer.browsers[token]
-        if session is not None:
-            session.disconnect()
+        for token, session in list(viewer.sessions.items()):
+            if session.browser is client:
+                del viewer.sessions[token]
+                session.disconnect()
 
     viewer.server.on_client_disconnect(disconnect)
     viewer.server.on_client_connect(connect)
 
 
-def _report(viewer: Viewer, browser: int, reason: str) -> None:
-    """Show on a browser's page why its message was rejected."""
-    if (session := viewer.sessions.get(browser)) is not None:
-        session.report_error(reason)
-
-
 def _receive(viewer: Viewer, token: str, query: str) -> bool:
     """Handle a request of a page's script; return whether the browser is connected.
 
-    The token is secret, so that only the script of a page can change what its browser shows.
-
-    query: An action with its value; ``open`` replaces the page by that of an address, others
-        are actions of the tray. Then the number of the page, whether pages are dark, and the
-        width of the window [pixels].
+    The query has an action with its value: ``open`` replaces the page by that of an address, others
+    are of the page or the tray. Then it has the page's number, the theme and the window's width.
     """
-    browser = viewer.browsers.get(token)
-    session = None if browser is None else viewer.sessions.get(browser)
-    fields = parse_qsl(query, keep_blank_values=True)
-    if browser is None or session is None or not fields:
+    # The token is secret: only the script of a page can change what its browser shows.
+    session, fields = viewer.sessions.get(token), parse_qsl(query, keep_blank_values=True)
+    if session is None or not fields:
         return False
     (action, value), state = fields[0], dict(fields[1:])
     if action != "open":
@@ -158,7 +150,7 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
         dark=bool(state.get("dark")),
         width=parse_count(state.get("width", ""), DEFAULT_WIDTH),
     )
-    viewer.sessions[browser] = following
+    viewer.sessions[token] = following
 
     def find_address() -> None:
         following.address = parse_address(value) or viewer.start

@@ -66,8 +66,7 @@ def call(function: str, *arguments: object) -> str:
 def page_links(address: Address, chosen: Sequence[str]) -> list[tuple[str, Address, bool]]:
     """Return the links of the top bar: label, address, and whether it is the current page.
 
-    A link keeps what the current page is about: from a set's gallery, *Population* leads to the
-    population of the same set. *Compare* and *Playback* take the chosen robots.
+    A link keeps what the current page is about; *Compare* and *Playback* take the chosen robots.
     """
     uri = address.subject if address.page in ("robot", "compare") else ""
     robots = tuple(chosen) or ((uri,) if uri else ())

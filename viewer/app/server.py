@@ -93,9 +93,9 @@ def refusal_reason(policy: AccessPolicy, path: str, headers: Headers) -> str:
             "viewer with --allow-origin and its origin."
         )
     query = parse_qsl(urlsplit(path).query, keep_blank_values=True)
-    named = [value for key, value in query if key in (_FOREIGN_SERVER, _FOREIGN_FILE)]
+    shown = [(key, value) for key, value in query if key in (_FOREIGN_SERVER, _FOREIGN_FILE)]
     # A browser takes the first of several values, other programs the last.
-    if len(named) > 1 or not all(_is_viewer_socket(policy, *pair) for pair in query):
+    if shown and not (len(shown) == 1 and _is_viewer_socket(policy, *shown[0])):
         return f"an address with {_FOREIGN_SERVER}= or {_FOREIGN_FILE}= would show another server."
     return ""
 
@@ -130,10 +130,9 @@ def _is_viewer_name(policy: AccessPolicy, netloc: str) -> bool:
 
 
 def _is_viewer_socket(policy: AccessPolicy, key: str, value: str) -> bool:
-    """Return whether a value of a query shows nothing but this viewer."""
+    """Return whether a value of a query names a server, and this one."""
     server = _split_url(value) if key == _FOREIGN_SERVER else None
-    own = server is not None and _is_viewer_name(policy, server.netloc.lower())
-    return own or key not in (_FOREIGN_SERVER, _FOREIGN_FILE)
+    return server is not None and _is_viewer_name(policy, server.netloc.lower())
 
 
 def _is_allowed_origin(policy: AccessPolicy, origin: str, host: str) -> bool:
@@ -215,20 +214,15 @@ def message_fault(data: object) -> str:
         msgspec.convert(content, message_type)
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
         return f"malformed message: {error}"
-    if message_type is ScenePointer and not _is_gesture(content):
-        return "a click needs a ray and a point, a rectangle needs two points"
+    if message_type is ScenePointer:  # its fields have valid types, but have to fit its gesture
+        rays = (content["ray_origin"], content["ray_direction"])
+        is_click = content["event_type"] == "click"
+        if len(content["screen_pos"]) != (1 if is_click else 2) or (is_click and None in rays):
+            return "a click needs a ray and a point, a rectangle needs two points"
     norm = math.hypot(*content.get("wxyz", (1.0,)))
     if not _all_finite(content.values()) or norm < MIN_QUATERNION_NORM:
         return "a number of the message is not finite, or a quaternion is zero"
     return ""
-
-
-def _is_gesture(content: dict[str, Any]) -> bool:
-    """Return whether the fields of a pointer message, which have valid types, fit its gesture."""
-    points = content["screen_pos"]
-    if content["event_type"] != "click":
-        return len(points) == 2
-    return len(points) == 1 and None not in (content["ray_origin"], content["ray_direction"])
 
 
 class MessageFilter:
@@ -238,30 +232,27 @@ class MessageFilter:
         """Replace viser's handlers of values for controls and of uploads."""
         self._client, self._report = client, report
         self._upload, self._rest = "", 0
-        self._viser = replace_handlers(
-            client,
-            {
-                GuiUpdate: self.update,
-                UploadStart: self.start_upload,
-                UploadPart: self.receive_part,
-            },
-        )
+        own = {
+            GuiUpdate: self.update,
+            UploadStart: self.start_upload,
+            UploadPart: self.receive_part,
+        }
+        self._viser = replace_handlers(client, own)
 
     async def update(self, client_id: Any, message: GuiUpdate) -> None:  # noqa: ANN401
         """Set the value of a control."""
         handle = input_handle(self._client, message.uuid)
         if handle is None:
             return  # a control of the previous page
+        if message.updates.keys() != {"value"}:
+            self._report("a browser may change the value of a control, and nothing else of it")
+            return
         try:
-            if message.updates.keys() != {"value"}:
-                raise MessageError(
-                    "a browser may change the value of a control, and nothing else of it"
-                )
             message.updates = {"value": _valid_value(handle, message.updates["value"])}
         except MessageError as error:
             self._report(str(error))
-            return
-        await self._viser[GuiUpdate](client_id, message)
+        else:
+            await self._viser[GuiUpdate](client_id, message)
 
     def start_upload(self, client_id: Any, message: UploadStart) -> None:  # noqa: ANN401
         """Start an upload; an unfinished one is dropped, so a browser holds at most one."""

@@ -76,11 +76,7 @@ class UploadError(MorphgenError):
 
 
 def store_upload(name: str, content: bytes, files: FileAccess) -> str:
-    """Check and store an upload.
-
-    Returns:
-        The URI of the robot.
-    """
+    """Check and store an upload; return the URI of its robot."""
     if len(content) > MAX_UPLOAD:
         raise UploadError(
             f"{shorten(name)}: {len(content) / 2**20:.0f} MB; at most {MAX_UPLOAD // 2**20} "

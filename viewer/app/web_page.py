@@ -37,10 +37,7 @@ _LABEL_SHARE = 0.08
 
 @contextmanager
 def scene_server() -> Iterator[viser.ViserServer]:
-    """Start a server whose scene can be recorded: viser records only scenes of servers.
-
-    It accepts no request, because it has no name.
-    """
+    """Start a server whose scene can be recorded; having no name, it accepts no request."""
     server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
     try:
         yield server
@@ -49,10 +46,9 @@ def scene_server() -> Iterator[viser.ViserServer]:
 
 
 def robot_page(robot: Robot, dark: bool = False) -> bytes:
-    """Return a web page with a robot on the viewer's stage.
+    """Return a web page with a robot whose joints move through their ranges, one after the other.
 
-    Its joints move through their ranges one after the other, again and again. The page has a slider
-    for the time, and stops with the space bar.
+    The page has a slider for the time, and stops with the space bar.
     """
     robot = split_colours(robot)
     low, high = robot_bounds(robot)
@@ -78,11 +74,7 @@ def robot_page(robot: Robot, dark: bool = False) -> bytes:
 
 
 def joint_sweep(robot: Robot, column: int, n: int) -> Array:
-    """Return configurations in which a joint moves from home to both limits and back.
-
-    Returns:
-        Shape (n, dof) [rad or m].
-    """
+    """Return configurations (n, dof) in which a joint moves from home to both limits and back."""
     home = np.array(robot.home, dtype=np.float64)
     low, high = joint_limits(robot)[column]
     stops = np.array([home[column], low, high, home[column]])
@@ -94,10 +86,7 @@ def joint_sweep(robot: Robot, column: int, n: int) -> Array:
 
 
 def sweep_bounds(robot: Robot) -> tuple[Array, Array]:
-    """Return the lowest and highest corner of a robot while its joints move as the page shows.
-
-    Above it is room for a label.
-    """
+    """Return the corners of a robot while its joints move as the page shows, and of its label."""
     sweeps = [joint_sweep(robot, column, _BOUNDED_STEPS) for column in range(robot.dof)]
     configurations = np.concatenate([np.array(robot.home, dtype=np.float64)[None], *sweeps])
     lows, highs = zip(*(robot_bounds(robot, q) for q in configurations), strict=True)

@@ -302,10 +302,7 @@ def robot_facts(robot: Robot) -> Facts:
 def replace_robot(view: ComposeView, robot: Robot) -> str:
     """Show a robot; the one before it becomes the ghost, unless both belong to one gesture.
 
-    The camera stays, unless the robot leaves the picture.
-
-    Returns:
-        What changed from the ghost to the robot; empty if there is no ghost.
+    Return what changed from the ghost to the robot; an empty text if there is no ghost.
     """
     client = view.session.client
     robot = split_colours(robot)

@@ -81,9 +81,8 @@ def kind_of(slot: str) -> PartKind:
 def slots_of(choice: PartChoice, library: Library) -> list[str]:
     """Return the slots that the chosen parts offer, except the base's own slot.
 
-    Every port of the base takes an arm with an end-effector; an arm with several ports takes an
-    end-effector on each. If there is a main arm, an end-effector on another port of the base needs
-    an arm there.
+    Every port of the base takes an arm with an end-effector on each of the arm's ports. Beside a
+    main arm, an end-effector on another port of the base needs an arm there.
     """
     base = library.manifest(choice.parts["base"], "base")
     arm = choice.parts.get("arm")
@@ -172,11 +171,7 @@ class PartsTab:
 def add_parts_tab(
     session: Session, tabs: viser.GuiTabGroupHandle, choice: PartChoice, show_robot: ShowRobot
 ) -> Callable[[], None]:
-    """Add the tab with a dropdown for the base and the controls of its slots.
-
-    Returns:
-        Function that shows the robot of the chosen parts.
-    """
+    """Add the tab of the base and its slots; return the function that shows the chosen robot."""
     gui = session.client.gui
     with tabs.add_tab("Parts", viser.Icon.PUZZLE):
         fault = gui.add_html("")
@@ -288,11 +283,7 @@ def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
 def add_parameters_tab(
     session: Session, tabs: viser.GuiTabGroupHandle, derivation: Derivation, show_robot: ShowRobot
 ) -> Callable[[], None]:
-    """Add the tab with a folder of sliders for every part of any derivation.
-
-    Returns:
-        Function that shows the robot.
-    """
+    """Add the tab with sliders for every part of any derivation; return what shows the robot."""
     gui, library, root = session.client.gui, session.files.library, derivation
 
     def show() -> None:

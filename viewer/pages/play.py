@@ -117,13 +117,10 @@ def _update(plots: EpisodePlots, episode: Episode) -> None:
 def curves(
     episode: Episode, step: int, scores: list[list[float]]
 ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the data of both charts: time, the robots' curves, and a line at a step.
+    """Return the data of the charts of distance and score: time, the robots' curves, and a line.
 
     uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
-
-    Returns:
-        Data of distance and of score: 2 + R arrays of the length of the episode. Robots whose
-        episode ended earlier keep their last value, because uPlot draws no curve with NaN.
+    Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
     """
     num_steps = max(episode.num_steps, 1)
     time = np.arange(1, num_steps + 1) * episode.period
@@ -230,10 +227,7 @@ def rollout_address(config: RolloutConfig) -> Address:
 
 
 def complete_address(session: Session) -> Robots:
-    """Return the robots that the address's checkpoint was trained on.
-
-    An address without a task gets the task and the obstacles of the training.
-    """
+    """Return the robots of the checkpoint's training; an address without task gets its task."""
     policy = session.address.state.get("policy", "")
     if not policy or is_named(policy):
         return []

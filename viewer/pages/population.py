@@ -19,19 +19,23 @@ from morphgen.viewer.app.session import Session
 from morphgen.viewer.comparison import RoleSliders
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.population import (
+    MAX_SHADOWS,
     NUM_SAMPLED,
     Population,
+    PopulationScene,
     Source,
+    add_population,
+    fade,
     find_source,
     grid,
     load_population,
+    move,
     move_roles,
     rows_by_fact,
 )
 from morphgen.viewer.robot_files import send_bundles
 from morphgen.viewer.robot_rows import UNITS, Row, facts_line
 from morphgen.viewer.robot_uri import UriError
-from morphgen.viewer.scene import population as scene_population
 from morphgen.viewer.scene.stage import (
     add_ground,
     add_scale_bar,
@@ -65,7 +69,7 @@ class PopulationPage:
 
     session: Session
     population: Population
-    scene: scene_population.PopulationScene
+    scene: PopulationScene
     arrange: viser.GuiDropdownHandle[str]
     selected: NDArray[np.bool_]
     """Mask of the selected robots, shape (n,)."""
@@ -127,7 +131,7 @@ def _show_population(
     client, gui = session.client, session.client.gui
     session.set_status("sending the shapes to the browser")
     positions = grid(population.home_bounds).positions
-    scene = scene_population.add_population(client, population, positions, population.home)
+    scene = add_population(client, population, positions, population.home)
     gui.add_html(markup.framed(_summary(source, population, faults)))
     arrange = gui.add_dropdown("Arrange", tuple(ARRANGEMENTS.values()))
     home = gui.add_button("Home", icon=viser.Icon.HOME)
@@ -156,8 +160,8 @@ def _summary(source: Source, population: Population, faults: list[tuple[str, str
     if faults:
         lines = "<br>".join(f"{escape(name)}: {escape(error)}" for name, error in faults[:5])
         text += f"{markup.tag(f'{len(faults)} cannot be read', 'error')}{markup.dim(lines)}"
-    if len(population) > scene_population.MAX_SHADOWS:
-        text += markup.dim(f"without shadows: more than {scene_population.MAX_SHADOWS} robots")
+    if len(population) > MAX_SHADOWS:
+        text += markup.dim(f"without shadows: more than {MAX_SHADOWS} robots")
     return text + markup.dim(
         "Click a robot to select it, with the shift key to add or remove it. Shift and drag "
         "selects a rectangle."
@@ -190,7 +194,7 @@ def _arrange(page: PopulationPage) -> None:
     with client.atomic():
         for handle in scene.labels:
             handle.remove()
-        scene_population.move(scene, layout.positions, _configurations(page))
+        move(scene, layout.positions, _configurations(page))
         scene.labels = [
             client.scene.add_label(f"/labels/{i}", text, position=(*position, 0.0))
             for i, (text, position) in enumerate(layout.labels)
@@ -207,7 +211,7 @@ def _configurations(page: PopulationPage) -> NDArray[np.float64]:
 
 
 def _move(page: PopulationPage) -> None:
-    scene_population.move(page.scene, page.scene.positions, _configurations(page))
+    move(page.scene, page.scene.positions, _configurations(page))
     page.session.show_state_later()
 
 
@@ -256,7 +260,7 @@ def _select(page: PopulationPage, selected: NDArray[np.bool_]) -> None:
 def _show_selection(page: PopulationPage) -> None:
     """Show which robots are selected, in the scene, the panel and the address."""
     background = background_colour(dark=page.session.dark)
-    scene_population.fade(page.scene, page.selected, background)
+    fade(page.scene, page.selected, background)
     page.selection.content = markup.framed(selection_text(page.rows))
     page.session.show_state()
 

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -105,17 +105,13 @@ class RobotPage:
     """Unit of the sliders of rotational joints, ``rad`` or ``deg``."""
     selected: str = ""
     """Name of the selected link; empty if none is."""
-    outline: list[Any] = field(default_factory=list)
-    """Scene nodes of the selected link's outline."""
     range_row: int | None = None
     """Index in q of the joint whose axis and range are drawn."""
-    range_nodes: list[Any] = field(default_factory=list)
-    """Scene nodes of that axis and range."""
     findings: tuple[Finding, ...] = ()
     """Findings of the checks, once they are there."""
     link_choice: viser.GuiDropdownHandle[str] | None = None
-    layer_shapes: dict[scene_robot.Layer, Sequence[Sequence[Shape]]] = field(default_factory=dict)
-    """Shapes by link of the collision layer and the primitives, once they were shown."""
+    primitives: Sequence[Sequence[Shape]] | None = None
+    """Primitives by link; None until they were shown."""
     workspace: Workspace | None = None
     """Controls of the workspace; None for robots without a tool."""
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
@@ -242,12 +238,8 @@ _MAX_TURN = 0.4
 
 def select_link(page: RobotPage, name: str) -> None:
     """Select a link: outline, card and slider; an empty or unknown name selects none."""
-    for node in page.outline:
-        node.remove()
     page.selected = name = name if name in page.robot.link_index else ""
-    page.outline = []
-    if name:
-        page.outline = scene_overlays.draw_outline(page.view, page.robot.link_index[name])
+    scene_overlays.show_outline(page.overlays, page.robot.link_index[name] if name else None)
     if page.link_choice is not None:
         set_value(page.link_choice, name or NO_LINK)
         details = robot_tables.link_details(page.robot, name) if name else ""
@@ -313,13 +305,10 @@ def show_range(page: RobotPage, row: int | None) -> None:
     """Draw the axis and the range of a joint, given by its index in q; None removes them."""
     if row == page.range_row:
         return
+    page.range_row = row
     with page.session.client.atomic():
-        for node in page.range_nodes:
-            node.remove()
-        page.range_row, page.range_nodes = row, []
-        if row is not None:
-            joint = page.robot.independent_joints[row]
-            page.range_nodes = scene_overlays.draw_range(page.view, joint)
+        joint = None if row is None else page.robot.independent_joints[row]
+        scene_overlays.show_range(page.overlays, joint)
 
 
 def connect_links(page: RobotPage) -> None:
@@ -367,11 +356,9 @@ class _LinkDrag:
 
 
 def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, target: Array) -> Array:
-    """Return a configuration in which a point of a link is as near as possible to a target.
+    """Return a configuration (dof,) in which a point of a link is as near as possible to a target.
 
-    q: Configuration, shape (dof,).
-    point: Point in the link's frame, shape (3,) [m].
-    target: Point in the root frame, shape (3,) [m].
+    The point is in the link's frame, the target in the root frame, shape (3,) each [m].
     """
     q, (low, high) = q.copy(), joint_limits(robot)[row]
     column = robot.mimic_map[0][:, row]
@@ -451,7 +438,7 @@ def _add_sliders(page: RobotPage) -> None:
             value = robot_tables.rounded(float(page.q[row]) * scale, step)
             with folder:
                 sliders[row] = gui.add_slider(
-                    robot_tables.short_name(joint, group),
+                    joint.name.removeprefix(f"{group.label}_"),
                     low,
                     max(high, low + 1e-9),  # viser rejects an empty range
                     step,
@@ -483,14 +470,14 @@ def _go_to(page: RobotPage, target: str) -> None:
     set_configuration(page, q)
 
 
-FRAMES, XRAY, GIZMO = "frames", "x-ray", "drag the tool"
+GIZMO = "drag the tool"
 _SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
     "joint axes": scene_overlays.show_joint_axes,
     "centres of mass": scene_overlays.show_mass_centres,
     "ignored pairs": scene_overlays.show_ignored_pairs,
     "names": scene_overlays.show_names,
 }
-TOGGLES = (*scene_robot.LAYERS, XRAY, FRAMES, *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
+TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
 """Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
 TOOL_TOGGLES = ("workspace", "trail", GIZMO)
 """Toggles for robots with a tool only."""
@@ -518,67 +505,61 @@ def add_toggles(page: RobotPage) -> None:
 def apply_toggle(page: RobotPage, name: str) -> None:
     """Show or hide what a toggle stands for."""
     on = page.toggles[name].value
-    layer = next((layer for layer in scene_robot.LAYERS if layer == name), None)
-    if layer is not None:
-        _toggle_layer(page, layer, on)
-    elif name == XRAY:
-        page.view.set_opacity(_XRAY_OPACITY if on else 1.0)
-        _show_visual(page)
-    elif name == FRAMES:
-        page.view.show_axes(on)
-    elif name == GIZMO:
-        _toggle_gizmo(page, on)
-    elif name == "workspace" and page.workspace is not None:
-        _toggle_workspace(page, page.workspace, on)
-    elif not on:
-        remove_overlay(page.overlays, name)
-    elif name in _SHOW_OVERLAY:
-        _SHOW_OVERLAY[name](page.overlays)
+    match name:
+        case "visual" | "x-ray":
+            _show_visual(page)
+        case "collision" | "primitives":
+            _show_layer(page, name)
+        case "inertia":
+            _show_inertia(page)
+        case "frames":
+            page.view.show_axes(on)
+        case "workspace" if page.workspace is not None:
+            _toggle_workspace(page, page.workspace, on)
+        case "drag the tool":
+            _toggle_gizmo(page, on)
+        case _ if not on:
+            remove_overlay(page.overlays, name)
+        case _ if name in _SHOW_OVERLAY:  # the trail appears when the tool moves
+            _SHOW_OVERLAY[name](page.overlays)
     page.session.show_state()
-
-
-def _toggle_layer(page: RobotPage, layer: scene_robot.Layer, on: bool) -> None:
-    if layer == "inertia":
-        _toggle_inertia(page, on)
-    elif layer == "primitives" and on and layer not in page.layer_shapes:
-        page.session.run_in_background(lambda: _fit_primitives(page))
-    elif layer == "visual":
-        _show_visual(page)
-    else:
-        if layer == "collision":
-            page.layer_shapes[layer] = [link.collisions for link in page.robot.links]
-        _show_layer(page, layer)
 
 
 def _has_visual(page: RobotPage) -> bool:
     """Return whether visual shapes are to be seen, solid or transparent."""
-    return is_on(page, "visual") or is_on(page, XRAY)
+    return is_on(page, "visual") or is_on(page, "x-ray")
 
 
 def _show_visual(page: RobotPage) -> None:
-    """Show or hide the visual shapes, and draw the layers beside them exact or a little grown."""
+    """Show the visual shapes as the toggles say, and the layers beside them exact or grown."""
+    page.view.set_opacity(_XRAY_OPACITY if is_on(page, "x-ray") else 1.0)
     page.view.set_visible("visual", _has_visual(page))
-    for layer in page.layer_shapes:
-        _show_layer(page, layer)
+    _show_layer(page, "collision")
+    _show_layer(page, "primitives")
 
 
-def _show_layer(page: RobotPage, layer: scene_robot.Layer) -> None:
+def _show_layer(page: RobotPage, layer: Literal["collision", "primitives"]) -> None:
     """Draw the collision shapes or primitives if they are to be seen, exact or a little grown."""
     if not is_on(page, layer):
         page.view.remove_layer(layer)
-        return
-    growth = _GROWTH * scene_robot.robot_extent(page.robot) if _has_visual(page) else 0.0
-    page.view.show_shapes(layer, page.layer_shapes[layer], growth)
+    elif layer == "primitives" and page.primitives is None:
+        page.session.run_in_background(lambda: _fit_primitives(page), "fit")
+    else:
+        shapes = page.primitives if layer == "primitives" else None
+        growth = _GROWTH * scene_robot.robot_extent(page.robot) if _has_visual(page) else 0.0
+        page.view.show_shapes(
+            layer, shapes or [link.collisions for link in page.robot.links], growth
+        )
 
 
-def _toggle_inertia(page: RobotPage, on: bool) -> None:
+def _show_inertia(page: RobotPage) -> None:
     """Draw the boxes of inertia with the findings about them, or remove both."""
     remove_overlay(page.overlays, "inertia findings")
-    if not on:
+    if is_on(page, "inertia"):
+        page.view.show_inertia()
+        scene_overlays.show_inertia_findings(page.overlays, page.findings)
+    else:
         page.view.remove_layer("inertia")
-        return
-    page.view.show_inertia()
-    scene_overlays.show_inertia_findings(page.overlays, page.findings)
 
 
 def set_findings(page: RobotPage, findings: Sequence[Finding]) -> None:
@@ -598,7 +579,7 @@ def _fit_primitives(page: RobotPage) -> None:
         with session.activity(f"fitting primitives to {len(missing)} links; this takes a while"):
             fitted = session.run_in_worker(as_primitives, robot, folders)
         primitives = {link.name: link.collisions for link in fitted.links}
-    page.layer_shapes["primitives"] = [primitives.get(link.name, ()) for link in robot.links]
+    page.primitives = [primitives.get(link.name, ()) for link in robot.links]
     session.enqueue(lambda: _show_layer(page, "primitives"))
 
 

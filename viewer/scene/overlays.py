@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Box, Geometry
 from morphgen.model.kinematics import frame_positions, random_configurations
-from morphgen.model.robot import Joint, Robot
+from morphgen.model.robot import Joint, Link, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 from morphgen.viewer.scene.robot import RobotView, robot_extent
@@ -113,6 +113,22 @@ def remove_overlay(overlays: Overlays, name: str) -> None:
         overlays.trail.clear()
 
 
+def _centre(link: Link) -> Vec3:
+    """Return a link's centre of mass, or its origin if it has no mass."""
+    return link.inertial.com if link.inertial else (0.0, 0.0, 0.0)
+
+
+def _add_label(view: RobotView, i: int, name: str, text: str) -> Any:  # noqa: ANN401
+    """Write a text at the centre of link i, and return its node."""
+    return view.scene.add_label(
+        f"{view.name}/{i}/{name}",
+        text,
+        font_screen_scale=0.75,
+        position=_centre(view.robot.links[i]),
+        anchor="center-left",
+    )
+
+
 def show_joint_axes(overlays: Overlays) -> None:
     """Draw an arrow along every movable joint's axis: orange rotates, blue slides."""
     view = overlays.view
@@ -148,15 +164,10 @@ def show_mass_centres(overlays: Overlays) -> None:
 
 
 def show_ignored_pairs(overlays: Overlays) -> None:
-    """Draw a line between the links of every pair whose contacts are ignored.
-
-    A line ends at the links' centres of mass, or at their origins for links without inertia.
-    """
+    """Draw a line between the centres of mass of links whose contacts are ignored."""
     remove_overlay(overlays, "ignored pairs")
     view = overlays.view
-    centres = np.array(
-        [link.inertial.com if link.inertial else (0, 0, 0) for link in view.robot.links]
-    )
+    centres = np.array([_centre(link) for link in view.robot.links])
     rotations, origins = view.T_root_link[:, :3, :3], view.T_root_link[:, :3, 3]
     points = np.einsum("nij,nj->ni", rotations, centres) + origins
     index = view.robot.link_index
@@ -173,31 +184,21 @@ def show_ignored_pairs(overlays: Overlays) -> None:
 
 
 def show_names(overlays: Overlays) -> None:
-    """Write the name of every link at its centre of mass, or its origin if it has no mass.
-
-    Links that are close to each other share a label.
-    """
+    """Write the name of every link at its centre of mass; near ones share a label."""
     view = overlays.view
     near = _NAME_DISTANCE * robot_extent(view.robot)
     groups: list[tuple[int, Array, list[str]]] = []
     for i, link in enumerate(view.robot.links):
         T_root_link = view.T_root_link[i]
-        position = T_root_link[:3, :3] @ (link.inertial.com if link.inertial else np.zeros(3))
-        position = position + T_root_link[:3, 3]
+        position = T_root_link[:3, :3] @ _centre(link) + T_root_link[:3, 3]
         group = next((g for g in groups if np.linalg.norm(g[1] - position) < near), None)
         if group is None:
             groups.append((i, position, [link.name]))
         else:
             group[2].append(link.name)
     overlays.nodes["names"] = [
-        view.scene.add_label(
-            f"{view.name}/{i}/name",
-            names[0] if len(names) == 1 else f"{names[0]} + {len(names) - 1}",
-            font_screen_scale=0.75,
-            position=inertial.com if (inertial := view.robot.links[i].inertial) else (0, 0, 0),
-            anchor="center-left",
-        )
-        for i, _, names in groups
+        _add_label(view, i, "name", f"{first} + {len(more)}" if more else first)
+        for i, _, (first, *more) in groups
     ]
 
 
@@ -214,15 +215,8 @@ def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> No
         if not about:
             continue
         colours[link.name] = _AMBER
-        nodes.append(
-            view.scene.add_label(
-                f"{view.name}/{i}/inertia_finding",
-                f"{link.name}: {', '.join(finding.code for finding in about)}",
-                font_screen_scale=0.75,
-                position=link.inertial.com if link.inertial else (0, 0, 0),
-                anchor="center-left",
-            )
-        )
+        text = f"{link.name}: {', '.join(finding.code for finding in about)}"
+        nodes.append(_add_label(view, i, "inertia_finding", text))
     view.paint("inertia", colours)
     overlays.nodes["inertia findings"] = nodes
 
@@ -305,11 +299,15 @@ def outline_triangles(geometry: Geometry, thickness: float) -> Triangles:
     return vertices, np.ascontiguousarray(faces[:, ::-1])
 
 
-def draw_outline(view: RobotView, link: int) -> list[Any]:
-    """Draw the outline of a link's visual shapes; return its scene nodes."""
+def show_outline(overlays: Overlays, link: int | None) -> None:
+    """Draw the outline of a link's visual shapes; without a link, of none."""
+    remove_overlay(overlays, "outline")
+    if link is None:
+        return
+    view = overlays.view
     thickness = _OUTLINE * robot_extent(view.robot)
     shapes = view.robot.links[link].visuals or view.robot.links[link].collisions
-    return [
+    overlays.nodes["outline"] = [
         view.scene.add_mesh_simple(
             f"{view.name}/{link}/outline{i}",
             *outline_triangles(shape.geometry, thickness),
@@ -325,11 +323,12 @@ def draw_outline(view: RobotView, link: int) -> list[Any]:
     ]
 
 
-def draw_range(view: RobotView, index: int) -> list[Any]:
-    """Draw the axis and the range of a joint with a needle at its position; return the nodes.
-
-    The range is fixed to the parent link and the needle to the child, so both follow the robot.
-    """
+def show_range(overlays: Overlays, index: int | None) -> None:
+    """Draw the axis and range of a joint on its parent link, and a needle on its child link."""
+    remove_overlay(overlays, "range")
+    if index is None:
+        return
+    view = overlays.view
     robot, joint = view.robot, view.robot.joints[index]
     parent, child = robot.parents[index + 1], index + 1
     size = _RADIUS * robot_extent(robot)
@@ -347,7 +346,7 @@ def draw_range(view: RobotView, index: int) -> list[Any]:
             wxyz=T_parent_joint.quaternion if at else (1.0, 0.0, 0.0, 0.0),
         )
 
-    return [
+    overlays.nodes["range"] = [
         add("range", parent, tracks, RANGE, 4.0, at=True),
         add("range_axis", parent, axis, RANGE, 2.0, at=True),
         add("range_needle", child, needle, SELECTED, 5.0, at=False),
@@ -355,13 +354,9 @@ def draw_range(view: RobotView, index: int) -> list[Any]:
 
 
 def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Array, Array]:
-    """Return the lines that show a joint's range.
+    """Return lines (n, 2, 3) [m] of a needle in the child's frame, and of a joint's range and axis.
 
-    size: Radius of the arc, and half the length of the axis [m].
-
-    Returns:
-        Lines of the needle in the child's frame, and of the range and the axis in the joint's frame
-        at position zero, each of shape (n, 2, 3) [m].
+    These two are in the joint's frame at position zero. ``size`` is the radius of the arc [m].
     """
     axis, side = np.array(joint.unit_axis), np.array(direction)
     low, high = joint.effective_limits

@@ -83,11 +83,9 @@ class RobotView:
     def show_shapes(
         self, layer: Layer, shapes: Sequence[Sequence[Shape]], growth: float = 0.0
     ) -> None:
-        """Draw shapes, given by link, in a layer; they replace the layer's previous shapes.
+        """Draw shapes, given by link, in place of a layer's previous ones.
 
-        shapes: Shapes of each link.
-        growth: Distance by which surfaces are moved outwards [m], so that they do not coincide
-            with those of another layer.
+        Surfaces are moved outwards by ``growth`` [m], so that they do not coincide with others.
         """
         self.remove_layer(layer)
         self.layers[layer] = [
@@ -172,10 +170,7 @@ def add_robot(
     name: str,
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> RobotView:
-    """Draw a robot's visual shapes at its home configuration.
-
-    position: Position of its root [m].
-    """
+    """Draw a robot's visual shapes at its home configuration, its root at a position [m]."""
     base = scene.add_frame(name, show_axes=False, position=position)
     length = 0.12 * robot_extent(robot)
     links = [
@@ -195,10 +190,7 @@ def add_robot(
 
 
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
-    """Return the lowest and highest corner of a robot in its root frame [m].
-
-    q: Configuration, shape (dof,); the home configuration by default.
-    """
+    """Return the lowest and highest corner of a robot in its root frame, by default at home [m]."""
     T_root_link = forward_kinematics(robot, robot.home if q is None else q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
@@ -286,12 +278,7 @@ def remove_offspring(scene: OffspringScene) -> None:
 
 
 def hit_robot(boxes: Array, origin: Array, direction: Array) -> int | None:
-    """Return the index of the nearest box that a ray meets; None if it meets none.
-
-    boxes: Lowest and highest corners, shape (n, 2, 3) [m].
-    origin: Start of the ray, shape (3,) [m].
-    direction: Direction of the ray, shape (3,).
-    """
+    """Return the index of the nearest box of (n, 2, 3) that a ray meets; None without one."""
     safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
     distances = (boxes - origin) / safe
     near = distances.min(axis=1).max(axis=1)

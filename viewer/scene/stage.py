@@ -41,10 +41,8 @@ def shape_colour(shape: Shape) -> Rgb:
 
 
 def batch_colours(colours: ArrayLike) -> NDArray[np.uint8]:
-    """Return colours (n, 3) for batched meshes, which viser takes as linear, not as sRGB.
-
-    The transfer function is that of IEC 61966-2-1.
-    """
+    """Return colours (n, 3) for batched meshes, which viser takes as linear, not as sRGB."""
+    # The transfer function is that of IEC 61966-2-1.
     share = np.asarray(colours, dtype=np.float64) / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.asarray(np.round(255 * linear), dtype=np.uint8)
@@ -67,21 +65,20 @@ def grown_triangles(geometry: Geometry, thickness: float) -> Triangles:
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     if mesh.volume < 0:  # its faces are inside out
         mesh.invert()
-    return _triangles(mesh.vertices + thickness * mesh.vertex_normals, mesh.faces)
+    mesh.vertices = mesh.vertices + thickness * mesh.vertex_normals
+    return mesh_arrays(mesh)
 
 
 def inertia_box(inertial: Inertial) -> tuple[Array, Array] | None:
-    """Return the solid box with a link's mass and inertia.
+    """Return the sides (3,) [m] of the solid box with a link's mass and inertia, and its axes.
 
-    A box with sides a, b, c has I_a = m (b^2 + c^2) / 12, and likewise I_b and I_c; the sum of all
-    three gives a^2 = 6 / m (I_a + I_b + I_c - 2 I_a).
-
-    Returns:
-        Sides (3,) [m], and their directions in the link frame as columns (3, 3). None for a
-        massless link, or if no rigid body has such an inertia.
+    The axes are columns (3, 3) in the link frame. None for a massless link, or if no rigid body has
+    such an inertia.
     """
     if inertial.mass <= 0:
         return None
+    # A box with sides a, b, c has I_a = m (b^2 + c^2) / 12, and likewise I_b and I_c; the sum of
+    # all three gives a^2 = 6 / m (I_a + I_b + I_c - 2 I_a).
     moments, axes = np.linalg.eigh(inertial.matrix)
     squares = 6 / inertial.mass * (moments.sum() - 2 * moments)
     if (squares < -1e-9).any() or not (squares > 0).any():
@@ -97,7 +94,7 @@ def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
     del mesh
     if len(loaded.faces) <= _MAX_SMOOTHED_FACES:
         loaded = trimesh.graph.smooth_shade(loaded, angle=SHARP_ANGLE)
-    return _triangles(loaded.vertices, loaded.faces)
+    return mesh_arrays(loaded)
 
 
 @lru_cache(maxsize=1024)
@@ -106,11 +103,12 @@ def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangl
     mesh = solid_mesh(geometry)
     if isinstance(geometry, Box | Cylinder):
         mesh = trimesh.graph.smooth_shade(mesh, angle=SHARP_ANGLE)
-    return _triangles(mesh.vertices, mesh.faces)
+    return mesh_arrays(mesh)
 
 
-def _triangles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Triangles:
-    return np.asarray(vertices, dtype=np.float32), np.asarray(faces, dtype=np.uint32)
+def mesh_arrays(mesh: trimesh.Trimesh) -> Triangles:
+    """Return the vertices and faces of a mesh in the types that viser sends."""
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
 
 
 BRAND: Rgb = (24, 100, 171)
@@ -172,11 +170,7 @@ def background_colour(*, dark: bool) -> Rgb:
 
 
 def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
-    """Draw an endless grid that fades with the distance, cells of 10 cm or, if large, of 1 m.
-
-    size: Size of what stands on it [m].
-    height: Height of the ground [m].
-    """
+    """Draw an endless grid at a height [m]; its cells have 10 cm or, below a large size, 1 m."""
     cell = 0.1 if size < 8 else 1.0
     scene.add_grid(
         "/ground",
@@ -197,11 +191,7 @@ def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
 def add_scale_bar(
     scene: viser.SceneApi, low: Array, high: Array, direction: tuple[float, float, float]
 ) -> None:
-    """Draw a bar on the ground in front of a box, of a length that fits: 0.1, 0.2, 0.5, 1, ... m.
-
-    low: Lowest corner of the box, shape (3,) [m].
-    high: Highest corner of the box, shape (3,) [m].
-    """
+    """Draw a bar of 0.1, 0.2, 0.5, 1, ... m, as fits, on the ground in front of a box."""
     extent = max(float((high - low).max()), MIN_EXTENT)  # a robot without shapes is a point
     length = bar_length(0.3 * extent)
     width, gap = 0.04 * length + 0.006 * extent, 0.08 * extent
@@ -291,11 +281,7 @@ def place_camera(
     direction: tuple[float, float, float] = CAMERA_DIRECTION,
     aspect: float = _MAX_ASPECT,
 ) -> None:
-    """Point a camera at a box; see ``look_at``.
-
-    low: Lowest corner of the box, shape (3,) [m].
-    high: Highest corner of the box, shape (3,) [m].
-    """
+    """Point a camera at a box with corners (3,) [m]; see ``look_at``."""
     forward = -np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -311,18 +297,13 @@ def place_camera(
 
 
 def fit_camera(points: Array, tangents: Array) -> Array:
-    """Return the foremost camera, centred on points, that has all of them in its picture.
+    """Return the foremost camera, centred on points (n, 3), that has all of them in its picture.
 
-    A point is in the picture if its offset from the camera across and up is at most its distance
-    times a tangent. Each axis of the picture gives two such bounds, on the farthest points to both
-    sides; the camera's offset is between them, and the stricter axis decides its distance.
-
-    points: Points in the camera's axes: right, up, forward, shape (n, 3) [m].
-    tangents: Largest offset per distance to the right and up, shape (2,).
-
-    Returns:
-        Position of the camera in its axes, shape (3,) [m].
+    All are in the camera's axes: right, up, forward [m]. A point is in the picture if its offset
+    from the camera to the right and up is at most its distance times the tangents (2,).
     """
+    # Each axis has two such bounds, on the farthest points to both sides. The camera's offset is
+    # between them, and the stricter axis decides its distance.
     after = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
     before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
     forward = float((-(after + before) / (2 * tangents)).min())
@@ -356,13 +337,9 @@ def camera_view(client: viser.ClientHandle) -> View:
 
 
 def project_points(view: View, points: Array) -> tuple[Array, Array]:
-    """Project points of the world.
+    """Return where points (..., 3) of the world are in the picture (..., 2), and their depths [m].
 
-    points: Shape (..., 3) [m].
-
-    Returns:
-        Points of the picture, shape (..., 2), and depths, shape (...) [m]; points behind the camera
-        have a depth below 0 and meaningless coordinates.
+    Points behind the camera have a depth below 0 and meaningless coordinates.
     """
     local = (points - view.position) @ view.R_world_camera
     depth = local[..., 2]
