@@ -350,7 +350,7 @@ def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
     from morphgen.viewer.app.app import serve
     from morphgen.viewer.pages import population as page_population
-    from morphgen.viewer.pages import robot_show as page_robot_show
+    from morphgen.viewer.pages import robot as page_robot
 
     times: dict[str, list[float]] = {"robot": [], "population": []}
 
@@ -362,10 +362,10 @@ def _serve(told: Path) -> None:
 
         return call
 
-    update_scene = timed(page_robot_show.update_scene, times["robot"])
+    update_scene = timed(page_robot.update_scene, times["robot"])
     move = timed(page_population.move, times["population"])
     with (
-        patch.object(page_robot_show, "update_scene", update_scene),
+        patch.object(page_robot, "update_scene", update_scene),
         patch.object(page_population, "move", move),
     ):
         viewer = serve()

@@ -223,8 +223,6 @@ class PopulationScene:
     handles: Mapping[Prototype, viser.BatchedMeshHandle]
     positions: Array
     """Positions of the roots on the ground, shape (n, 2) [m]."""
-    T_world_shape: NDArray[np.float32]
-    """Current pose of every instance, shape (m, 4, 4)."""
     labels: list[viser.LabelHandle] = field(default_factory=list)
 
 
@@ -249,7 +247,7 @@ def add_population(
             cast_shadow=len(population) <= MAX_SHADOWS,
             side="double" if is_mesh else "front",  # some meshes have their faces inside out
         )
-    return PopulationScene(client, population, handles, positions, poses)
+    return PopulationScene(client, population, handles, positions)
 
 
 def move(scene: PopulationScene, positions: Array, q: Array) -> None:
@@ -260,7 +258,7 @@ def move(scene: PopulationScene, positions: Array, q: Array) -> None:
         for prototype, part in scene.population.instances.prototypes.items():
             handle = scene.handles[prototype]
             handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
-    scene.positions, scene.T_world_shape = positions, poses
+    scene.positions = positions
 
 
 def fade(scene: PopulationScene, selected: NDArray[np.bool_], background: Rgb) -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.model.kinematics import frame_pose
-from morphgen.viewer.pages.robot_show import format_joints
+from morphgen.viewer.pages.robot import format_joints
 from morphgen.viewer.robot_uri import read_robot_uri
 from morphgen.viewer.scene.robot import RED
 

@@ -12,7 +12,7 @@ from morphgen.model.findings import Finding
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Inertial
 from morphgen.model.rotation import to_matrix
-from morphgen.viewer.pages.robot_show import (
+from morphgen.viewer.pages.robot import (
     format_joints,
     free_configuration,
     joint_of_link,

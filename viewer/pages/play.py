@@ -75,23 +75,19 @@ def start_plots(plots: EpisodePlots, episode: Episode) -> None:
     """Replace the charts by those of a new episode."""
     clear_plots(plots)
     plots.step, plots.scores = 0, [[] for _ in episode.tracks]
-    names = [track.robot.name for track in episode.tracks]
-    target = TASKS[episode.task].target
-    dark = plots.session.dark
-    with plots.folder:
-        for label, data in zip(
-            (f"m from {target}", "score so far"), curves(episode, 0, plots.scores), strict=True
-        ):
-            plots.charts.append(
-                plots.session.client.gui.add_uplot(
-                    data,
-                    _series(names),
-                    axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
-                    scales={"x": uplot.Scale(time=False)},
-                    legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
-                    height=_HEIGHT,
-                )
+    names, dark = [track.robot.name for track in episode.tracks], plots.session.dark
+    labels = (f"m from {TASKS[episode.task].target}", "score so far")
+    for label, data in zip(labels, curves(episode, 0, plots.scores), strict=True):
+        with plots.folder:
+            chart = plots.session.client.gui.add_uplot(
+                data,
+                _series(names),
+                axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
+                scales={"x": uplot.Scale(time=False)},
+                legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
+                height=_HEIGHT,
             )
+        plots.charts.append(chart)
 
 
 def clear_plots(plots: EpisodePlots) -> None:
@@ -104,14 +100,14 @@ def clear_plots(plots: EpisodePlots) -> None:
 def show_plots(plots: EpisodePlots, episode: Episode, step: int) -> None:
     """Update the charts to what is simulated and shown, at most every ``PLOT_INTERVAL``."""
     plots.step = step
-    plots.session.call_later(PLOT_INTERVAL, lambda: _update(plots, episode), "plots")
 
+    def update() -> None:
+        if len(plots.scores) == len(episode.tracks):  # no other episode has begun meanwhile
+            data = curves(episode, plots.step, plots.scores)
+            for chart, values in zip(plots.charts, data, strict=False):  # none after a failure
+                chart.data = values
 
-def _update(plots: EpisodePlots, episode: Episode) -> None:
-    if len(plots.scores) != len(episode.tracks):  # another episode has begun meanwhile
-        return
-    for chart, data in zip(plots.charts, curves(episode, plots.step, plots.scores), strict=False):
-        chart.data = data
+    plots.session.call_later(PLOT_INTERVAL, update, "plots")
 
 
 def curves(
@@ -182,13 +178,17 @@ class RolloutControls:
     """Controls of a rollout in one browser."""
 
     session: Session
-    config: RolloutConfig
-    """Config of the rollout that the page shows."""
-    trained_on: Robots
-    """Robots that the policy was trained on."""
+    robots: tuple[str, ...]
+    """URIs of the robots."""
     start: Callable[[RolloutConfig], object]
     """Starts a rollout."""
     handles: dict[str, Any] = field(default_factory=dict)
+    """Controls by the field of ``RolloutConfig``."""
+
+    def restart(self) -> None:
+        """Start an episode with what the controls say."""
+        values = {name: handle.value for name, handle in self.handles.items()}
+        self.start(RolloutConfig(robots=self.robots, **values))
 
 
 def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
@@ -238,69 +238,62 @@ def complete_address(session: Session) -> Robots:
     return robots
 
 
-def add_rollout_controls(controls: RolloutControls) -> None:
-    """Add the controls to the page."""
+def add_rollout_controls(
+    controls: RolloutControls, config: RolloutConfig, trained_on: Robots
+) -> None:
+    """Add the controls in the state of a config to the page."""
     gui, session, handles = controls.session.client.gui, controls.session, controls.handles
-    config = controls.config
-    restart = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
+    next_one = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
     with gui.add_folder("Task"):
         handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
-        policies = _policies(session.files, config)
+        policies = _policies(session.files, config.task, config.policy)
         handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
         handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
         handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
         names = tuple(simulators())
         handles["simulator"] = gui.add_dropdown("simulator", names, initial_value=config.simulator)
     with gui.add_folder("Robots"):
-        trained_on = {"trained on": lambda: controls.trained_on} if controls.trained_on else {}
-        lists = robot_lists(config.robots[0], session.files, trained_on)
-        picker = add_picker(session, lists, lambda: controls.config.robots[0])
+        first = {"trained on": lambda: trained_on} if trained_on else {}
+        lists = robot_lists(config.robots[0], session.files, first)
+        picker = add_picker(session, lists, lambda: controls.robots[0])
         action = gui.add_button_group("this robot", ACTIONS)
-    session.on_change(restart, lambda: _change(controls, seed=controls.config.seed + 1))
+
+    def start_next() -> None:
+        set_value(handles["seed"], handles["seed"].value + 1)
+        controls.restart()
+
+    session.on_change(next_one, start_next)
     session.on_change(handles["task"], lambda: _change_task(controls))
-
-    def apply(name: str) -> None:
-        _change(controls, **{name: handles[name].value})
-
     for name in ("policy", "obstacles", "seed", "simulator"):
-        session.on_change(handles[name], functools.partial(apply, name), name)
+        session.on_change(handles[name], controls.restart, name)
     session.on_change(picker.robot, lambda: _use_robot(controls, picked_uri(picker), "replace"))
     session.on_change(action, lambda: _use_robot(controls, picked_uri(picker), action.value))
 
 
-def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
-    """Return the task's baselines and shipped policies, and the checkpoints in this folder."""
-    names = (*policies_for(config.task), *list_checkpoints(files), config.policy)
-    return tuple(dict.fromkeys(names))
+def _policies(files: FileAccess, task: str, policy: str) -> tuple[str, ...]:
+    """Return the task's baselines and shipped policies, the folder's checkpoints and the policy."""
+    return tuple(dict.fromkeys((*policies_for(task), *list_checkpoints(files), policy)))
 
 
 def _use_robot(controls: RolloutControls, uri: str, action: str) -> None:
     """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
-    robots = controls.config.robots
-    if action == "add":
-        if len(robots) >= MAX_PLAYED:
-            raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
-        _change(controls, robots=(*robots, uri))
-    else:
-        _change(controls, robots=(uri, *(robots[1:] if action == "replace" else ())))
+    robots = controls.robots
+    if action == "add" and len(robots) >= MAX_PLAYED:
+        raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
+    kept = {"add": robots, "replace": robots[1:], "only": ()}[action]
+    controls.robots = (*kept, uri) if action == "add" else (uri, *kept)
+    controls.restart()
 
 
 def _change_task(controls: RolloutControls) -> None:
     """Start another task, with its own baseline if the current one is for the other task."""
-    config = replace(controls.config, task=controls.handles["task"].value)
-    if is_named(config.policy) and config.policy not in policies_for(config.task):
-        config = replace(config, policy=baselines_for(config.task)[0])
-    controls.handles["policy"].options = _policies(controls.session.files, config)
-    controls.handles["policy"].value = config.policy
-    _change(controls, task=config.task, policy=config.policy)
-
-
-def _change(controls: RolloutControls, **changes: Any) -> None:  # noqa: ANN401
-    """Start an episode with another config."""
-    controls.config = replace(controls.config, **changes)
-    if controls.handles["seed"].value != controls.config.seed:
-        controls.handles["seed"].value = controls.config.seed
-    controls.start(controls.config)
+    task, dropdown = controls.handles["task"].value, controls.handles["policy"]
+    policy = dropdown.value
+    if is_named(policy) and policy not in policies_for(task):
+        policy = baselines_for(task)[0]
+    dropdown.options = _policies(controls.session.files, task, policy)
+    dropdown.value = policy
+    controls.restart()
 
 
 PANEL_WIDTH = 400.0
@@ -417,7 +410,7 @@ def show(session: Session) -> None:
             session.show_address(f"{config.task} {uri_name(config.robots[0])}")
             player.load(lambda: Rollout(config, session.files, session.set_status), start=paused_at)
 
-        add_rollout_controls(RolloutControls(session, config, trained_on, start))
+        add_rollout_controls(RolloutControls(session, config.robots, start), config, trained_on)
         start(config, paused_at)
     with gui.add_folder("Get"):
         _add_downloads(page)
