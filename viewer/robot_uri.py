@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -258,21 +257,14 @@ def content_hash(uri: str, files: FileAccess) -> str:
     # Not with meshes and included xacro files, which takes long: who edits one starts again.
     lines = [_VERSION]
     if derivation := resolve_derivation(uri, files):
-        lines += [str(derivation), *_stamps(_part_files(derivation, files.library))]
+        lines.append(str(derivation))
+        manifests = [files.library.manifest(node.part) for node in derivation.walk()]
+        paths = [path for manifest in manifests for path in (manifest.path, manifest.source)]
     else:
         path = files.path(uri)
-        parts = (path / URDF, path / MJCF, path / CARD) if path.is_dir() else (path,)
-        lines += [str(path.resolve()), *_stamps(parts)]
+        lines.append(str(path.resolve()))
+        paths = [path / URDF, path / MJCF, path / CARD] if path.is_dir() else [path]
+    # Sources that are no paths are files of installed packages, which change with their version.
+    stamped = sorted({path for path in paths if isinstance(path, Path)})
+    lines += [f"{path} {file_stamp(path)}" for path in stamped]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
-
-
-def _part_files(derivation: Derivation, library: Library) -> Iterable[Path]:
-    for part in {node.part for node in derivation.walk()}:
-        manifest = library.manifest(part)
-        yield manifest.path
-        if isinstance(manifest.source, Path):
-            yield manifest.source
-
-
-def _stamps(paths: Iterable[Path]) -> list[str]:
-    return [f"{path} {file_stamp(path)}" for path in sorted(set(paths))]

@@ -206,9 +206,10 @@ def add_split_form(
 
         def compose_sides() -> Sides:
             """Compose the robots in the worker processes."""
+            files, workers = session.files, session.workers
             with session.activity("composing {} robots"):
                 train, test = (
-                    make_members(rows, task.value, obstacles.value, session.files, session.workers)
+                    make_members(rows, task.value, obstacles.value, files, workers)
                     for rows in choose_sides()
                 )
             return train, test

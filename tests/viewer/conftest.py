@@ -4,7 +4,6 @@ import os
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -139,16 +138,6 @@ def _pages(browser):
     yield open_page
     for context in contexts:
         context.close()
-
-
-@pytest.fixture
-def control():
-    """Find viser's controls in a page by their labels."""
-
-    def labelled(page, label):
-        return page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]//input")
-
-    return SimpleNamespace(input=labelled)
 
 
 @pytest.fixture

@@ -5,28 +5,11 @@ import re
 import numpy as np
 import pytest
 
+from helpers.pages import choose, field, nodes, press
 from morphgen.formats.bundle import read_bundle
 from morphgen.viewer.scene.stage import camera_view, project_points
 
 pytestmark = pytest.mark.slow
-
-
-def choose(page, label, option, nth=0):
-    field = page.get_by_text(label, exact=True).nth(nth)
-    field.locator("xpath=ancestor::*[.//input][1]//input").first.click()
-    page.get_by_role("option", name=option, exact=True).click()
-
-
-def test_chosen_parts_become_compose_arguments(see, picture):
-    page = see("?compose=arm=arm3 ee=plane")
-    page.get_by_text(re.compile("5 DoF|6 DoF")).first.wait_for()
-    slider = page.get_by_text("length (m)", exact=True)
-    slider.locator("xpath=ancestor::*[.//input][1]//input").last.fill("0.45")
-    page.wait_for_url(re.compile(r"arm\.length=0\.45"))
-    page.get_by_role("tab", name="Get").click()
-    page.get_by_text("morphgen compose base=fixed arm=arm3 ee=plane arm.length=0.45").wait_for()
-    picture(page)
-    assert page.failures == []
 
 
 def test_parts_that_do_not_fit_show_an_error_and_keep_the_robot(see):
@@ -41,9 +24,8 @@ def test_robot_is_written_to_a_bundle(see, folder):
     page = see("?compose=base=planar ee=cube")
     page.get_by_text("DoF").first.wait_for()
     page.get_by_role("tab", name="Get").click()
-    name = page.get_by_text("name", exact=True)
-    name.locator("xpath=ancestor::*[.//input][1]//input").fill("by-hand")
-    page.get_by_role("button", name="Write to robots/").click()
+    field(page, "name").fill("by-hand")
+    press(page, "Write to robots/")
     page.get_by_text("Written", exact=True).wait_for()
     assert read_bundle(folder / "robots" / "by-hand").name == "by-hand"
     assert (folder / "robots" / "by-hand" / "preview.png").is_file()
@@ -52,7 +34,7 @@ def test_robot_is_written_to_a_bundle(see, folder):
 def test_grammar_is_edited_sampled_and_stepped_through(see, picture):
     page = see("?compose=planar_arm")
     page.get_by_text("Derivation").first.wait_for()
-    page.get_by_role("button", name="next").click()
+    press(page, "next")
     page.wait_for_url(re.compile(r"seed=0&number=1"))
     page.get_by_text("planar_arm-000001").wait_for()
     picture(page)
@@ -62,8 +44,7 @@ def test_grammar_is_edited_sampled_and_stepped_through(see, picture):
     page.get_by_text(re.compile(r"planar_arm:\d+:\d+")).first.wait_for()
     text.fill(whole)
     page.get_by_text(re.compile(r"planar_arm:\d+:\d+")).first.wait_for(state="detached")
-    steps = page.get_by_text("parts shown", exact=True)
-    steps.locator("xpath=ancestor::*[.//input][1]//input").last.fill("1")
+    field(page, "parts shown").last.fill("1")
     page.locator("pre .dim").first.wait_for()
     assert page.failures == []
 
@@ -75,7 +56,7 @@ def test_edited_grammar_is_kept_in_the_url(see):
     edited = f"# my own\n{text.input_value()}"
     text.fill(edited)
     page.wait_for_url(re.compile(r"compose=planar_arm&text=[\w-]+$"))
-    page.get_by_role("button", name="next").click()
+    press(page, "next")
     page.wait_for_url(re.compile(r"seed=0&number=1&text="))
     page.reload()
     page.get_by_text("planar_arm-000001").wait_for()
@@ -91,24 +72,21 @@ def camera_distance(viewer):
     return float(sum((camera.position - camera.look_at) ** 2) ** 0.5)
 
 
-def test_the_camera_follows_a_robot_that_outgrows_the_view(see, viewer, control, picture):
+def test_the_camera_follows_a_robot_that_outgrows_the_view(see, viewer, picture):
     on = viewer()
     page = see("?compose=arm=arm3 ee=plane arm.length=0.1", on=on)
     page.get_by_text("DoF").first.wait_for()
     page.wait_for_timeout(1000)
     before = camera_distance(on)
-    control.input(page, "length (m)").last.fill("0.5")
+    field(page, "length (m)").last.fill("0.5")
     page.get_by_text(re.compile(r"changed: reach 0\.\d\d to 1\.\d\d m, mass \+")).wait_for()
     page.wait_for_function("true")
     page.wait_for_timeout(1000)
     assert camera_distance(on) > 1.5 * before
-    (session,) = on.sessions.values()
-    robots = [
-        n for n in session.client.scene._handle_from_node_name if re.fullmatch(r"/robot\d", n)
-    ]
+    robots = [name for name in nodes(on) if re.fullmatch(r"/robot\d", name)]
     assert len(robots) == 2  # the robot and the ghost of the one before
     picture(page, "compose-ghost")
-    control.input(page, "length (m)").last.fill("0.25")
+    field(page, "length (m)").last.fill("0.25")
     page.wait_for_url(re.compile(r"arm\.length=0\.25$"))
     assert page.failures == []
 
@@ -147,7 +125,7 @@ def test_robots_are_mutated_and_adopted(see, viewer, folder, picture):
     page = see("?compose=planar_arm&seed=0&number=1", on=on)
     page.get_by_text("planar_arm-000001").first.wait_for()
     page.get_by_role("tab", name="Evolve").click()
-    page.get_by_role("button", name="mutants").click()
+    press(page, "mutants")
     adopt = page.locator("[data-do=adopt]")
     adopt.nth(8).wait_for()
     page.wait_for_url(re.compile(r"compose=planar_arm&choices=[\w-]+&evolve=1&tab=Evolve$"))
@@ -158,11 +136,10 @@ def test_robots_are_mutated_and_adopted(see, viewer, folder, picture):
     assert re.fullmatch(r"planar_arm-[0-9a-f]{8}", adopted)
     page.reload()
     adopt.nth(8).wait_for(state="attached")
-    (session,) = on.sessions.values()
-    assert "/offspring8" in session.client.scene._handle_from_node_name
+    assert "/offspring8" in nodes(on)
     page.get_by_role("heading", name=adopted).wait_for()
     page.get_by_role("tab", name="Get").click()
-    page.get_by_role("button", name="Write to robots/").click()
+    press(page, "Write to robots/")
     page.get_by_text("Written", exact=True).wait_for()
     assert read_bundle(folder / "robots" / adopted).name == adopted
     assert page.failures == []
@@ -173,31 +150,13 @@ def test_a_click_in_the_scene_adopts_a_robot(see, viewer):
     page = see("?compose=prims&seed=0&number=2", on=on)
     page.get_by_text("prims-000002").first.wait_for()
     page.get_by_role("tab", name="Evolve").click()
-    page.get_by_role("button", name="mutants").click()
+    press(page, "mutants")
     page.locator("[data-do=adopt]").nth(8).wait_for()
     page.wait_for_url(re.compile(r"evolve=1&tab=Evolve$"))
     page.wait_for_timeout(1500)
     (session,) = on.sessions.values()
-    node = session.client.scene._handle_from_node_name["/offspring4"]
-    view = camera_view(session.client)
-    (x, y), _ = project_points(view, node.position + np.array([0.0, 0.0, 0.5]))
+    middle = nodes(on)["/offspring4"].position + np.array([0.0, 0.0, 0.5])
+    (x, y), _ = project_points(camera_view(session.client), middle)
     box = page.locator("canvas").last.bounding_box()
     page.mouse.click(box["x"] + x * box["height"], box["y"] + y * box["height"])
     page.wait_for_url(re.compile(r"evolve=2&tab=Evolve$"))
-
-
-def test_a_robot_from_words_evolves(see, picture):
-    page = see("?compose=base=gantry ee=cube")
-    page.get_by_role("tab", name="Evolve").click()
-    page.get_by_text("This robot has no grammar").wait_for()
-    page.get_by_role("button", name="mutants").click()
-    adopt = page.locator("[data-do=adopt]")
-    adopt.nth(8).wait_for()
-    picture(page, "evolve-words")
-    page.wait_for_url(re.compile(r"compose=base=gantry%20ee=cube&choices=[\w-]+&evolve=1"))
-    page.reload()
-    adopt.nth(8).wait_for(state="attached")
-    page.locator('[role=tab][aria-selected=true][title="Evolve"]').wait_for()
-    adopt.nth(0).click()
-    page.get_by_role("heading", name=re.compile(r"cube-[0-9a-f]{8}")).wait_for()
-    assert page.failures == []

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from helpers.pages import field, press
 from helpers.viser_client import PlainClient
 from morphgen.benchmark.split_file import read_split
 from morphgen.viewer.app.address import AddressError
@@ -13,11 +14,6 @@ from morphgen.viewer.gallery import parse_range
 
 def names(page):
     return page.locator(".card .name").all_inner_texts()
-
-
-def wait_for_names(page, wanted):
-    for name in wanted:
-        page.locator(".card .name", has_text=name).wait_for()
 
 
 def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):
@@ -34,10 +30,10 @@ def test_the_library_counts_parts(shared_viewer):
 
 
 @pytest.mark.slow
-def test_search_filters_rows_and_updates_the_url(see, control):
+def test_search_filters_rows_and_updates_the_url(see):
     page = see("?gallery=robots/prims")
     page.locator(".card").first.wait_for()
-    control.input(page, "Search").fill("00000")
+    field(page, "Search").fill("00000")
     page.get_by_text("10 of 30 robots").wait_for()
     assert names(page) == [f"prims-{i:06d}" for i in range(10)]
     page.wait_for_url(re.compile(r"search=00000"))
@@ -50,7 +46,7 @@ def test_gallery_pages_can_be_changed(see):
     page = see("?gallery=robots/prims&sort=-name")
     page.locator(".card").first.wait_for()
     assert names(page)[0] == "prims-000029"
-    page.get_by_role("button", name="next").click()
+    press(page, "next")
     page.get_by_text("page 2 of 2").wait_for()
     assert names(page) == [f"prims-{i:06d}" for i in range(5, -1, -1)]
     page.wait_for_url(re.compile(r"sort=-name&n=2"))
@@ -80,13 +76,13 @@ def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, vie
 
 
 @pytest.mark.slow
-def test_split_is_created_from_filtered_robots(see, control, folder):
+def test_split_is_created_from_filtered_robots(see, folder):
     page = see("?gallery=robots/prims&search=00000")
     page.get_by_text("10 of 30 robots").wait_for()
     page.get_by_text("New split").click()
     for label, value in (("split name", "from/gallery"), ("to train on", "3"), ("to test on", "2")):
-        control.input(page, label).last.fill(value)
-    page.get_by_role("button", name="Save").click()
+        field(page, label).last.fill(value)
+    press(page, "Save")
     page.get_by_text("morphgen split audit splits/from/gallery.yaml").wait_for()
     split = read_split(folder / "splits" / "from" / "gallery.yaml")
     assert [member.name for member in split.train] == [f"prims-{i:06d}" for i in range(3)]

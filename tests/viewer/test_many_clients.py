@@ -1,15 +1,14 @@
 """Many clients at once: each sees its own page, and nothing of them remains."""
 
 import contextlib
-import gc
 import re
 import threading
-import time
 import weakref
 from pathlib import Path
 
 import pytest
 
+from helpers.pages import wait_until
 from helpers.viser_client import PlainClient
 
 GROWTH = 1.05
@@ -31,14 +30,6 @@ def session_threads():
 def resident():
     """Return the resident memory of this process [pages]."""
     return int(Path("/proc/self/statm").read_text().split()[1])
-
-
-def wait_until(condition):
-    until = time.monotonic() + 60
-    while not condition() and time.monotonic() < until:
-        gc.collect()
-        time.sleep(0.1)
-    assert condition()
 
 
 def crowd(on, n, check=lambda: None):

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from helpers.pages import field, nodes, press
 from morphgen.benchmark.split_file import read_split
 
 pytestmark = pytest.mark.slow
@@ -29,7 +30,7 @@ def same(see):
     return open_marked
 
 
-def test_robots_are_chosen_compared_played_and_split(same, control, folder, picture):
+def test_robots_are_chosen_compared_played_and_split(same, folder, picture):
     page = same("?gallery=robots/prims")
     page.locator(".card img").nth(5).wait_for()
     boxes = page.locator("input[data-choose]")
@@ -51,8 +52,8 @@ def test_robots_are_chosen_compared_played_and_split(same, control, folder, pict
     page.locator(TRAY).get_by_text("split").click()
     page.get_by_text("test (1)").wait_for()
     picture(page, "chosen")
-    control.input(page, "split name").last.fill("from/tray")
-    page.get_by_role("button", name="Save").click()
+    field(page, "split name").last.fill("from/tray")
+    press(page, "Save")
     page.get_by_text("morphgen split audit splits/from/tray.yaml").wait_for()
     split = read_split(folder / "splits" / "from" / "tray.yaml")
     assert [member.name for member in split.test] == ["prims-000005"]
@@ -94,21 +95,8 @@ def test_leaving_a_page_leaves_nothing_of_it(same, viewer):
     bar(page, "Splits").click()
     page.get_by_text("Open which split?").wait_for()
     page.wait_for_timeout(3000)
-    (session,) = on.sessions.values()
-    assert set(session.client.scene._handle_from_node_name) <= {"/light"}
+    assert set(nodes(on)) <= {"/light"}
     assert page.get_by_role("tab").count() == 0
-
-
-def test_a_robot_of_a_set_is_edited_in_compose(same, control):
-    page = same("?robot=robots/prims/prims-000001")
-    page.get_by_role("link", name="Edit in Compose").click()
-    page.get_by_role("tab", name="Parameters").wait_for()
-    page.get_by_text("DoF").first.wait_for()
-    control.input(page, "travel x (m)").last.fill("0.3")
-    page.wait_for_url(re.compile(r"compose=derivation:.*travel_x=0\.3"))
-    page.reload()
-    page.get_by_role("tab", name="Parameters").wait_for()
-    assert control.input(page, "travel x (m)").last.input_value() == "0.3"
 
 
 def test_the_theme_changes_without_a_new_page(same):
@@ -133,11 +121,6 @@ def test_the_open_tab_is_in_the_address_and_back_returns_to_it(same):
     assert page.failures == []
 
 
-def node(viewer, name):
-    (session,) = viewer.sessions.values()
-    return session.client.scene._handle_from_node_name[name]
-
-
 def test_robots_are_compared(see, viewer, picture):
     on = viewer()
     page = see("?compare=words:base=gantry ee=plane&compare=robots/some-arm", on=on)
@@ -145,11 +128,10 @@ def test_robots_are_compared(see, viewer, picture):
     page.get_by_text(re.compile("gantry-plane and arm")).wait_for()
     picture(page, "compare")
     page.get_by_role("tab", name="Move").click()
-    before = [node(on, f"/robot{i}/2").position.copy() for i in range(2)]
-    row = page.get_by_text("joint 1", exact=True).locator("xpath=ancestor::*[.//input][1]")
-    row.locator("input").last.fill("0.9")
+    before = [nodes(on)[f"/robot{i}/2"].position.copy() for i in range(2)]
+    field(page, "joint 1").last.fill("0.9")
     page.wait_for_timeout(1500)
-    after = [node(on, f"/robot{i}/2").position for i in range(2)]
+    after = [nodes(on)[f"/robot{i}/2"].position for i in range(2)]
     assert all(abs(a - b).max() > 0.01 for a, b in zip(after, before, strict=True))
     assert page.failures == []
 
@@ -162,4 +144,4 @@ def test_primitives_are_coloured_by_their_iou(see, viewer, picture):
     page.get_by_text("IoU", exact=True).wait_for()
     page.get_by_role("cell", name="arm_forearm_link").wait_for()
     picture(page)
-    assert not node(on, "/robot0/3/visual0").visible
+    assert not nodes(on)["/robot0/3/visual0"].visible

@@ -1,12 +1,12 @@
 """Overlays of the robot page, and the camera that is pointed at robots."""
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from helpers.pages import nodes as scene_nodes
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
@@ -43,21 +43,24 @@ def test_a_slice_has_the_hole_of_the_workspace(ball):
 
 def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
     on = viewer()
-    shown = "visual,collision,x-ray,names,inertia,workspace"
+    shown = "visual,collision,inertia,x-ray,frames,joint axes,centres of mass,names,workspace"
     with PlainClient(on.port, f"{ARM}&show={shown}&slice=0.05") as client:
         client.shows("no self-collision")
-        (session,) = on.sessions.values()
-        nodes = session.client.scene._handle_from_node_name
+        nodes = scene_nodes(on)
         client.until(lambda: "/robot/workspace_slice" in nodes)
         client.shows("slice=0.05")
         client.shows("200,000 random configurations")
+        slide = client.control("Slider", "slice at y [m]")
+        client.change(slide, 0.03)
+        client.shows("slice=0.03")
         assert nodes["/robot/1/visual0"].opacity == pytest.approx(0.2)
         assert nodes["/robot/1/name"].text == "upper"
-        assert "/robot/1/inertia" in nodes
+        assert {"/robot/1/inertia", "/robot/1/axis", "/robot/1/com"} <= nodes.keys()
+        assert nodes["/robot/1"].show_axes
         radius = np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max()
         assert 0.0205 < radius < 0.03  # the cylinder has 0.02 m
         client.change(client.control("Checkbox", "visual"), False)
-        client.shows("show=collision,inertia,x-ray")
+        client.shows("show=collision,inertia,x-ray,frames")
         assert nodes["/robot/1/visual0"].visible
         client.change(client.control("Checkbox", "x-ray"), False)
         client.until(lambda: not nodes["/robot/1/visual0"].visible)
@@ -82,25 +85,6 @@ def test_findings_about_inertia_are_written_beside_the_boxes(shared_viewer, fold
             ]
         )
         assert found == "lower: inertia-missing"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "shown", ["visual,x-ray,frames,joint axes,centres of mass,names", "visual,workspace"]
-)
-def test_overlays_are_shown(see, picture, shown):
-    page = see(f"?robot=words:arm=ur5 ee=robotiq_2f85&show={shown}")
-    page.get_by_text("no self-collision").wait_for()
-    page.get_by_role("tab", name="Show").click()
-    if "workspace" in shown:
-        page.get_by_text("many", exact=True).wait_for()
-        page.get_by_text("slice at y [m]").locator(
-            "xpath=ancestor::*[.//input][1]//input"
-        ).last.fill("0.3")
-        page.wait_for_url(re.compile("slice=0.3"))
-    page.wait_for_timeout(2000)
-    picture(page, f"overlays-{shown.rpartition(',')[2]}")
-    assert page.failures == []
 
 
 POINT = np.zeros(3)

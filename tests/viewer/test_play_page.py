@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from helpers.pages import choose, field, press
 from helpers.runs import QUIET, small_config, small_source
 from morphgen.rl.runs.training import train
 from morphgen.viewer.episode import read_episode, score_until
@@ -13,21 +14,6 @@ from morphgen.viewer.episode import read_episode, score_until
 pytestmark = pytest.mark.slow
 
 CUBE = "words:base=planar ee=cube"
-
-
-def number(page, label):
-    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
-    return row.locator("input").last
-
-
-def choose(page, label, option):
-    field = page.get_by_text(label, exact=True).first
-    field.locator("xpath=ancestor::*[.//input][1]//input").first.click()
-    page.get_by_role("option", name=option, exact=True).click()
-
-
-def press(page, name):
-    page.get_by_role("button", name=name, exact=True).click()
 
 
 def wait_for_end(page, seconds="6.00"):
@@ -51,7 +37,7 @@ def test_reach_episode_can_be_scrubbed_and_stepped(see, viewer, picture):
     wait_for_end(page)
     page.get_by_text("success", exact=True).wait_for()
     picture(page, "play-reach")
-    number(page, "time (s)").fill("2")
+    field(page, "time (s)").last.fill("2")
     page.get_by_text("2.00 s; simulated: 6.00 s").wait_for()
     press(page, "step")
     page.get_by_text("2.02 s; simulated: 6.00 s").wait_for()
@@ -67,7 +53,7 @@ def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
     press(page, "New episode")
     page.wait_for_url(re.compile(r"seed=1"))
-    assert number(page, "seed").input_value() == "1"
+    assert field(page, "seed").last.input_value() == "1"
     choose(page, "policy", "ik")
     page.wait_for_url(re.compile(r"policy=ik&seed=1"))
     wait_for_end(page)
@@ -98,7 +84,7 @@ def test_robots_are_replaced_added_and_removed(see, viewer, picture):
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
     choose(page, "robot", "prims-000002")
     page.wait_for_url(re.compile(r"robot=robots/prims/prims-000002&policy=ik"))
-    number(page, "or words").fill("base=planar ee=cube")
+    field(page, "or words").last.fill("base=planar ee=cube")
     press(page, "add")
     page.wait_for_url(re.compile(r"prims-000002&robot=words:base=planar%20ee=cube"))
     page.get_by_role("cell", name="planar-cube").wait_for()
@@ -113,22 +99,6 @@ def test_robot_that_cannot_do_the_task_shows_the_reason(see, viewer):
     page.wait_for_url(re.compile(r"play=reach.*policy=ik"))
     wait_for_end(page)
     assert page.get_by_text("can hardly push").count() == 0
-
-
-@pytest.mark.parametrize(
-    ("query", "why"),
-    [
-        ("?play=rech", "did you mean 'reach'"),
-        ("?play=reach&seed=x", "seed 'x': expected a whole number"),
-        ("?play=reach&sim=bullet", "did you mean 'pybullet'"),
-        ("?play=reach&policy=scripted", "policy 'scripted' is for push, not for reach"),
-        ("?play=reach&policy=../x.pt", "outside of the folders"),
-        ("?play=robots/prims/index.jsonl", "no task"),
-        ("?play=nothing.npz", "no such file"),
-    ],
-)
-def test_invalid_rollout_shows_the_reason(see, query, why):
-    see(query).get_by_text(re.compile(re.escape(why))).first.wait_for()
 
 
 def test_checkpoint_starts_with_its_training_robot(see, viewer, folder, tmp_path):
@@ -174,6 +144,6 @@ def test_the_time_of_a_paused_episode_is_in_the_address(see):
     press(page, "play")
     page.wait_for_url(re.compile(r"seed=0$"))
     wait_for_end(page)
-    number(page, "time (s)").fill("2")
+    field(page, "time (s)").last.fill("2")
     page.wait_for_url(re.compile(r"&t=2$"))
     assert page.failures == []

@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from helpers.pages import field, nodes, pointer, press
 from helpers.viser_client import PlainClient
 from morphgen.benchmark.split_file import read_split
 from morphgen.viewer.scene.stage import camera_view, project_points
@@ -25,24 +26,13 @@ def test_a_click_selects_a_robot_and_one_with_shift_adds_another(viewer):
         batches = client.until(
             lambda: [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
         )
-        click = {
-            "type": "SceneNodeClickMessage",
-            "name": batches[0]["name"],
-            "instance_index": 0,
-            "ray_origin": [1.0, 0.0, 0.0],
-            "ray_direction": [-1.0, 0.0, 0.0],
-            "screen_pos": [0.5, 0.5],
-            "modifier": None,
-            "owner": batches[0]["owner"],
-        }
+        click = pointer("Click", batches[0], instance_index=0)
         for index in (-1, 10**6, None):
             client.send({**click, "instance_index": index})
         client.send(click)
         client.shows("1 selected")
         client.shows("joint1=0.25&select=0")
-        (session,) = on.sessions.values()
-        drawn = session.client.scene._handle_from_node_name[batches[0]["name"]]
-        last = len(drawn.batched_positions) - 1
+        last = len(nodes(on)[batches[0]["name"]].batched_positions) - 1
         client.send({**click, "instance_index": last, "modifier": "shift"})
         client.shows("2 selected")
         client.change(client.control("ButtonGroup", "Select"), "invert")
@@ -59,9 +49,8 @@ def test_a_click_of_the_pointer_selects_the_robot_under_it(see, viewer, picture)
     page.wait_for_timeout(3000)
     picture(page, "population")
     (session,) = on.sessions.values()
-    handle = session.client.scene._handle_from_node_name["/population/0"]
-    view = camera_view(session.client)
-    (x, y), _ = project_points(view, np.array(handle.batched_positions[7], dtype=float))
+    position = np.array(nodes(on)["/population/0"].batched_positions[7], dtype=float)
+    (x, y), _ = project_points(camera_view(session.client), position)
     box = page.locator("canvas").first.bounding_box()
     page.mouse.click(box["x"] + x * box["height"], box["y"] + y * box["height"])
     page.get_by_text("1 selected").wait_for()
@@ -73,10 +62,10 @@ def test_a_click_of_the_pointer_selects_the_robot_under_it(see, viewer, picture)
 
 
 @pytest.mark.slow
-def test_a_rectangle_selects_and_the_address_keeps_arrangement_and_selection(see, control):
+def test_a_rectangle_selects_and_the_address_keeps_arrangement_and_selection(see):
     page = see("?population=robots/prims&arrange=reach")
     wait_until_shown(page)
-    control.input(page, "joint 1").last.fill("0.25")
+    field(page, "joint 1").last.fill("0.25")
     page.wait_for_url(re.compile("joint1=0.25"))
     box = page.locator("canvas").first.bounding_box()
     page.keyboard.down("Shift")
@@ -88,17 +77,17 @@ def test_a_rectangle_selects_and_the_address_keeps_arrangement_and_selection(see
     page.keyboard.up("Shift")
     page.get_by_text("30 selected").wait_for()
     page.wait_for_url(re.compile("select=0-29"))
-    page.get_by_role("button", name="invert").click()
+    press(page, "invert")
     page.get_by_text("no robot is selected").wait_for()
     page.goto(re.sub("$", "&select=2,4-5", page.url))
     page.get_by_text("3 selected").wait_for()
     assert all(part in page.url for part in ("arrange=reach", "joint1=0.25"))
-    page.get_by_role("button", name="Home").click()
+    press(page, "Home")
     page.wait_for_url(re.compile(r"arrange=reach&select=2,4-5$"))
 
 
 @pytest.mark.slow
-def test_selected_robots_are_exported_and_split(see, control, folder):
+def test_selected_robots_are_exported_and_split(see, folder):
     page = see("?population=robots/prims&select=0-1")
     page.get_by_text("2 selected").wait_for()
     with page.expect_download() as download:
@@ -107,8 +96,8 @@ def test_selected_robots_are_exported_and_split(see, control, folder):
         urdfs = [name for name in archive.namelist() if name.endswith("/robot.urdf")]
     assert [name.split("/")[1] for name in urdfs] == ["0000-prims-000000", "0001-prims-000001"]
     page.get_by_text("New split").click()
-    control.input(page, "split name").last.fill("from/population")
-    page.get_by_role("button", name="Save").click()
+    field(page, "split name").last.fill("from/population")
+    press(page, "Save")
     page.get_by_text("morphgen split audit splits/from/population.yaml").wait_for()
     split = read_split(folder / "splits" / "from" / "population.yaml")
     assert [member.name for member in split.test] == ["prims-000000", "prims-000001"]

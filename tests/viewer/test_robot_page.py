@@ -6,13 +6,13 @@ import os
 import re
 import signal
 import subprocess
-import time
 import weakref
 import zipfile
 
 import pytest
 from PIL import Image
 
+from helpers.pages import choose, field, nodes, press, wait_until
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.model.kinematics import frame_pose
@@ -23,12 +23,6 @@ from morphgen.viewer.scene.robot import RED
 ARM = "?robot=robots/some-arm"
 
 
-def slider_number(page, label):
-    """The number field of a slider."""
-    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
-    return row.locator("input").last
-
-
 def wait_for_page(page):
     page.get_by_text("no self-collision").or_(
         page.get_by_text("collision", exact=True)
@@ -37,19 +31,6 @@ def wait_for_page(page):
 
 def show_tab(page, name):
     page.get_by_role("tab", name=name).click()
-
-
-def wait_until(condition):
-    until = time.monotonic() + 60
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert condition()
-
-
-def node(viewer, name):
-    """Return a scene node of the only browser, as stored on the server."""
-    (session,) = viewer.sessions.values()
-    return session.client.scene._handle_from_node_name[name]
 
 
 @pytest.mark.slow
@@ -65,13 +46,18 @@ def test_colliding_links_are_red(see, viewer):
     assert len(pairs) > 0
     links = [robot.link_index[name] for pair in pairs for name in pair]
     for link in links:
-        assert tuple(node(on, f"/robot/{link}/visual0").color) == RED
-    assert node(on, "/robot/ignored").visible
-    page.get_by_role("button", name="home").click()
+        assert tuple(nodes(on)[f"/robot/{link}/visual0"].color) == RED
+    assert nodes(on)["/robot/ignored"].visible
+    show_tab(page, "Links")
+    choose(page, "Link", "arm_forearm_link")
+    page.wait_for_url(re.compile("link=arm_forearm_link"))
+    assert all(tuple(nodes(on)[f"/robot/{link}/visual0"].color) == RED for link in links)
+    show_tab(page, "Move")
+    press(page, "home")
     page.get_by_text("no self-collision").wait_for()
     for link in links:
-        assert tuple(node(on, f"/robot/{link}/visual0").color) != RED
-    page.get_by_role("button", name="random free").click()
+        assert tuple(nodes(on)[f"/robot/{link}/visual0"].color) != RED
+    press(page, "random free")
     page.wait_for_url(re.compile(r"[?&]q="))
     page.get_by_text("no self-collision").wait_for()
 
@@ -81,12 +67,11 @@ def test_workspace_trail_and_gizmo(see, viewer, picture):
     on = viewer()
     page = see(f"{ARM}&show=visual,workspace,trail,drag the tool", on=on)
     wait_for_page(page)
-    slider_number(page, "shoulder").fill("-0.5")
+    field(page, "shoulder").last.fill("-0.5")
     page.wait_for_url(re.compile(r"q=-0\.5"))
-    slider_number(page, "shoulder").fill("0.5")
+    field(page, "shoulder").last.fill("0.5")
     page.wait_for_url(re.compile(r"q=0\.5"))
-    (session,) = on.sessions.values()
-    names = session.client.scene._handle_from_node_name
+    names = nodes(on)
     page.wait_for_timeout(1000)
     assert {"/robot/workspace", "/robot/trail", "/gizmo"} <= names.keys()
     robot = read_robot_uri("robots/some-arm", on.files)
@@ -134,25 +119,6 @@ def test_a_broken_robot_shows_its_findings(see, picture):
     assert page.get_by_text(re.compile("lost")).first.is_visible()
     page.get_by_role("link", name="Library").first.wait_for()
     picture(page)
-
-
-@pytest.mark.slow
-def test_two_browsers_do_not_disturb_each_other(see, viewer):
-    on = viewer()
-    first = see(ARM, on=on)
-    wait_for_page(first)
-    second = see("?robot=robots/prims/prims-000001", on=on)
-    second.get_by_text("prims-000001").first.wait_for()
-    third = see(ARM, on=on)
-    wait_for_page(third)
-    slider_number(first, "shoulder").fill("1.5")
-    first.wait_for_url(re.compile(r"q=1\.5"))
-    assert slider_number(third, "shoulder").input_value() == "0.4"
-    assert "prims-000001" in second.url
-    second.close()
-    slider_number(third, "shoulder").fill("-1.5")
-    third.wait_for_url(re.compile(r"q=-1\.5"))
-    assert slider_number(first, "shoulder").input_value() == "1.5"
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.pages import field, nodes, pointer
 from helpers.robots import arm, finger
 from helpers.viser_client import PlainClient
 from morphgen.model.findings import Finding
@@ -30,7 +31,6 @@ from morphgen.viewer.robot_tables import (
     summary,
 )
 from morphgen.viewer.scene.overlays import range_lines
-from morphgen.viewer.scene.robot import RED
 from morphgen.viewer.scene.stage import View, inertia_box, project_points
 
 
@@ -200,36 +200,15 @@ def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):
         frame = client.until(
             lambda: next((m for m in client.messages if m.get("name") == "/robot/1"), None)
         )
-        (session,) = on.sessions.values()
-        view = session.client.scene._handle_from_node_name
-        click = {
-            "type": "SceneNodeClickMessage",
-            "name": "/robot/1",
-            "instance_index": None,
-            "ray_origin": [1.0, 0.0, 0.0],
-            "ray_direction": [-1.0, 0.0, 0.0],
-            "screen_pos": [0.5, 0.5],
-            "modifier": None,
-            "owner": frame["owner"],
-        }
+        view = nodes(on)
+        click = pointer("Click", frame)
         client.send(click)
         client.shows("link=upper")
         client.until(lambda: "/robot/1/outline0" in view)
         robot = arm()
         grip = poses(robot.home)[1] @ [0, 0, 0.3, 1]
-        drag = {
-            "type": "SceneNodeDragMessage",
-            "phase": "start",
-            "name": "/robot/1",
-            "instance_index": None,
-            "start_position": grip[:3].tolist(),
-            "start_screen_pos": [0.5, 0.5],
-            "end_position": grip[:3].tolist(),
-            "end_screen_pos": [0.5, 0.5],
-            "button": "left",
-            "modifier": None,
-            "owner": frame["owner"],
-        }
+        start = grip[:3].tolist()
+        drag = pointer("Drag", frame, phase="start", start_position=start, end_position=start)
         client.send(drag)
         goal = poses([1.0, *robot.home[1:]])[1] @ [0, 0, 0.3, 1]
         client.send({**drag, "phase": "update", "end_position": goal[:3].tolist()})
@@ -247,18 +226,15 @@ def test_pointer_selects_drags_and_shows_ranges(see, viewer, picture):
     page = see(f"{ARM}&link=lower&angles=deg", on=on)
     page.get_by_text("no self-collision").wait_for()
     (session,) = on.sessions.values()
-    nodes = session.client.scene._handle_from_node_name
-    assert "/robot/2/outline0" in nodes
-    shoulder = page.get_by_text("shoulder", exact=True)
-    row = shoulder.locator("xpath=ancestor::*[.//input][1]")
-    assert row.locator("input").last.input_value() == "23"
-    shoulder.hover()
+    assert "/robot/2/outline0" in nodes(on)
+    assert field(page, "shoulder").last.input_value() == "23"
+    page.get_by_text("shoulder", exact=True).hover()
     page.wait_for_timeout(1500)
-    assert "/robot/0/range" in nodes
+    assert "/robot/0/range" in nodes(on)
     picture(page, "robot-selection")
     page.mouse.move(300, 100)
     page.wait_for_timeout(1500)
-    assert "/robot/0/range" not in nodes
+    assert "/robot/0/range" not in nodes(on)
     middle = (poses(arm().home)[1] @ [0, 0, 0.15, 1])[:3]
     x, y = on_screen(page, session.client.camera, middle)
     page.mouse.click(x, y)
@@ -272,20 +248,3 @@ def test_pointer_selects_drags_and_shows_ranges(see, viewer, picture):
     page.wait_for_url(re.compile("q="))
     assert "link=upper" in page.url
     assert page.failures == []
-
-
-@pytest.mark.slow
-def test_collisions_stay_red_when_a_link_is_selected(see, viewer):
-    on = viewer()
-    query = "?robot=words:arm=ur5 ee=plane&q=0,-1,2.6,2.5,0,0&link=arm_wrist_3_link"
-    page = see(query, on=on)
-    page.get_by_text("collision", exact=True).wait_for()
-    (session,) = on.sessions.values()
-    nodes = session.client.scene._handle_from_node_name
-    red = [n for n, node in nodes.items() if "visual" in n and tuple(node.color) == RED]
-    assert red
-    page.get_by_role("tab", name="Links").click()
-    page.get_by_role("combobox", name="Link").click()
-    page.get_by_role("option", name="arm_forearm_link").click()
-    page.wait_for_url(re.compile("link=arm_forearm_link"))
-    assert all(tuple(nodes[name].color) == RED for name in red)

@@ -23,6 +23,7 @@ from morphgen.viewer.robot_uri import (
     UriError,
     content_hash,
     read_robot_uri,
+    resolve_derivation,
     resolve_split,
     with_library_meshes,
 )
@@ -116,8 +117,9 @@ def test_the_content_hash_changes_with_the_file(files):
     urdf = files.path("robots/one/robot.urdf")
     urdf.write_text(urdf.read_text() + "\n")
     assert content_hash("robots/one", files) != before
-    words = content_hash("words:base=planar ee=cube", files)
-    assert words == content_hash("derivation:" + str(_derivation(files)), files)
+    words = "words:base=planar ee=cube"
+    derivation = f"derivation:{resolve_derivation(words, files)}"
+    assert content_hash(words, files) == content_hash(derivation, files)
 
 
 @pytest.mark.parametrize(
@@ -139,12 +141,6 @@ def test_errors_contain_no_absolute_paths(text, expected):
     files = FileAccess((), (root,), Path(temporary) / "morphgen-uploads-1")
     given = text.format(uploads=files.uploads, root=root, temporary=temporary)
     assert files.redact(given) == expected
-
-
-def _derivation(files):
-    from morphgen.viewer.robot_uri import resolve_derivation
-
-    return resolve_derivation("words:base=planar ee=cube", files)
 
 
 def test_bundle_uses_library_meshes_only_if_the_robot_is_unchanged(files, tmp_path):

@@ -13,13 +13,12 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
 from morphgen.rl.play import make_env_and_controller, play, read_controller
-from morphgen.rl.runs import checkpoint as runs
 from morphgen.rl.runs.training import train
-from morphgen.viewer.app.address import Address
+from morphgen.viewer.app.address import Address, parse_address
 from morphgen.viewer.app.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.pages.play import parse_rollout, rollout_address
-from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess
+from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import RecordedEpisode, Rollout, RolloutConfig, simulators
 from morphgen.viewer.scene.rollout import (
     GAP,
@@ -228,10 +227,6 @@ def test_an_invalid_rollout_is_rejected(files, cache, config, why):
         Rollout(config, files)
 
 
-def test_checkpoint_name_matches_that_of_training_runs():
-    assert CHECKPOINT == runs.CHECKPOINT
-
-
 def test_rollout_is_restored_from_its_url():
     for simulator in simulators():
         config = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
@@ -240,6 +235,20 @@ def test_rollout_is_restored_from_its_url():
         rollout_address(RolloutConfig("push", (), "zero")), [("it", "robots/one")]
     )
     assert default.robots == ("robots/one",)
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [
+        ("?play=rech", "did you mean 'reach'"),
+        ("?play=reach&seed=x", "seed 'x': expected a whole number"),
+        ("?play=reach&sim=bullet", "did you mean 'pybullet'"),
+        ("?play=robots/prims/index.jsonl", "no task"),
+    ],
+)
+def test_an_invalid_address_of_a_rollout_is_rejected(query, why):
+    with pytest.raises(MorphgenError, match=why):
+        parse_rollout(parse_address(query), [])
 
 
 def test_snapshot_is_independent_of_the_episode(episode):

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from helpers.pages import field, press
 from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
@@ -50,17 +51,15 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
 def test_new_split_is_saved_from_the_shown_robots(see, folder):
     page = see(f"?split={SPLIT}&search=0000")
     page.get_by_text("train (10)").wait_for()
-    search = page.get_by_text("Search", exact=True)
-    search.locator("xpath=ancestor::*[.//input][1]//input").fill("000001")
+    field(page, "Search").fill("000001")
     page.get_by_text(re.compile("of 12 robots")).wait_for()
     page.get_by_text("New split of what is shown").click()
-    name = page.get_by_text("split name", exact=True)
-    name.locator("xpath=ancestor::*[.//input][1]//input").fill("mine/ones")
-    page.get_by_role("button", name="Save").click()
+    field(page, "split name").fill("mine/ones")
+    press(page, "Save")
     page.get_by_text("morphgen split audit splits/mine/ones.yaml").wait_for()
     split = read_split(folder / "splits" / "mine" / "ones.yaml")
     assert {member.name[-6:] for member in (*split.train, *split.test)} == {"000001"}
-    page.get_by_role("button", name="Save").click()
+    press(page, "Save")
     page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
 
 

@@ -53,13 +53,8 @@ def test_zipped_bundle_survives_a_round_trip(access, tmp_path):
         ("a.xml", b"<mujocoinclude/>", "holds no .urdf and no MJCF"),
         ("a.xml", b"<mujoco", "a.xml:1:"),
         ("a.xacro", URDF, "expected a .urdf, an MJCF as .xml, or a .zip"),
-        ("a.zip", b"PK nothing", "not a readable zip"),
-        ("..", URDF, "invalid file name"),
         ("a.zip", archive({"b.txt": b""}), "holds no .urdf"),
         ("a.zip", archive({"b.xml": b"<mujoco", ".c.xml": b"<"}), "b.xml:1:"),
-        ("a.zip", archive({"../b.urdf": URDF}), "leads out of its folder"),
-        ("a.zip", archive({"/b.urdf": URDF}), "leads out of its folder"),
-        ("a.zip", archive({"c\\..\\..\\b.urdf": URDF}), "leads out of its folder"),
         ("a.urdf", MESHED % b"../secret.stl", "leads out of its folder"),
         ("a.urdf", MESHED % b"file:///etc/passwd", "only relative paths and package://"),
         ("a.urdf", MESHED % b"/etc/passwd", "leads out of its folder"),
@@ -142,6 +137,9 @@ def patched(whole, old, new):
         (archive({"a\n.urdf": URDF}), "not a valid file name"),
         (archive({"C:/a.urdf": URDF}), "leads out"),
         (archive({"b/../a.urdf": URDF}), "leads out"),
+        (archive({"../b.urdf": URDF}), "leads out"),
+        (archive({"/b.urdf": URDF}), "leads out"),
+        (archive({"c\\..\\..\\b.urdf": URDF}), "leads out"),
         (patched(archive({"aXb.urdf": URDF}), b"aXb", b"a\0b"), "not a valid file|not a readable"),
         (linked("meshes", "/etc"), "is a link"),
         (linked("meshes/x.stl", "../../../etc/passwd"), "is a link"),
@@ -291,12 +289,8 @@ def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
     ("name", "content", "why"),
     [
         ("a.zip", archive({"a.urdf": XACRO}), "a.urdf:2: is a xacro"),
-        ("a.zip", archive({"a.xacro": XACRO}), "no xacro of an upload is expanded"),
-        ("a.zip", twice("x", "x/a.urdf"), "in a folder that is a file"),
-        ("a.zip", archive({"a" * 300 + ".urdf": URDF}), "longer than 100"),
         ("a.zip", linked("x", "/etc/passwd"), "is a link"),
         ("a.urdf", b"", "a.urdf:1:1"),
-        ("a.urdf", MESHED % b"x.stl", "is not in the upload"),
         ("a.xml", b'<mujoco><asset><mesh file="x.stl"/></asset></mujoco>',
          "mesh 'x': not in the upload"),
         ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
@@ -342,11 +336,6 @@ def test_errors_show_no_temporary_path(shared_viewer, capfd):
         client.shows("a.urdf")
         client.shows("tag error")
         assert tempfile.gettempdir() not in client.text
-    for text in (
-        f"{on.files.uploads}/x/a.urdf:1: bad",
-        f"{tempfile.gettempdir()}/tmpab12/robot/x",
-    ):
-        assert tempfile.gettempdir() not in on.files.redact(text)
 
 
 def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
@@ -370,7 +359,7 @@ def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
 
 
 def test_a_picture_of_too_many_pixels_is_none(tmp_path):
-    Image.new("1", (20_000, 20_000)).save(tmp_path / "preview.png")
+    Image.new("1", (6000, 6000)).save(tmp_path / "preview.png")
     assert thumbnail_of_picture(tmp_path / "preview.png") == ""
 
 

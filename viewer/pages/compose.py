@@ -203,7 +203,7 @@ def show_robot(
             markup.command(command), "<h3>Derivation</h3>", markup.code(str(derivation))
         )
     if page.evolve is not None:
-        leave_parent(page.evolve, uri.removeprefix(WORDS))
+        set_parent(page.evolve, None, uri.removeprefix(WORDS))
     page.session.run_in_background(lambda: _check(page), "check")
 
 
@@ -402,7 +402,12 @@ def add_evolve_tab(
         tab = EvolveTab(session, grammar, seed, gui.add_html(""))
 
     def press() -> None:
-        (_next_generation if buttons.value == "mutants" else _hide)(tab)
+        if buttons.value == "mutants":
+            _next_generation(tab)
+            return
+        _clear_generation(tab)
+        _show_in_address(tab)
+        _show_generation(tab)
 
     def click(event: viser.SceneClickEvent) -> None:
         if tab.scene is not None:
@@ -440,16 +445,11 @@ def offspring_html(parent: Individual, generation: Sequence[Individual]) -> str:
     return f'<div class="offspring">{"".join(cards)}</div>' if cards else ""
 
 
-def leave_parent(tab: EvolveTab, source: str) -> None:
-    """Forget the parent and remove its mutants: another robot is shown now."""
-    tab.parent, tab.source = None, source
-    _clear_generation(tab)
-    _show_generation(tab)
-
-
-def set_parent(tab: EvolveTab, individual: Individual) -> None:
-    """Take the robot that the grammar gave as the parent."""
-    tab.parent = individual
+def set_parent(tab: EvolveTab, individual: Individual | None, source: str = "") -> None:
+    """Take the robot that is shown as the parent: one of the grammar, or else words or a URI."""
+    tab.parent, tab.source = individual, source
+    if individual is None:
+        _clear_generation(tab)
     _show_generation(tab)
 
 
@@ -507,12 +507,6 @@ def _clear_generation(tab: EvolveTab) -> None:
     if tab.scene is not None:
         remove_offspring(tab.scene)
     tab.scene, tab.generation = None, []
-
-
-def _hide(tab: EvolveTab) -> None:
-    _clear_generation(tab)
-    _show_in_address(tab)
-    _show_generation(tab)
 
 
 def _adopt(tab: EvolveTab, i: int) -> None:
