@@ -62,8 +62,7 @@ class RoleSliders:
 
     def __init__(self, session: Session, low: float, move: Callable[[], object]) -> None:
         """Prepare for sliders from ``low`` to 1; ``move`` is called after the user moved one."""
-        self.moved: dict[str, float] = {}
-        """Positions of the roles that the user moved."""
+        self.moved: dict[str, float] = {}  # positions of the roles that the user moved
         self._session, self._low, self._move = session, low, move
         self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
         self._home: dict[str, float] = {}

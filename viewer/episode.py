@@ -100,11 +100,9 @@ class Track:
 
     robot: Robot
     uri: str
-    ground: float | None
-    """Height of the ground [m]; None without ground."""
+    ground: float | None  # height of the ground [m]; None without ground
     obstacles: tuple[Block, ...] = ()
-    markers: tuple[Marker, ...] = ()
-    """Shapes that show the goal."""
+    markers: tuple[Marker, ...] = ()  # shapes that show the goal
     block_size: tuple[float, float, float] | None = None
     q: list[Array] = field(default_factory=list)
     """Independent joint positions at the start and after every step, shape (J,) each."""
@@ -115,8 +113,7 @@ class Track:
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
-    fault: str = ""
-    """Error that ended the episode early; empty without error."""
+    fault: str = ""  # error that ended the episode early; empty without error
 
     @property
     def num_steps(self) -> int:
@@ -131,11 +128,9 @@ class Episode:
     task: str
     policy: str
     seed: int
-    obstacles: bool
-    """Whether obstacles were requested."""
+    obstacles: bool  # whether obstacles were requested
     simulator: str
-    period: float
-    """Time of a control step [s]."""
+    period: float  # time of a control step [s]
     tracks: list[Track]
 
     @property

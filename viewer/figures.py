@@ -16,16 +16,12 @@ from morphgen.viewer.app.address import Address
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
 CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"
 """Colours of the bars inside and outside a range."""
-_NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60
-"""Bars of a histogram, and its height in units of the SVG."""
-_WIDTH = 480
-"""Width of an SVG in its own units."""
+_NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60  # bars of a histogram, and its height in units of the SVG
+_WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
-_MAX_ROUNDS = 200
-"""Rounds in which the robots of a map move apart."""
-_BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
-"""White to dark blue."""
+_MAX_ROUNDS = 200  # rounds in which the robots of a map move apart
+_BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))  # white to dark blue
 
 
 def blend(stops: ArrayLike, share: float) -> tuple[int, int, int]:

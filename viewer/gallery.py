@@ -34,31 +34,25 @@ class Gallery:
 
     session: Session
     title: str
-    rows: list[robot_rows.Row]
-    """All robots, shown or not."""
+    rows: list[robot_rows.Row]  # all robots, shown or not
     columns: tuple[str, ...] = ()
     """Roles that are shown in a column each; without any, all robots are in one grid."""
     scale: str = SCALES[1]
     """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
     noun: str = "robot"
     """Singular word for what a row of ``rows`` shows: a robot, or a part of the library."""
-    thumbnails: dict[str, str] = field(default_factory=dict)
-    """Thumbnails drawn so far, by URI."""
+    thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
     faults: dict[str, str] = field(default_factory=dict)
     """Errors of robots that cannot be read, by URI."""
-    controls: dict[str, Any] = field(default_factory=dict)
-    """Controls by their key in the address."""
+    controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
     histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     """Distributions of the facts above their sliders."""
     notices: list[str] = field(default_factory=list)
     """Messages about values of the address that were left out; cleared when a control changes."""
-    empty: str = ""
-    """HTML in place of the cards if no robot passes the filter."""
+    empty: str = ""  # HTML in place of the cards if no robot passes the filter
     grid: viser.GuiHtmlHandle | None = None
-    summary: str = ""
-    """Number of robots that pass the filter, and of the page."""
-    page_rows: list[robot_rows.Row] = field(default_factory=list)
-    """Robots on the current page."""
+    summary: str = ""  # number of robots that pass the filter, and of the page
+    page_rows: list[robot_rows.Row] = field(default_factory=list)  # robots on the current page
     page_number: int = 1
 
 
@@ -119,8 +113,7 @@ def draw_cards(gallery: Gallery) -> None:
 
 _ALL = "all"
 _LABELS = {"dof": "DoF", "links": "Links", "reach": "Reach (m)", "mass": "Mass (kg)"}
-_COUNTS = ("dof", "links")
-"""Facts that are integers."""
+_COUNTS = ("dof", "links")  # facts that are integers
 _SORTS = [key for name in robot_rows.SORTS for key in (name, f"-{name}")]
 """Keys of the orders: ascending and descending."""
 
@@ -321,10 +314,8 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
         rows[:] = [replace(row, **facts) if row.uri == uri else row for row in rows]
 
 
-CONTROLS_WIDTH = 330.0
-"""Width of the controls [pixels]."""
-CANVAS_WIDTH = 120.0
-"""Width that viser keeps free for its scene between the panels [pixels]."""
+CONTROLS_WIDTH = 330.0  # width of the controls [pixels]
+CANVAS_WIDTH = 120.0  # width that viser keeps free for its scene between the panels [pixels]
 _PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
     "first": lambda number: 1,
     "prev": lambda number: number - 1,

@@ -57,45 +57,34 @@ from morphgen.viewer.scene.stage import (
 
 UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
 """Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""
-Prototype = Box | Cylinder | Sphere | Mesh
-"""Geometry of which instances are scaled copies."""
+Prototype = Box | Cylinder | Sphere | Mesh  # geometry of which instances are scaled copies
 
 
 @dataclass(frozen=True, eq=False)
 class Instances:
     """The shapes of all robots; m instances."""
 
-    prototypes: dict[Prototype, slice]
-    """Instances of each prototype."""
-    robot: NDArray[np.intp]
-    """Robot of each instance, shape (m,)."""
-    link: NDArray[np.intp]
-    """Link of each instance within its robot, shape (m,)."""
-    T_link_shape: NDArray[np.float32]
-    """Pose of each instance on its link, shape (m, 4, 4)."""
+    prototypes: dict[Prototype, slice]  # instances of each prototype
+    robot: NDArray[np.intp]  # robot of each instance, shape (m,)
+    link: NDArray[np.intp]  # link of each instance within its robot, shape (m,)
+    T_link_shape: NDArray[np.float32]  # pose of each instance on its link, shape (m, 4, 4)
     scale: NDArray[np.float32]
     """Factors by which the prototype is scaled along its axes, shape (m, 3)."""
-    colour: NDArray[np.uint8]
-    """Colour, shape (m, 3)."""
+    colour: NDArray[np.uint8]  # colour, shape (m, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
     """Robots that are drawn and moved together; n robots with at most J independent joints."""
 
-    rows: tuple[Row, ...]
-    """Names, URIs and facts."""
+    rows: tuple[Row, ...]  # names, URIs and facts
     robots: tuple[Robot, ...]
     instances: Instances
     tree: KinematicTree
-    lower: Array
-    """Lower joint limits, padded with 0, shape (n, J) [rad or m]."""
-    upper: Array
-    """Upper joint limits, padded with 0, shape (n, J) [rad or m]."""
-    home: Array
-    """Home configurations within the limits, padded with 0, shape (n, J) [rad or m]."""
-    roles: tuple[str, ...]
-    """Roles of the joints of any robot; see ``comparison.joint_roles``."""
+    lower: Array  # lower joint limits, padded with 0, shape (n, J) [rad or m]
+    upper: Array  # upper joint limits, padded with 0, shape (n, J) [rad or m]
+    home: Array  # home configurations within the limits, padded with 0, shape (n, J) [rad or m]
+    roles: tuple[str, ...]  # roles of the joints of any robot; see `comparison.joint_roles`
     role: NDArray[np.intp]
     """Index into ``roles`` of each joint, shape (n, J); ``len(roles)`` for padding."""
 
@@ -112,8 +101,7 @@ class ReadRobot:
 
     row: Row
     robot: Robot
-    bounds: Array
-    """Lowest and highest corner at home, shape (2, 3) [m]."""
+    bounds: Array  # lowest and highest corner at home, shape (2, 3) [m]
 
 
 def make_population(read: Sequence[ReadRobot]) -> Population:
@@ -221,8 +209,7 @@ class PopulationScene:
     client: viser.ClientHandle
     population: Population
     handles: Mapping[Prototype, viser.BatchedMeshHandle]
-    positions: Array
-    """Positions of the roots on the ground, shape (n, 2) [m]."""
+    positions: Array  # positions of the roots on the ground, shape (n, 2) [m]
     labels: list[viser.LabelHandle] = field(default_factory=list)
 
 
@@ -304,16 +291,12 @@ def surface(prototype: Prototype) -> Triangles:
             return mesh_arrays(trimesh.graph.smooth_shade(simple, angle=SHARP_ANGLE))
 
 
-MAX_ROBOTS = 1000
-"""Largest population."""
-NUM_SAMPLED = 100
-"""Robots that are sampled from a grammar by default."""
-_CHUNK = 20
-"""Robots of one call of a worker."""
+MAX_ROBOTS = 1000  # largest population
+NUM_SAMPLED = 100  # robots that are sampled from a grammar by default
+_CHUNK = 20  # robots of one call of a worker
 ASPECT = 0.7
 """Width of an arrangement divided by its depth: seen from above the front, it fills a window."""
-_MAX_LABELS = 16
-"""Labels beside rows: more would cover each other."""
+_MAX_LABELS = 16  # labels beside rows: more would cover each other
 _WORD_GAP, _LABEL_GAP = 0.2, 0.3
 """Gap between neighbours in a row, in median widths, and between labels and rows [m]."""
 _QUANTILE = 0.8
@@ -324,16 +307,11 @@ _QUANTILE = 0.8
 class Source:
     """Robots that an address names."""
 
-    rows: tuple[Row, ...]
-    """At most ``MAX_ROBOTS``, with the facts that are known."""
-    total: int
-    """Number of robots that the address names."""
-    grammar: str = ""
-    """Name or file of the grammar from which the robots are sampled; else empty."""
-    seed: int = 0
-    """Seed of the sample."""
-    stamp: str = ""
-    """Changes with the files of the robots, the split or the grammar."""
+    rows: tuple[Row, ...]  # at most `MAX_ROBOTS`, with the facts that are known
+    total: int  # number of robots that the address names
+    grammar: str = ""  # name or file of the grammar from which the robots are sampled; else empty
+    seed: int = 0  # seed of the sample
+    stamp: str = ""  # changes with the files of the robots, the split or the grammar
 
     @property
     def key(self) -> str:

@@ -30,10 +30,8 @@ from morphgen.viewer.app.session import Session
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import FileAccess, UriError, content_hash, read_robot_uri, uri_name
 
-SIZE = (240, 180)
-"""Largest width and height of a thumbnail [pixels]."""
-_JPEG_QUALITY = 82
-"""JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card."""
+SIZE = (240, 180)  # largest width and height of a thumbnail [pixels]
+_JPEG_QUALITY = 82  # JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card
 _CACHE_FORMAT = 2
 """Version of the cache; increase it when a thumbnail or its facts change for the same robot."""
 
@@ -42,12 +40,9 @@ _CACHE_FORMAT = 2
 class Thumbnail:
     """A small picture of a robot and its facts."""
 
-    image: str
-    """A JPEG as a ``data:`` URL; empty if the robot cannot be drawn."""
-    facts: dict[str, object]
-    """Values of ``Row`` fields."""
-    error: str = ""
-    """Reason why the robot cannot be read; empty if it can."""
+    image: str  # a JPEG as a `data:` URL; empty if the robot cannot be drawn
+    facts: dict[str, object]  # values of `Row` fields
+    error: str = ""  # reason why the robot cannot be read; empty if it can
 
 
 def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
@@ -151,10 +146,8 @@ def _data_url(picture: Image.Image) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
 
 
-MAX_EXPORT = 200 * 2**20
-"""Largest export before compression [bytes]."""
-MAX_NAME = 60
-"""Longest name of a robot's folder in an export, after its number [characters]."""
+MAX_EXPORT = 200 * 2**20  # largest export before compression [bytes]
+MAX_NAME = 60  # longest name of a robot's folder in an export, after its number [characters]
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
 

@@ -21,11 +21,9 @@ from morphgen.viewer.robot_uri import (
 )
 
 ARMS = "arms with a plate"
-MAX_CHOICES = 500
-"""Robots that a dropdown offers; others can be named by words."""
+MAX_CHOICES = 500  # robots that a dropdown offers; others can be named by words
 
-Robots = list[tuple[str, str]]
-"""Names and URIs."""
+Robots = list[tuple[str, str]]  # names and URIs
 RobotLists = Mapping[str, Callable[[], Robots]]
 """Functions that list robots, by the label of their source."""
 
@@ -36,14 +34,12 @@ class RobotPicker:
 
     session: Session
     lists: RobotLists
-    current: Callable[[], str]
-    """Returns the URI of the robot that the dropdown shows first."""
+    current: Callable[[], str]  # returns the URI of the robot that the dropdown shows first
     source: viser.GuiDropdownHandle[str]
     robot: viser.GuiDropdownHandle[str]
     """Dropdown of the robots of the source; typing into it searches them."""
     words: viser.GuiTextHandle
-    labels: dict[str, str]
-    """URIs of the robots in the dropdown, by label."""
+    labels: dict[str, str]  # URIs of the robots in the dropdown, by label
 
 
 def add_picker(session: Session, lists: RobotLists, current: Callable[[], str]) -> RobotPicker:

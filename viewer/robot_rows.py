@@ -39,8 +39,7 @@ UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
 """Facts that are numbers, and their units."""
 NUMBERS = ("dof", "links", "reach", "mass")
 """Facts by whose range rows can be filtered, in the order of their sliders."""
-UNREADABLE = "unreadable"
-"""Finding of a bundle whose card cannot be read."""
+UNREADABLE = "unreadable"  # finding of a bundle whose card cannot be read
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,12 @@ class Row:
     name: str
     uri: str
     category: str = ""
-    role: str = ""
-    """Side of a split, or kind of a part."""
+    role: str = ""  # side of a split, or kind of a part
     task: str = ""
     dof: int | None = None
     links: int | None = None
-    reach: float | None = None
-    """Reach [m]; None for a robot without a tool, too."""
-    mass: float | None = None
-    """Mass [kg]."""
+    reach: float | None = None  # reach [m]; None for a robot without a tool, too
+    mass: float | None = None  # mass [kg]
     findings: tuple[str, ...] | None = None
     """Codes of errors and warnings; of all findings for rows from the index of a set."""
     order: int = 0
@@ -69,8 +65,7 @@ class Row:
 FILTERS = ("search", "category", "role", "findings", *NUMBERS)
 """Keys of conditions on rows, as addresses have them: words that must all occur, a category, a
 role, ``with`` or ``without`` findings, and ranges ``LOW..HIGH``, which no unknown number is in."""
-ROUNDING = 1e-9
-"""Browsers round the ends of a range."""
+ROUNDING = 1e-9  # browsers round the ends of a range
 
 
 def passes(row: Row, state: Mapping[str, str]) -> bool:

@@ -25,12 +25,10 @@ _ROTATION_UNITS = ("rad", "N m", "rad/s")
 class JointGroup:
     """Independent joints that came with the same part."""
 
-    label: str
-    """Label of the part, which begins the names of its joints; empty for unknown parts."""
+    label: str  # label of the part, which begins the names of its joints; empty for unknown parts
     title: str
     """Label and name of the part, such as ``left_arm (ur5)``; the label alone if both are equal."""
-    rows: tuple[int, ...]
-    """Indices of the joints in q."""
+    rows: tuple[int, ...]  # indices of the joints in q
 
 
 def has_tool(robot: Robot) -> bool:

@@ -45,12 +45,10 @@ from morphgen.model.robot import Robot
 
 WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 """Schemes of robot URIs; a URI without scheme is a path."""
-DEFAULT_WORDS = "arm=ur5 ee=plane"
-"""Words of the robot that pages show when none is named."""
+DEFAULT_WORDS = "arm=ur5 ee=plane"  # words of the robot that pages show when none is named
 EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
 _VERSION = version("morphgen")  # it takes longer to look up than the rest of a hash
-MAX_ERROR = 1000
-"""Longest error that a page shows [characters]."""
+MAX_ERROR = 1000  # longest error that a page shows [characters]
 _TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")
 
 
@@ -62,12 +60,10 @@ class UriError(MorphgenError):
 class FileAccess:
     """Folders that a viewer may read. Plain data, so that worker processes get it too."""
 
-    library_folders: tuple[Path, ...]
-    """Folders of the library of parts."""
+    library_folders: tuple[Path, ...]  # folders of the library of parts
     roots: tuple[Path, ...]
     """Absolute folders below which addresses may name files; relative paths start at the first."""
-    uploads: Path
-    """Folder with the users' uploads."""
+    uploads: Path  # folder with the users' uploads
 
     @cached_property
     def library(self) -> Library:

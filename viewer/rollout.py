@@ -44,8 +44,7 @@ from morphgen.viewer.robot_uri import (
     with_library_meshes,
 )
 
-MAX_CHECKPOINTS = 50
-"""Checkpoints that a page offers."""
+MAX_CHECKPOINTS = 50  # checkpoints that a page offers
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,8 @@ class RolloutConfig:
     """A task, robots and the policy that acts on them."""
 
     task: str
-    robots: tuple[str, ...]
-    """URIs of the robots."""
-    policy: str
-    """Name of a baseline, or the path of a checkpoint as an address names it."""
+    robots: tuple[str, ...]  # URIs of the robots
+    policy: str  # name of a baseline, or the path of a checkpoint as an address names it
     seed: int = 0
     obstacles: bool = False
     simulator: str = "mujoco"
@@ -66,10 +63,8 @@ class EpisodeSource(Protocol):
     """Source of an episode: a simulation or a file."""
 
     episode: Episode
-    max_steps: int
-    """Longest possible episode [control steps]."""
-    faults: dict[str, str]
-    """Errors of robots that cannot do the task, by URI."""
+    max_steps: int  # longest possible episode [control steps]
+    faults: dict[str, str]  # errors of robots that cannot do the task, by URI
 
     def advance(self) -> bool:
         """Simulate one more control step; return False if the episode has ended."""
@@ -274,10 +269,8 @@ def _to_numpy(values: torch.Tensor) -> Array:
     return np.array(values.cpu().numpy(), dtype=np.float32)
 
 
-SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Speeds of playback [simulated seconds per second]."""
-FRAME_TIME = 0.04
-"""Time between two frames in a browser: 25 per second [s]."""
+SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)  # speeds of playback [simulated seconds per second]
+FRAME_TIME = 0.04  # time between two frames in a browser: 25 per second [s]
 MAX_SIMULATION_TIME = 0.12
 """Time after which simulated steps are shown, and commands handled, however far behind [s]."""
 

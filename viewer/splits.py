@@ -45,12 +45,9 @@ from morphgen.viewer.robot_uri import (
 
 SAVED_REGIMES = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
 """Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
-SPLITS = "splits"
-"""Folder in which new splits are written."""
-MAX_NAME = 200
-"""Longest name of a split [characters]."""
-MAX_ROBOTS = 60
-"""Robots of which every pair is compared; a map of more could not be read."""
+SPLITS = "splits"  # folder in which new splits are written
+MAX_NAME = 200  # longest name of a split [characters]
+MAX_ROBOTS = 60  # robots of which every pair is compared; a map of more could not be read
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +55,8 @@ class SplitStudy:
     """Survey of a split's robots."""
 
     audit: Audit
-    statistics: Mapping[str, object]
-    """Statistics by side; empty if a robot cannot be composed."""
-    members: tuple[tuple[Side, Member], ...]
-    """Members that can be composed, train robots first."""
+    statistics: Mapping[str, object]  # statistics by side; empty if a robot cannot be composed
+    members: tuple[tuple[Side, Member], ...]  # members that can be composed, train robots first
     matrices: Mapping[str, Array]
     """Similarity of every pair of these members by measure, shape (n, n)."""
 
@@ -181,8 +176,7 @@ def conclude_study(
     )
 
 
-Sides = tuple[Sequence[Member], Sequence[Member]]
-"""Members to train on, and members to test on."""
+Sides = tuple[Sequence[Member], Sequence[Member]]  # members to train on, and members to test on
 ChooseSides = Callable[[], tuple[list[Row], list[Row]]]
 """Function that returns the robots to train on and those to test on."""
 

@@ -35,10 +35,8 @@ def load_page(name: str) -> Callable[[Any], None]:
     return show
 
 
-MAX_QUERY = 8000
-"""Longest query [characters]."""
-MAX_DIGITS = 15
-"""Longest number in an address [digits]; larger integers are not exact in a browser."""
+MAX_QUERY = 8000  # longest query [characters]
+MAX_DIGITS = 15  # longest number in an address [digits]; larger integers are not exact in a browser
 MAX_PACKED = 4000
 """Longest packed text [characters]; some browsers and mail programs cut longer addresses."""
 MAX_UNPACKED = 200_000
@@ -47,8 +45,7 @@ ROBOT = "robot"
 """Key of the page of a robot, and on the page ``play`` the key of each robot of the rollout."""
 CHOSEN = "chosen"
 """Key of the page of chosen robots, and on other pages the key of each robot in the tray."""
-MAX_COMPARED, MAX_PLAYED = 4, 9
-"""Robots that are compared, and that do a task, at once."""
+MAX_COMPARED, MAX_PLAYED = 4, 9  # robots that are compared, and that do a task, at once
 MAX_CHOSEN = 3000
 """Longest URIs of all chosen robots together, as the address writes them [characters]."""
 
@@ -61,14 +58,12 @@ class AddressError(MorphgenError):
 class Address:
     """A page with its subjects and its state."""
 
-    page: str
-    """Key of the page in ``PAGES``."""
+    page: str  # key of the page in `PAGES`
     subjects: tuple[str, ...] = ("",)
     """Folder, robot URI or name of a split that the page shows; several on page ``compare``."""
     state: Mapping[str, str] = field(default_factory=dict)
     """Sort order, filter, joint positions, ... by key; default values are left out."""
-    robots: tuple[str, ...] = ()
-    """URIs of the robots of a rollout (page ``play`` only)."""
+    robots: tuple[str, ...] = ()  # URIs of the robots of a rollout (page `play` only)
     chosen: tuple[str, ...] = ()
     """URIs of the robots in the tray; on the page ``chosen`` they are the subjects."""
 

@@ -38,12 +38,9 @@ from morphgen.viewer.robot_uri import (
 )
 from morphgen.viewer.scene.stage import BRAND, set_stage
 
-NOTHING = "This address cannot be shown"
-"""Title of the page for an address that cannot be shown."""
-FAULT_WIDTH = 760.0
-"""Width of that page's panel [pixels]."""
-NUM_WORKERS = 2
-"""Processes that draw thumbnails and compare robots."""
+NOTHING = "This address cannot be shown"  # title of the page for an address that cannot be shown
+FAULT_WIDTH = 760.0  # width of that page's panel [pixels]
+NUM_WORKERS = 2  # processes that draw thumbnails and compare robots
 
 
 @dataclass(eq=False)
@@ -51,8 +48,7 @@ class Viewer:
     """A running viewer."""
 
     server: viser.ViserServer
-    start: Address
-    """Page for browsers whose URL names none."""
+    start: Address  # page for browsers whose URL names none
     files: FileAccess
     workers: Workers
     uploads: TemporaryDirectory[str]

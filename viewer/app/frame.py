@@ -31,8 +31,7 @@ from morphgen.viewer.robot_uri import (
 REVEAL = "window.morphgen?.reveal();"
 """JavaScript that removes the cover, after the content before it has been drawn."""
 _BEFORE = b'<div id="root">'
-_SET_PAGES = ("gallery", "population")
-"""Pages whose subject is a set, a folder or a split."""
+_SET_PAGES = ("gallery", "population")  # pages whose subject is a set, a folder or a split
 
 
 def frame_page(response: Response) -> None:

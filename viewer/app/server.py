@@ -40,8 +40,7 @@ from morphgen.viewer.app.viser_internals import (
     replace_handlers,
 )
 
-LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Names of this machine that nobody else can claim."""
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # names of this machine that nobody else can claim
 _PORTS = {"http": 80, "https": 443}
 _FOREIGN_SERVER, _FOREIGN_FILE = "websocket", "playbackPath"
 """Query keys that make viser's page show another server, or a file, under this viewer's name."""
@@ -51,8 +50,7 @@ _FOREIGN_SERVER, _FOREIGN_FILE = "websocket", "playbackPath"
 class AccessPolicy:
     """Names by which a viewer may be addressed, and sites that may use it."""
 
-    names: frozenset[str] = frozenset(LOCAL_NAMES)
-    """Host names and IP addresses, in lower case."""
+    names: frozenset[str] = frozenset(LOCAL_NAMES)  # host names and IP addresses, in lower case
     any_address: bool = False
     """Whether every IP address is accepted as a name, because the viewer listens on all of them."""
     origins: frozenset[str] = frozenset()
@@ -182,16 +180,12 @@ def _is_ip_address(name: str) -> bool:
     return "%" not in name
 
 
-MAX_UPLOAD = 100 * 2**20
-"""Largest upload [bytes]."""
-MAX_TEXT = 200_000
-"""Longest value of a text field [characters]."""
-MAX_NAME = 1000
-"""Longest part of a file name that an error message repeats [characters]."""
+MAX_UPLOAD = 100 * 2**20  # largest upload [bytes]
+MAX_TEXT = 200_000  # longest value of a text field [characters]
+MAX_NAME = 1000  # longest part of a file name that an error message repeats [characters]
 MAX_NUMBER = 2**53
 """Limit of number fields without their own: larger integers are not exact in a browser."""
-MIN_QUATERNION_NORM = 1e-3
-"""Shortest quaternion that still defines a rotation."""
+MIN_QUATERNION_NORM = 1e-3  # shortest quaternion that still defines a rotation
 
 
 class MessageError(MorphgenError):
@@ -341,15 +335,13 @@ MAX_REQUEST_LINE = 65_536
 address of a page with its escapes, and closes the connection without an answer."""
 _POLICY_VIOLATION = 1008
 """Close code of websockets (RFC 6455) for a message that violates the policy."""
-_starting = threading.Lock()
-"""Held while websockets' ``serve`` is replaced."""
+_starting = threading.Lock()  # held while websockets' `serve` is replaced
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 Receive = Callable[[str, str], bool]
 """Receives a request of a page's script: the token of the page, and a query. Returns whether there
 is such a page."""
-REQUESTS = "/morphgen/"
-"""Path of these requests, before the token."""
+REQUESTS = "/morphgen/"  # path of these requests, before the token
 
 
 class _OneLine(logging.Filter):

@@ -26,12 +26,10 @@ from morphgen.viewer.app.viser_internals import run_javascript
 from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_uri import FileAccess
 
-DEFAULT_WIDTH = 1400
-"""Width of a window that a browser does not tell [pixels]."""
+DEFAULT_WIDTH = 1400  # width of a window that a browser does not tell [pixels]
 ADDRESS_DELAY = 0.5
 """Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
-URL_TIMEOUT = 20.0
-"""Time in which a browser has to report its URL [s]."""
+URL_TIMEOUT = 20.0  # time in which a browser has to report its URL [s]
 
 _READ_LOCATION = """
 const name = Object.keys(localStorage).find((key) => key.endsWith(%s));
@@ -45,13 +43,11 @@ if (name) localStorage.setItem(name, JSON.stringify(state));
 class Location:
     """The URL and the theme that a browser reports."""
 
-    query: str = ""
-    """Query of its URL with the question mark; empty if there is none."""
+    query: str = ""  # query of its URL with the question mark; empty if there is none
     dark: bool = False
     """Whether pages are dark: as the address says (``theme=dark``) or said before, else as the
     browser prefers."""
-    width: int = DEFAULT_WIDTH
-    """Width of its window [pixels]."""
+    width: int = DEFAULT_WIDTH  # width of its window [pixels]
 
 
 def read_location(client: viser.ClientHandle) -> Location:
@@ -103,16 +99,11 @@ class Session:
 
     browser: viser.ClientHandle
     files: FileAccess
-    workers: Workers
-    """Processes for slow work, shared by all browsers."""
-    address: Address
-    """Address of the page with its state, as the URL shows it."""
-    dark: bool = False
-    """Whether the page is dark."""
-    width: int = DEFAULT_WIDTH
-    """Width of the browser's window when the page was opened [pixels]."""
-    chosen: tuple[str, ...] = ()
-    """URIs of the robots in the tray."""
+    workers: Workers  # processes for slow work, shared by all browsers
+    address: Address  # address of the page with its state, as the URL shows it
+    dark: bool = False  # whether the page is dark
+    width: int = DEFAULT_WIDTH  # width of the browser's window when the page was opened [pixels]
+    chosen: tuple[str, ...] = ()  # URIs of the robots in the tray
     visit: int = 0
     """Number of the page in this browser, counted from the load of the browser's page."""
     cache: SharedResults = field(default_factory=SharedResults)
@@ -132,8 +123,7 @@ class Session:
     close_callbacks: list[Work] = field(init=False, default_factory=list)
     status: viser.GuiHtmlHandle | None = field(init=False, default=None)
     """Line of the page that shows the current activity."""
-    title: str = field(init=False, default="morphgen")
-    """Title of the browser's tab."""
+    title: str = field(init=False, default="morphgen")  # title of the browser's tab
     tabs: str = field(init=False, default="")
     """Titles of the open tabs, separated by commas; those that are open at first are left out."""
     actions: dict[str, Callable[[str], object]] = field(init=False, default_factory=dict)

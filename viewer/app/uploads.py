@@ -49,21 +49,17 @@ from morphgen.viewer.robot_uri import (
     shorten,
 )
 
-MAX_UPLOADS = 50
-"""Uploads that a viewer keeps."""
+MAX_UPLOADS = 50  # uploads that a viewer keeps
 LIMITS = ZipLimits(max_bytes=100 * 2**20, max_files=2000, max_name=100, max_depth=20)
 """Bounds on a zip."""
-PACKAGE = "package.xml"
-"""Marks a ROS package, which ``package://`` needs."""
+PACKAGE = "package.xml"  # marks a ROS package, which `package://` needs
 _FORMATS = {"robot": "URDF", "mujoco": "MJCF", "mujocoinclude": "included MJCF"}
 """Formats of descriptions by their root element."""
-_SUFFIXES = (".urdf", ".xml")
-"""Suffixes of descriptions."""
+_SUFFIXES = (".urdf", ".xml")  # suffixes of descriptions
 _Documents = dict[str, etree._Element | FormatError]
 """Roots of descriptions by their paths, or why a file is not XML."""
 _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
-_MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
-"""Suffixes of files that meshes refer to."""
+_MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")  # suffixes of files that meshes refer to
 _PATH_ATTRIBUTES = (
     *("assetdir", "file", "filename", "meshdir", "texturedir"),
     *(f"file{side}" for side in ("back", "down", "front", "left", "right", "up")),

@@ -29,10 +29,8 @@ _TITLE = re.compile(r"<title>[^<]*</title>")
 _JOINT_TIME, _HOME_TIME, _FRAME_TIME = 2.4, 1.0, 0.05
 """Time in which a joint moves through its range, at home before the first one, and of a picture
 [s]."""
-_BOUNDED_STEPS = 8
-"""Configurations of each joint by which the camera is framed."""
-_LABEL_SHARE = 0.08
-"""Height of the room for the label, as a share of the robot's."""
+_BOUNDED_STEPS = 8  # configurations of each joint by which the camera is framed
+_LABEL_SHARE = 0.08  # height of the room for the label, as a share of the robot's
 
 
 @contextmanager

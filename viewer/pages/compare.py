@@ -21,17 +21,14 @@ from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 
-PANEL_WIDTH = 520.0
-"""Width of the panel [pixels]."""
+PANEL_WIDTH = 520.0  # width of the panel [pixels]
 EMPTY = (
     "<h2>Compare two to four robots</h2>Pick them here, or tick the box of cards in a gallery and "
     "press <i>compare</i> in the tray."
 )
 ONE_ROBOT = "Add a second robot to see how similar they are."
-PRIMITIVES = "primitives"
-"""Value of ``show`` in the address when primitives are drawn."""
-GAP = 0.35
-"""Distance between the bounding boxes of two robots [m]."""
+PRIMITIVES = "primitives"  # value of `show` in the address when primitives are drawn
+GAP = 0.35  # distance between the bounding boxes of two robots [m]
 _CAMERA_DIRECTION = (0.74, 0.09, 0.28)
 """Direction to the camera, so that robots along y stand from left to right."""
 

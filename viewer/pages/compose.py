@@ -80,8 +80,7 @@ from morphgen.viewer.scene.stage import (
     project_points,
 )
 
-ROBOTS = "robots"
-"""Folder in which bundles are written."""
+ROBOTS = "robots"  # folder in which bundles are written
 DEFAULT_GRAMMAR = "arm3"
 _OF_GRAMMARS = ("choices", "evolve", "number", "text")
 """Keys of the address that only robots of grammars have."""
@@ -260,12 +259,10 @@ def _send_bundle(page: ComposePage, name: str) -> None:
         session.send_file(f"{folder}.zip", zip_files(folder, files))
 
 
-GHOST_OPACITY = 0.16
-"""Opacity of the previous robot."""
+GHOST_OPACITY = 0.16  # opacity of the previous robot
 GESTURE_TIME = 1.0
 """Changes that follow each other faster, as those of a moved slider, count as one [s]."""
-_EDGE = 0.02
-"""Share of the picture at its edges into which a robot may not reach."""
+_EDGE = 0.02  # share of the picture at its edges into which a robot may not reach
 
 
 @dataclass(frozen=True)
@@ -273,10 +270,8 @@ class Facts:
     """Numbers of a robot that the page compares."""
 
     dof: int
-    mass: float
-    """Mass [kg]."""
-    reach: float | None
-    """Reach [m]; None for a robot without a tool or without joints."""
+    mass: float  # mass [kg]
+    reach: float | None  # reach [m]; None for a robot without a tool or without joints
 
 
 @dataclass(eq=False)
@@ -286,12 +281,9 @@ class ComposeView:
     session: Session
     shown: RobotView | None = None
     ghost: RobotView | None = None
-    before: Facts | None = None
-    """Facts of the ghost."""
-    changed_at: float = -np.inf
-    """Time of the last change by ``time.monotonic`` [s]."""
-    count: int = 0
-    """Number of robots shown so far; names the nodes of the scene."""
+    before: Facts | None = None  # facts of the ghost
+    changed_at: float = -np.inf  # time of the last change by `time.monotonic` [s]
+    count: int = 0  # number of robots shown so far; names the nodes of the scene
 
 
 def robot_facts(robot: Robot) -> Facts:
@@ -363,8 +355,7 @@ def _camera_direction(view: ComposeView) -> tuple[float, float, float]:
     return (x, y, z) if np.linalg.norm((x, y)) > 1e-6 else CAMERA_DIRECTION
 
 
-_MAX_CHANGES = 4
-"""Lines of changes on a card."""
+_MAX_CHANGES = 4  # lines of changes on a card
 NO_GRAMMAR = (
     "This robot has no grammar whose choices could be drawn again. <i>mutants</i> makes one: "
     "parameters vary about their values, and arms and end-effectors may be replaced by others. "
@@ -379,14 +370,11 @@ class EvolveTab:
     """Controls of the tab in one browser."""
 
     session: Session
-    grammar: GrammarTab
-    """The tab whose robot evolves."""
+    grammar: GrammarTab  # the tab whose robot evolves
     seed: viser.GuiNumberHandle[int]
     grid: viser.GuiHtmlHandle
-    parent: Individual | None = None
-    """The robot that is shown, if the grammar gave it."""
-    source: str = ""
-    """Words or URI of the robot that is shown, if no grammar gave it."""
+    parent: Individual | None = None  # the robot that is shown, if the grammar gave it
+    source: str = ""  # words or URI of the robot that is shown, if no grammar gave it
     generation: list[Individual] = field(default_factory=list)
     scene: OffspringScene | None = None
 

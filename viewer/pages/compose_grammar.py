@@ -138,8 +138,7 @@ def _item(part: str, arguments: dict[str, str]) -> str:
     return f"{part}({texts})" if texts else part
 
 
-NUM_OFFSPRING = 9
-"""Mutants of a generation."""
+NUM_OFFSPRING = 9  # mutants of a generation
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,14 +237,10 @@ class GrammarTab:
 
     session: Session
     show_robot: ShowRobot
-    source: str
-    """Name or file of the grammar, or the robot that it is around; see ``source_text``."""
-    name: str
-    """Name of the grammar, from which its robots get theirs."""
-    original: str
-    """Text of the grammar before it was edited."""
-    start: viser.GuiDropdownHandle[str]
-    """Grammars to start from."""
+    source: str  # name or file of the grammar, or the robot that it is around; see `source_text`
+    name: str  # name of the grammar, from which its robots get theirs
+    original: str  # text of the grammar before it was edited
+    start: viser.GuiDropdownHandle[str]  # grammars to start from
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
     too_long: viser.GuiHtmlHandle
@@ -256,10 +251,8 @@ class GrammarTab:
     tree: viser.GuiHtmlHandle = field(init=False)
     derivation: Derivation | None = None
     """Derivation of the whole robot; fewer of its parts may be shown."""
-    choices: Choices = field(default_factory=dict)
-    """Choices that gave the robot."""
-    mode: Mode = "typical"
-    """Which robot of the grammar is shown."""
+    choices: Choices = field(default_factory=dict)  # choices that gave the robot
+    mode: Mode = "typical"  # which robot of the grammar is shown
     on_shown: Callable[[Individual], object] | None = None
     """Called after a whole robot of the grammar was shown."""
 

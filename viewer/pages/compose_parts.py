@@ -24,16 +24,14 @@ from morphgen.viewer.pages.compose_grammar import ShowRobot
 from morphgen.viewer.robot_tables import part_title, slider_step
 from morphgen.viewer.robot_uri import DERIVATION, WORDS, resolve_words
 
-NO_PART = "(none)"
-"""Option of a dropdown that leaves a slot empty."""
+NO_PART = "(none)"  # option of a dropdown that leaves a slot empty
 
 
 @dataclass(frozen=True)
 class PartChoice:
     """Parts by slot, and the parameters that differ from their defaults."""
 
-    parts: Mapping[str, str]
-    """Names of parts by slot, such as ``left.arm``."""
+    parts: Mapping[str, str]  # names of parts by slot, such as `left.arm`
     values: Mapping[str, float] = field(default_factory=dict)
     """Parameters by ``slot.parameter``, in SI units."""
 

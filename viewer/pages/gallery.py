@@ -140,8 +140,7 @@ def _set_sides(rows: list[Row], num_train: int) -> None:
     rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
 
 
-INDEX_WIDTH = 620.0
-"""Width of the panel [pixels]."""
+INDEX_WIDTH = 620.0  # width of the panel [pixels]
 Sections = Mapping[str, list[tuple[str, Address]]]
 """Labels and addresses of links, by the title of their section."""
 _ROBOTS, _SPLITS, _GRAMMARS = "Robots in this folder", "Splits", "Grammars"

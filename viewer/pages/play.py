@@ -44,15 +44,13 @@ from morphgen.viewer.scene.rollout import (
 )
 from morphgen.viewer.scene.stage import look_at
 
-PLOT_INTERVAL = 0.25
-"""Time between two updates of the curves [s]."""
+PLOT_INTERVAL = 0.25  # time between two updates of the curves [s]
 COLOURS = (
     *("#1c7ed6", "#f76707", "#2f9e44", "#ae3ec9", "#e03131"),
     *("#0ca678", "#f59f00", "#7048e8", "#868e96"),
 )
 """Colours of the robots, in their order."""
-_HEIGHT = 150
-"""Height of a chart [pixels]."""
+_HEIGHT = 150  # height of a chart [pixels]
 _NOW = "#868e96"
 """Colour of the line at the current time."""
 
@@ -65,8 +63,7 @@ class EpisodePlots:
     folder: viser.GuiFolderHandle
     charts: list[viser.GuiUplotHandle] = field(default_factory=list)
     """Charts of the distance and of the score; empty until an episode is shown."""
-    step: int = 0
-    """Number of control steps that the scene shows."""
+    step: int = 0  # number of control steps that the scene shows
     scores: list[list[float]] = field(default_factory=list)
     """Score after every step by robot, as far as it was computed."""
 
@@ -178,10 +175,8 @@ class RolloutControls:
     """Controls of a rollout in one browser."""
 
     session: Session
-    robots: tuple[str, ...]
-    """URIs of the robots."""
-    start: Callable[[RolloutConfig], object]
-    """Starts a rollout."""
+    robots: tuple[str, ...]  # URIs of the robots
+    start: Callable[[RolloutConfig], object]  # starts a rollout
     handles: dict[str, Any] = field(default_factory=dict)
     """Controls by the field of ``RolloutConfig``."""
 
@@ -296,10 +291,8 @@ def _change_task(controls: RolloutControls) -> None:
     controls.restart()
 
 
-PANEL_WIDTH = 400.0
-"""Width of the panel [pixels]."""
-PLANNERS = ("ik", "scripted")
-"""Policies whose first step takes seconds, because they plan a path."""
+PANEL_WIDTH = 400.0  # width of the panel [pixels]
+PLANNERS = ("ik", "scripted")  # policies whose first step takes seconds, because they plan a path
 
 
 @dataclass(eq=False)
@@ -313,12 +306,9 @@ class PlayPage:
     plots: EpisodePlots
     source: EpisodeSource | None = None
     scene: RolloutScene | None = None
-    framed: tuple[str, ...] = ()
-    """URIs of the robots that the camera was pointed at."""
-    is_planning: bool = False
-    """Whether the policy is still planning its first step."""
-    position: int | None = None
-    """Step at which the user paused; None while the episode plays."""
+    framed: tuple[str, ...] = ()  # URIs of the robots that the camera was pointed at
+    is_planning: bool = False  # whether the policy is still planning its first step
+    position: int | None = None  # step at which the user paused; None while the episode plays
 
     def show_start(self, source: EpisodeSource) -> None:
         """Show a new episode at its start."""

@@ -46,8 +46,7 @@ from morphgen.viewer.scene.stage import (
 )
 from morphgen.viewer.splits import ChooseSides, add_split_form
 
-PANEL_WIDTH = 340.0
-"""Width of the panel [pixels]."""
+PANEL_WIDTH = 340.0  # width of the panel [pixels]
 ARRANGEMENTS = {
     "grid": "grid",
     "reach": "rows by reach",
@@ -55,12 +54,10 @@ ARRANGEMENTS = {
     "dof": "rows by DoF",
 }
 """Labels of the arrangements by their key in the address."""
-MIDDLE = 0.5
-"""Position of a slider whose joints are at home."""
+MIDDLE = 0.5  # position of a slider whose joints are at home
 CAMERA_DIRECTION = (0.08, -0.8, 0.6)
 """Direction to the camera: rows run from left to right, and their order is the reader's."""
-_NUM_NAMED = 5
-"""Selected robots that are listed."""
+_NUM_NAMED = 5  # selected robots that are listed
 
 
 @dataclass(eq=False)
@@ -71,10 +68,8 @@ class PopulationPage:
     population: Population
     scene: PopulationScene
     arrange: viser.GuiDropdownHandle[str]
-    selected: NDArray[np.bool_]
-    """Mask of the selected robots, shape (n,)."""
-    sliders: RoleSliders = field(init=False)
-    """Sliders of the joints' shares of their ranges."""
+    selected: NDArray[np.bool_]  # mask of the selected robots, shape (n,)
+    sliders: RoleSliders = field(init=False)  # sliders of the joints' shares of their ranges
     selection: viser.GuiHtmlHandle = field(init=False)
 
     @property

@@ -59,29 +59,21 @@ from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 from morphgen.viewer.scene.overlays import NUM_POINTS, OFTEN, SELDOM, Overlays, remove_overlay
 
-WEB_PAGE = "robot.html"
-"""Name of the web page in a bundle."""
-PANEL_WIDTH = 390.0
-"""Width of the panel [pixels]."""
-RENDER_TIMEOUT = 60.0
-"""Time in which the browser has to send a screenshot [s]."""
-_STEP = 0.01
-"""Step of the slice [m]."""
+WEB_PAGE = "robot.html"  # name of the web page in a bundle
+PANEL_WIDTH = 390.0  # width of the panel [pixels]
+RENDER_TIMEOUT = 60.0  # time in which the browser has to send a screenshot [s]
+_STEP = 0.01  # step of the slice [m]
 
 
 @dataclass(eq=False)
 class Workspace:
     """The workspace of a page's robot."""
 
-    position: viser.GuiSliderHandle[float]
-    """Position y of the slice [m]."""
+    position: viser.GuiSliderHandle[float]  # position y of the slice [m]
     legend: viser.GuiHtmlHandle
-    asked: str = ""
-    """Position of the slice in the address; anything but a number means zero."""
-    points: Array | None = None
-    """Tool positions, shape (n, 3) [m]; None until they are sampled."""
-    shell: scene_stage.Triangles | None = None
-    """Shell of these positions."""
+    asked: str = ""  # position of the slice in the address; anything but a number means zero
+    points: Array | None = None  # tool positions, shape (n, 3) [m]; None until they are sampled
+    shell: scene_stage.Triangles | None = None  # shell of these positions
 
     def ask(self, position: str) -> None:
         """Remember the position that an address has until the workspace is there."""
@@ -105,8 +97,7 @@ class RobotPage:
     robot: Robot
     view: scene_robot.RobotView
     overlays: Overlays
-    q: Array
-    """Independent joint positions, shape (dof,) [rad or m]."""
+    q: Array  # independent joint positions, shape (dof,) [rad or m]
     sliders: list[viser.GuiSliderHandle[float]] = field(default_factory=list)
     """Sliders in the order of q."""
     slider_scales: list[float] = field(default_factory=list)
@@ -120,19 +111,14 @@ class RobotPage:
     """Dropdown of the unit of angles; None for robots without rotational joints."""
     hover_channel: viser.GuiTextHandle | None = None
     """Hidden text field in which the browser names the joint under the pointer."""
-    angles: str = "rad"
-    """Unit of the sliders of rotational joints, ``rad`` or ``deg``."""
-    selected: str = ""
-    """Name of the selected link; empty if none is."""
-    range_row: int | None = None
-    """Index in q of the joint whose axis and range are drawn."""
-    findings: tuple[Finding, ...] = ()
-    """Findings of the checks, once they are there."""
+    angles: str = "rad"  # unit of the sliders of rotational joints, `rad` or `deg`
+    selected: str = ""  # name of the selected link; empty if none is
+    range_row: int | None = None  # index in q of the joint whose axis and range are drawn
+    findings: tuple[Finding, ...] = ()  # findings of the checks, once they are there
     link_choice: viser.GuiDropdownHandle[str] | None = None
     primitives: Sequence[Sequence[Shape]] | None = None
     """Primitives by link; None until they were shown."""
-    workspace: Workspace | None = None
-    """Controls of the workspace; None for robots without a tool."""
+    workspace: Workspace | None = None  # controls of the workspace; None for robots without a tool
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     gizmo: viser.TransformControlsHandle | None = None
@@ -316,12 +302,9 @@ def _is_on(page: RobotPage, name: str) -> bool:
     return name in page.toggles and page.toggles[name].value
 
 
-NO_LINK = "(none)"
-"""Choice of the dropdown of links that selects none."""
-_DRAG_ROUNDS = 4
-"""Newton steps by which a joint follows the pointer, per event."""
-_MAX_TURN = 0.4
-"""Largest such step [rad or m]."""
+NO_LINK = "(none)"  # choice of the dropdown of links that selects none
+_DRAG_ROUNDS = 4  # Newton steps by which a joint follows the pointer, per event
+_MAX_TURN = 0.4  # largest such step [rad or m]
 
 
 def _select_link(page: RobotPage, name: str) -> None:
@@ -465,8 +448,7 @@ def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, targ
 
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}
 """Units of angles and their number per radian."""
-MAX_TRIES = 500
-"""Random configurations that are tested to find one without collision."""
+MAX_TRIES = 500  # random configurations that are tested to find one without collision
 
 
 def _add_move_tab(page: RobotPage) -> None:
@@ -567,10 +549,8 @@ _SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
 }
 TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
 """Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
-TOOL_TOGGLES = ("workspace", "trail", GIZMO)
-"""Toggles for robots with a tool only."""
-_XRAY_OPACITY = 0.2
-"""Opacity of visual shapes in the x-ray view."""
+TOOL_TOGGLES = ("workspace", "trail", GIZMO)  # toggles for robots with a tool only
+_XRAY_OPACITY = 0.2  # opacity of visual shapes in the x-ray view
 _GROWTH = 0.002
 """Distance by which collision shapes and primitives are grown while visual shapes are shown, in
 extents of the robot: surfaces at the same place would flicker."""

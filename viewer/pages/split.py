@@ -27,12 +27,10 @@ from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
 
-PANEL_WIDTH = 520.0
-"""Largest width of the controls [pixels]."""
+PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36
 """Largest share of the window that the controls take, so that names on the map are readable."""
-NUM_PLAYED = 4
-"""Test robots of the link to a rollout."""
+NUM_PLAYED = 4  # test robots of the link to a rollout
 
 
 @dataclass(eq=False)
@@ -40,8 +38,7 @@ class SplitPage:
     """A split in one browser."""
 
     session: Session
-    name: str
-    """Name or file of the split, as in the address."""
+    name: str  # name or file of the split, as in the address
     split: Split
     gallery: Gallery
     measure: viser.GuiDropdownHandle[str]

@@ -22,22 +22,18 @@ from morphgen.typing import Array
 from morphgen.viewer.scene.robot import RobotView, robot_extent
 from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, grown_triangles, triangles
 
-NUM_POINTS = 200_000
-"""Configurations that are sampled for a workspace."""
+NUM_POINTS = 200_000  # configurations that are sampled for a workspace
 _SHELL_SUBDIVISIONS = 3
 """Subdivisions of the icosahedron whose 642 vertices are the directions of the shell."""
-_CELLS = 48
-"""Cells of a slice along the longest side of the workspace."""
+_CELLS = 48  # cells of a slice along the longest side of the workspace
 
 
 @dataclass(frozen=True, eq=False)
 class Slice:
     """Cells of a vertical plane y = constant that the tool reaches."""
 
-    centres: Array
-    """Shape (n, 3) [m]."""
-    side: float
-    """Side of a cell [m]."""
+    centres: Array  # shape (n, 3) [m]
+    side: float  # side of a cell [m]
     density: Array
     """Share of the configurations near the cell, relative to the most frequent cell, shape (n,)."""
 
@@ -80,18 +76,15 @@ def cut(points: Array, y: float) -> Slice:
     return Slice(centres, side, filled[i, k] / max(float(filled.max()), 1e-9))
 
 
-TRAIL_LENGTH = 400
-"""Tool positions that a trail keeps."""
+TRAIL_LENGTH = 400  # tool positions that a trail keeps
 _ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
-_AMBER: Rgb = (232, 89, 12)
-"""Colour of the inertia of links with findings about it."""
+_AMBER: Rgb = (232, 89, 12)  # colour of the inertia of links with findings about it
 _SHELL: Rgb = (76, 110, 245)
 SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
 """Colours of a slice of the workspace where few and where most configurations lead."""
 _INERTIA_CODES = ("inertia", "mass", "com-", "density")
 """Beginnings of the codes of findings about mass and inertia."""
-_NAME_DISTANCE = 0.045
-"""Distance below which links share a label, in extents of the robot."""
+_NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
 
 @dataclass(eq=False)
@@ -99,8 +92,7 @@ class Overlays:
     """The overlays of a robot."""
 
     view: RobotView
-    nodes: dict[str, list[Any]] = field(default_factory=dict)
-    """viser's scene nodes by overlay."""
+    nodes: dict[str, list[Any]] = field(default_factory=dict)  # viser's scene nodes by overlay
     trail: deque[Array] = field(default_factory=lambda: deque(maxlen=TRAIL_LENGTH))
     """Recent tool positions [m]."""
 
@@ -283,10 +275,8 @@ RANGE: Rgb = (250, 176, 5)
 """Colour of a joint's range; its axis is orange or blue as in the overlay of all axes."""
 _OUTLINE_COLOUR: Rgb = (60, 240, 255)
 """Brighter than ``SELECTED``, because the outline is in the shade of its link."""
-_OUTLINE = 0.009
-"""Thickness of the outline, in extents of the robot."""
-_RADIUS = 0.18
-"""Radius of the arc that shows a range, in extents of the robot."""
+_OUTLINE = 0.009  # thickness of the outline, in extents of the robot
+_RADIUS = 0.18  # radius of the arc that shows a range, in extents of the robot
 _ARC_STEPS = 48
 
 

@@ -35,8 +35,7 @@ from morphgen.viewer.scene.stage import (
 Layer = Literal["visual", "collision", "primitives", "inertia"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
-RED: Rgb = (224, 49, 49)
-"""Colour of colliding or selected links."""
+RED: Rgb = (224, 49, 49)  # colour of colliding or selected links
 _COLOURS: Mapping[Layer, Rgb] = {
     "collision": (64, 192, 87),
     "primitives": (253, 126, 20),
@@ -59,15 +58,12 @@ class RobotView:
 
     scene: viser.SceneApi
     robot: Robot
-    name: str
-    """Name of the robot's node in the scene, such as ``/robot``."""
+    name: str  # name of the robot's node in the scene, such as `/robot`
     base: viser.FrameHandle
-    links: list[viser.FrameHandle]
-    """Frames of the links, in the order of ``robot.links``."""
+    links: list[viser.FrameHandle]  # frames of the links, in the order of `robot.links`
     layers: dict[Layer, list[list[DrawnShape]]] = field(default_factory=dict)
     """Shapes by link of the layers drawn so far."""
-    red: frozenset[str] = frozenset()
-    """Names of the links that are painted red."""
+    red: frozenset[str] = frozenset()  # names of the links that are painted red
     T_root_link: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Current pose of every link in the root frame, shape (n_links, 4, 4)."""
 
@@ -228,8 +224,7 @@ def _add_mesh(
 COLUMNS = 3
 CAMERA_DIRECTION = (0.08, -0.8, 0.62)
 """Direction to the camera: columns run from left to right, and the first row is the farthest."""
-_GAP = 1.25
-"""Distance of two columns in widths of the widest robot."""
+_GAP = 1.25  # distance of two columns in widths of the widest robot
 _ROW = 0.8
 """Smallest distance of two rows in the longest sides of the largest robot: rows are seen from
 above at an angle."""
@@ -240,8 +235,7 @@ class OffspringScene:
     """The offspring in a scene."""
 
     views: list[RobotView]
-    boxes: Array
-    """Lowest and highest corner of each robot in the world, shape (n, 2, 3) [m]."""
+    boxes: Array  # lowest and highest corner of each robot in the world, shape (n, 2, 3) [m]
 
 
 def add_offspring(
@@ -287,10 +281,8 @@ def hit_robot(boxes: Array, origin: Array, direction: Array) -> int | None:
     return int(hits[np.argmin(near[hits])]) if len(hits) else None
 
 
-SIZE = (640, 480)
-"""Width and height of a frame [pixels]."""
-NUM_FRAMES, FPS = 72, 18
-"""Frames of a turn, and frames per second: a turn takes four seconds."""
+SIZE = (640, 480)  # width and height of a frame [pixels]
+NUM_FRAMES, FPS = 72, 18  # frames of a turn, and frames per second: a turn takes four seconds
 _RING_POINTS = 24
 
 

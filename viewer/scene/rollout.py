@@ -25,10 +25,8 @@ from morphgen.viewer.scene.stage import Rgb, add_ground, place_camera, set_stage
 
 Position = tuple[float, float, float]
 
-NODE = "/play"
-"""Name of the scene node above everything of an episode."""
-GAP = 0.3
-"""Distance between the areas of two robots [m]."""
+NODE = "/play"  # name of the scene node above everything of an episode
+GAP = 0.3  # distance between the areas of two robots [m]
 _GOAL: Rgb = (26, 166, 64)
 _BLOCK: Rgb = (230, 140, 38)
 _OBSTACLE: Rgb = (140, 64, 64)
@@ -50,10 +48,8 @@ class RolloutScene:
 
     root: viser.FrameHandle
     tracks: list[DrawnTrack]
-    low: Array
-    """Lowest corner of the episode's bounding box, shape (3,) [m]."""
-    high: Array
-    """Highest corner of the episode's bounding box, shape (3,) [m]."""
+    low: Array  # lowest corner of the episode's bounding box, shape (3,) [m]
+    high: Array  # highest corner of the episode's bounding box, shape (3,) [m]
 
 
 def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
@@ -148,10 +144,8 @@ def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> vis
     )
 
 
-STRIDE = 2
-"""Control steps between two frames."""
-_FRAMED_STEPS = 32
-"""Steps, evenly spread over the episode, by which the camera is framed."""
+STRIDE = 2  # control steps between two frames
+_FRAMED_STEPS = 32  # steps, evenly spread over the episode, by which the camera is framed
 
 
 def render_video(episode: Episode) -> bytes:

@@ -21,11 +21,9 @@ from morphgen.typing import Array
 from morphgen.viewer.app.viser_internals import remove_camera_callbacks
 
 Rgb = tuple[int, int, int]
-Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]
-"""Vertices (n, 3) [m] and faces (m, 3)."""
+Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]  # vertices (n, 3) [m] and faces (m, 3)
 
-GREY: Rgb = (176, 182, 190)
-"""Colour of shapes without their own."""
+GREY: Rgb = (176, 182, 190)  # colour of shapes without their own
 SHARP_ANGLE = np.radians(35.0)
 """Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
 _MAX_SMOOTHED_FACES = 150_000
@@ -111,8 +109,7 @@ def mesh_arrays(mesh: trimesh.Trimesh) -> Triangles:
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
 
 
-BRAND: Rgb = (24, 100, 171)
-"""Colour of links, buttons and sliders."""
+BRAND: Rgb = (24, 100, 171)  # colour of links, buttons and sliders
 CAMERA_DIRECTION = (0.72, -0.60, 0.34)
 """Direction from a robot to the camera, that of the thumbnails (``formats.picture``)."""
 MIN_EXTENT = 0.05
@@ -134,14 +131,10 @@ _KEY_POSITION = (0.9, -1.0, 2.4)
 _GRID: Rgb = (150, 157, 166)
 """Colour of the lines on the ground, visible on light and on dark backgrounds."""
 _SHADOW_OPACITY = 0.3
-_FADE = 5.0
-"""Distance at which the ground has faded, in sizes of what stands on it."""
-_FOV = math.radians(35.0)
-"""Vertical field of view [rad], that of the thumbnails."""
-_MARGIN = 0.92
-"""Share of the picture that what the camera looks at may fill."""
-_MAX_ASPECT = 1.2
-"""Largest aspect of the picture that is used: panels may still open beside it."""
+_FADE = 5.0  # distance at which the ground has faded, in sizes of what stands on it
+_FOV = math.radians(35.0)  # vertical field of view [rad], that of the thumbnails
+_MARGIN = 0.92  # share of the picture that what the camera looks at may fill
+_MAX_ASPECT = 1.2  # largest aspect of the picture that is used: panels may still open beside it
 _STRIP_ASPECT, _PAGE_ASPECT = 0.3, 1.0
 """Aspect below which the picture is still the strip beside the panel of a gallery that the browser
 is leaving, and the aspect that is used instead."""
@@ -245,14 +238,10 @@ def look_at(
 class _Placement:
     """Callback of a camera that points it at a box again when the aspect of the scene changes."""
 
-    low: Array
-    """Lower corner of the box, shape (3,) [m]."""
-    high: Array
-    """Upper corner of the box, shape (3,) [m]."""
-    direction: tuple[float, float, float]
-    """Direction from the box to the camera."""
-    aspect: float = 0.0
-    """Aspect for which the camera was placed last."""
+    low: Array  # lower corner of the box, shape (3,) [m]
+    high: Array  # upper corner of the box, shape (3,) [m]
+    direction: tuple[float, float, float]  # direction from the box to the camera
+    aspect: float = 0.0  # aspect for which the camera was placed last
     position: Array = field(default_factory=lambda: np.zeros(3))
     """Position of the camera when it was placed last, shape (3,) [m]."""
 
@@ -310,22 +299,17 @@ def fit_camera(points: Array, tangents: Array) -> Array:
     return np.array([*((after - before) / 2), forward])
 
 
-_NEAR = 1e-3
-"""Smallest distance from the camera by which points are divided [m]."""
+_NEAR = 1e-3  # smallest distance from the camera by which points are divided [m]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """The camera of a browser."""
 
-    position: Array
-    """Position in the world, shape (3,) [m]."""
-    R_world_camera: Array
-    """Axes of the camera in the world: right, down, forward, shape (3, 3)."""
-    fov: float
-    """Vertical field of view [rad]."""
-    aspect: float
-    """Width of the picture divided by its height."""
+    position: Array  # position in the world, shape (3,) [m]
+    R_world_camera: Array  # axes of the camera in the world: right, down, forward, shape (3, 3)
+    fov: float  # vertical field of view [rad]
+    aspect: float  # width of the picture divided by its height
 
 
 def camera_view(client: viser.ClientHandle) -> View:
