@@ -104,10 +104,8 @@ class Track:
     obstacles: tuple[Block, ...] = ()
     markers: tuple[Marker, ...] = ()  # shapes that show the goal
     block_size: tuple[float, float, float] | None = None
-    q: list[Array] = field(default_factory=list)
-    """Independent joint positions at the start and after every step, shape (J,) each."""
-    block: list[Array] = field(default_factory=list)
-    """Poses of the block at the start and after every step; empty if there is no block."""
+    q: list[Array] = field(default_factory=list)  # positions (J,) at the start and every step
+    block: list[Array] = field(default_factory=list)  # poses at the same times, if there is one
     marker_poses: dict[str, list[Array]] = field(default_factory=dict)
     """Poses of each marker at the start and after every step, by name."""
     score: list[float] = field(default_factory=list)

@@ -14,8 +14,7 @@ from morphgen.typing import Array
 from morphgen.viewer.app.address import Address
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
-CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"
-"""Colours of the bars inside and outside a range."""
+CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"  # bars inside and outside a range
 _NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60  # bars of a histogram, and its height in units of the SVG
 _WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18

@@ -24,8 +24,7 @@ from morphgen.viewer.robot_files import (
 )
 from morphgen.viewer.robot_rows import FILTERS, UNITS, Row, passes
 
-SCALES = ("common", "own")
-"""Scales of pictures: the same for all robots, or for each one that fills its picture."""
+SCALES = ("common", "own")  # of pictures: the same for all robots, or each fills its picture
 
 
 @dataclass(eq=False)
@@ -35,15 +34,11 @@ class Gallery:
     session: Session
     title: str
     rows: list[robot_rows.Row]  # all robots, shown or not
-    columns: tuple[str, ...] = ()
-    """Roles that are shown in a column each; without any, all robots are in one grid."""
-    scale: str = SCALES[1]
-    """Scale of the pictures, one of ``SCALES``, unless the user chooses the other."""
-    noun: str = "robot"
-    """Singular word for what a row of ``rows`` shows: a robot, or a part of the library."""
+    columns: tuple[str, ...] = ()  # roles in a column each; without any, there is one grid
+    scale: str = SCALES[1]  # of the pictures at first, one of `SCALES`
+    noun: str = "robot"  # what a row shows: a robot, or a part of the library
     thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
-    faults: dict[str, str] = field(default_factory=dict)
-    """Errors of robots that cannot be read, by URI."""
+    faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
     controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
     histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     """Distributions of the facts above their sliders."""
@@ -245,8 +240,7 @@ def _range_text(gallery: Gallery, fact: str) -> str:
     return f"{low:g}..{high:g}"
 
 
-REFRESH_INTERVAL = 0.6
-"""Time after which a gallery shows the thumbnails that were drawn meanwhile [s]."""
+REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
 
 
 def load_pictures(gallery: Gallery, rows: Sequence[Row]) -> None:

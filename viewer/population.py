@@ -68,8 +68,7 @@ class Instances:
     robot: NDArray[np.intp]  # robot of each instance, shape (m,)
     link: NDArray[np.intp]  # link of each instance within its robot, shape (m,)
     T_link_shape: NDArray[np.float32]  # pose of each instance on its link, shape (m, 4, 4)
-    scale: NDArray[np.float32]
-    """Factors by which the prototype is scaled along its axes, shape (m, 3)."""
+    scale: NDArray[np.float32]  # factors along the prototype's axes, shape (m, 3)
     colour: NDArray[np.uint8]  # colour, shape (m, 3)
 
 
@@ -85,11 +84,9 @@ class Population:
     upper: Array  # upper joint limits, padded with 0, shape (n, J) [rad or m]
     home: Array  # home configurations within the limits, padded with 0, shape (n, J) [rad or m]
     roles: tuple[str, ...]  # roles of the joints of any robot; see `comparison.joint_roles`
-    role: NDArray[np.intp]
-    """Index into ``roles`` of each joint, shape (n, J); ``len(roles)`` for padding."""
+    role: NDArray[np.intp]  # index into `roles`, shape (n, J); `len(roles)` for padding
 
-    home_bounds: Array
-    """Lowest and highest corner of each robot at home in its root frame, shape (n, 2, 3) [m]."""
+    home_bounds: Array  # lowest and highest corners at home, shape (n, 2, 3) [m]
 
     def __len__(self) -> int:
         return len(self.robots)
@@ -191,15 +188,13 @@ def _copies(shape: Shape) -> list[tuple[Prototype, Pose, Array]]:
             return [(mesh, pose, np.ones(3))]
 
 
-MAX_FACES = 3000
-"""Largest number of faces of a mesh that is drawn as it is [faces]; larger ones are simplified."""
+MAX_FACES = 3000  # largest mesh that is drawn as it is [faces]; larger ones are simplified
 MAX_SHADOWS = 300
 """Largest population that casts shadows [robots]: viser draws shadows up to 20 m from the camera,
 which is nearer than larger ones are seen from, and each would be drawn four times."""
 _CYLINDER_SECTIONS = 24
 _SPHERE_SUBDIVISIONS = 2
-_FADED_SHARE = 0.8
-"""Share of the background's colour in the robots that are not selected, while others are."""
+_FADED_SHARE = 0.8  # share of the background's colour in robots that are not selected
 
 
 @dataclass(eq=False)
@@ -294,13 +289,10 @@ def surface(prototype: Prototype) -> Triangles:
 MAX_ROBOTS = 1000  # largest population
 NUM_SAMPLED = 100  # robots that are sampled from a grammar by default
 _CHUNK = 20  # robots of one call of a worker
-ASPECT = 0.7
-"""Width of an arrangement divided by its depth: seen from above the front, it fills a window."""
+ASPECT = 0.7  # width of an arrangement by its depth: seen from the front above, it fills a window
 _MAX_LABELS = 16  # labels beside rows: more would cover each other
-_WORD_GAP, _LABEL_GAP = 0.2, 0.3
-"""Gap between neighbours in a row, in median widths, and between labels and rows [m]."""
-_QUANTILE = 0.8
-"""Share of a row's robots that its depth has room for; the largest cover those behind a little."""
+_WORD_GAP, _LABEL_GAP = 0.2, 0.3  # in median widths; between labels and rows [m]
+_QUANTILE = 0.8  # of a row's depths; the largest robots cover those behind a little
 
 
 @dataclass(frozen=True)
@@ -404,8 +396,7 @@ def _measured(row: Row, robot: Robot) -> Row:
 class Layout:
     """Positions of n robots on the ground, with labels."""
 
-    positions: Array
-    """Positions of the roots, shape (n, 2) [m]: x to the right, y away from the reader."""
+    positions: Array  # of the roots, (n, 2) [m]: x right, y away from the reader
     labels: tuple[tuple[str, tuple[float, float]], ...] = ()
     """Texts on the ground and their positions [m]."""
 

@@ -32,8 +32,7 @@ from morphgen.viewer.robot_uri import FileAccess, UriError, content_hash, read_r
 
 SIZE = (240, 180)  # largest width and height of a thumbnail [pixels]
 _JPEG_QUALITY = 82  # JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card
-_CACHE_FORMAT = 2
-"""Version of the cache; increase it when a thumbnail or its facts change for the same robot."""
+_CACHE_FORMAT = 2  # increase it when a thumbnail or its facts change for the same robot
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ ARMS = "arms with a plate"
 MAX_CHOICES = 500  # robots that a dropdown offers; others can be named by words
 
 Robots = list[tuple[str, str]]  # names and URIs
-RobotLists = Mapping[str, Callable[[], Robots]]
-"""Functions that list robots, by the label of their source."""
+RobotLists = Mapping[str, Callable[[], Robots]]  # functions that list robots, by source
 
 
 @dataclass(eq=False)
@@ -36,8 +35,7 @@ class RobotPicker:
     lists: RobotLists
     current: Callable[[], str]  # returns the URI of the robot that the dropdown shows first
     source: viser.GuiDropdownHandle[str]
-    robot: viser.GuiDropdownHandle[str]
-    """Dropdown of the robots of the source; typing into it searches them."""
+    robot: viser.GuiDropdownHandle[str]  # of the source; typing into it searches them
     words: viser.GuiTextHandle
     labels: dict[str, str]  # URIs of the robots in the dropdown, by label
 

@@ -37,8 +37,7 @@ SORTS = ("order", "name", "category", "dof", "links", "reach", "mass", "role", "
 """Keys by which rows can be sorted; ``order`` is the order of the set."""
 UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
 """Facts that are numbers, and their units."""
-NUMBERS = ("dof", "links", "reach", "mass")
-"""Facts by whose range rows can be filtered, in the order of their sliders."""
+NUMBERS = ("dof", "links", "reach", "mass")  # facts with a range, in the order of their sliders
 UNREADABLE = "unreadable"  # finding of a bundle whose card cannot be read
 
 
@@ -55,11 +54,9 @@ class Row:
     links: int | None = None
     reach: float | None = None  # reach [m]; None for a robot without a tool, too
     mass: float | None = None  # mass [kg]
-    findings: tuple[str, ...] | None = None
-    """Codes of errors and warnings; of all findings for rows from the index of a set."""
+    findings: tuple[str, ...] | None = None  # errors and warnings; sets have all
     order: int = 0
-    picture_height: float | None = None
-    """Height at the middle of the robot that its picture shows [m]."""
+    picture_height: float | None = None  # shown at the robot's middle [m]
 
 
 FILTERS = ("search", "category", "role", "findings", *NUMBERS)

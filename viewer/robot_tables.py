@@ -16,8 +16,7 @@ from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.viewer import markup
 
-_UNITS = {"prismatic": ("m", "N", "m/s")}
-"""Units of position, effort and velocity by kind of joint; other joints rotate."""
+_UNITS = {"prismatic": ("m", "N", "m/s")}  # of position, effort and velocity
 _ROTATION_UNITS = ("rad", "N m", "rad/s")
 
 
@@ -26,8 +25,7 @@ class JointGroup:
     """Independent joints that came with the same part."""
 
     label: str  # label of the part, which begins the names of its joints; empty for unknown parts
-    title: str
-    """Label and name of the part, such as ``left_arm (ur5)``; the label alone if both are equal."""
+    title: str  # label and name of the part, such as `left_arm (ur5)`, or what both are
     rows: tuple[int, ...]  # indices of the joints in q
 
 

@@ -57,8 +57,7 @@ class SplitStudy:
     audit: Audit
     statistics: Mapping[str, object]  # statistics by side; empty if a robot cannot be composed
     members: tuple[tuple[Side, Member], ...]  # members that can be composed, train robots first
-    matrices: Mapping[str, Array]
-    """Similarity of every pair of these members by measure, shape (n, n)."""
+    matrices: Mapping[str, Array]  # similarity of their pairs by measure, shape (n, n)
 
 
 def make_member(uri: str, category: str, task: str, obstacles: bool, files: FileAccess) -> Member:

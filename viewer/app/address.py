@@ -37,17 +37,12 @@ def load_page(name: str) -> Callable[[Any], None]:
 
 MAX_QUERY = 8000  # longest query [characters]
 MAX_DIGITS = 15  # longest number in an address [digits]; larger integers are not exact in a browser
-MAX_PACKED = 4000
-"""Longest packed text [characters]; some browsers and mail programs cut longer addresses."""
-MAX_UNPACKED = 200_000
-"""Longest text that is unpacked [bytes], so that a short address cannot fill the memory."""
-ROBOT = "robot"
-"""Key of the page of a robot, and on the page ``play`` the key of each robot of the rollout."""
-CHOSEN = "chosen"
-"""Key of the page of chosen robots, and on other pages the key of each robot in the tray."""
+MAX_PACKED = 4000  # longest packed text [characters]; some mail programs cut longer addresses
+MAX_UNPACKED = 200_000  # longest unpacked text [bytes]: a short address cannot fill the memory
+ROBOT = "robot"  # page of a robot; on the page `play`, each robot of the rollout
+CHOSEN = "chosen"  # page of chosen robots; on other pages, each robot in the tray
 MAX_COMPARED, MAX_PLAYED = 4, 9  # robots that are compared, and that do a task, at once
-MAX_CHOSEN = 3000
-"""Longest URIs of all chosen robots together, as the address writes them [characters]."""
+MAX_CHOSEN = 3000  # longest URIs of all chosen robots together in an address [characters]
 
 
 class AddressError(MorphgenError):
@@ -64,8 +59,7 @@ class Address:
     state: Mapping[str, str] = field(default_factory=dict)
     """Sort order, filter, joint positions, ... by key; default values are left out."""
     robots: tuple[str, ...] = ()  # URIs of the robots of a rollout (page `play` only)
-    chosen: tuple[str, ...] = ()
-    """URIs of the robots in the tray; on the page ``chosen`` they are the subjects."""
+    chosen: tuple[str, ...] = ()  # URIs of the robots in the tray, subjects of page `chosen`
 
     @property
     def subject(self) -> str:

@@ -51,12 +51,10 @@ class Viewer:
     start: Address  # page for browsers whose URL names none
     files: FileAccess
     workers: Workers
-    uploads: TemporaryDirectory[str]
-    """Folder of uploads; deleted with the viewer, at the latest when its process ends."""
+    uploads: TemporaryDirectory[str]  # deleted with the viewer, at the latest when its process ends
     sessions: dict[str, Session] = field(default_factory=dict)
     """Current sessions of the connected browsers, by the secret token that their scripts send."""
-    cache: SharedResults = field(default_factory=SharedResults)
-    """Results of slow work that all sessions share."""
+    cache: SharedResults = field(default_factory=SharedResults)  # of slow work, for all sessions
 
     @property
     def port(self) -> int:

@@ -51,10 +51,8 @@ class AccessPolicy:
     """Names by which a viewer may be addressed, and sites that may use it."""
 
     names: frozenset[str] = frozenset(LOCAL_NAMES)  # host names and IP addresses, in lower case
-    any_address: bool = False
-    """Whether every IP address is accepted as a name, because the viewer listens on all of them."""
-    origins: frozenset[str] = frozenset()
-    """Other sites that may use the viewer, such as ``https://hub.example.com``."""
+    any_address: bool = False  # whether every IP address is a name: the viewer listens on all
+    origins: frozenset[str] = frozenset()  # other sites that may use it: `https://hub.example.com`
 
 
 def access_policy(host: str, origins: Sequence[str] = ()) -> AccessPolicy:
@@ -333,8 +331,7 @@ def _all_finite(values: Any) -> bool:  # noqa: ANN401
 MAX_REQUEST_LINE = 65_536
 """Longest first line of a request [bytes]. websockets' own limit of 8192 is below the longest
 address of a page with its escapes, and closes the connection without an answer."""
-_POLICY_VIOLATION = 1008
-"""Close code of websockets (RFC 6455) for a message that violates the policy."""
+_POLICY_VIOLATION = 1008  # close code of websockets (RFC 6455)
 _starting = threading.Lock()  # held while websockets' `serve` is replaced
 
 Answer = Callable[[ServerConnection, Request], Response | None]

@@ -27,8 +27,7 @@ from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_uri import FileAccess
 
 DEFAULT_WIDTH = 1400  # width of a window that a browser does not tell [pixels]
-ADDRESS_DELAY = 0.5
-"""Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
+ADDRESS_DELAY = 0.5  # of URL updates after a move [s]; Safari allows at most 100 updates in 30 s
 URL_TIMEOUT = 20.0  # time in which a browser has to report its URL [s]
 
 _READ_LOCATION = """
@@ -83,8 +82,7 @@ class SessionClosed(RuntimeError):  # noqa: N818
 class StateValue:
     """A value of a page that its address keeps, as text."""
 
-    write: Callable[[], str]
-    """Returns the value; empty for the default, which the address leaves out."""
+    write: Callable[[], str]  # returns the value; empty for the default, which is left out
     apply: Callable[[str], object] | None
     """Takes over the value of an address; None if the page has read it before it was built."""
 
@@ -104,10 +102,8 @@ class Session:
     dark: bool = False  # whether the page is dark
     width: int = DEFAULT_WIDTH  # width of the browser's window when the page was opened [pixels]
     chosen: tuple[str, ...] = ()  # URIs of the robots in the tray
-    visit: int = 0
-    """Number of the page in this browser, counted from the load of the browser's page."""
-    cache: SharedResults = field(default_factory=SharedResults)
-    """Results of slow work, shared by all browsers."""
+    visit: int = 0  # number of the page since the browser has loaded the client
+    cache: SharedResults = field(default_factory=SharedResults)  # of slow work, for all browsers
     events: ThreadPoolExecutor = field(
         default_factory=partial(ThreadPoolExecutor, 1, "morphgen-events")
     )
@@ -117,8 +113,7 @@ class Session:
     background: ThreadPoolExecutor = field(
         init=False, default_factory=partial(ThreadPoolExecutor, 1, "morphgen-background")
     )
-    pending: set[str] = field(init=False, default_factory=set)
-    """Keys of queued work that has not started yet."""
+    pending: set[str] = field(init=False, default_factory=set)  # keys of queued work
     lock: threading.Lock = field(init=False, default_factory=threading.Lock)
     close_callbacks: list[Work] = field(init=False, default_factory=list)
     status: viser.GuiHtmlHandle | None = field(init=False, default=None)
@@ -129,8 +124,7 @@ class Session:
     actions: dict[str, Callable[[str], object]] = field(init=False, default_factory=dict)
     """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
     called with the element's ``data-value``."""
-    on_choice: Work | None = field(init=False, default=None)
-    """Called after the user has chosen other robots."""
+    on_choice: Work | None = field(init=False, default=None)  # called after a choice
     values: dict[str, StateValue] = field(init=False, default_factory=dict)
     """The page's state by its keys in the address; see ``keep``."""
 

@@ -62,8 +62,7 @@ class Workers:
         return ProcessPoolExecutor(self._n, self._context, init_worker, (self._stopped,))
 
 
-MAX_RESULTS = 24
-"""Number of results that are kept; a population of 1,000 robots takes tens of megabytes."""
+MAX_RESULTS = 24  # results that are kept; a population of 1,000 robots takes tens of megabytes
 
 
 class SharedResults:

@@ -29,8 +29,7 @@ EMPTY = (
 ONE_ROBOT = "Add a second robot to see how similar they are."
 PRIMITIVES = "primitives"  # value of `show` in the address when primitives are drawn
 GAP = 0.35  # distance between the bounding boxes of two robots [m]
-_CAMERA_DIRECTION = (0.74, 0.09, 0.28)
-"""Direction to the camera, so that robots along y stand from left to right."""
+_CAMERA_DIRECTION = (0.74, 0.09, 0.28)  # to the camera: robots along y are from left to right
 
 
 @dataclass(eq=False)

@@ -260,8 +260,7 @@ def _send_bundle(page: ComposePage, name: str) -> None:
 
 
 GHOST_OPACITY = 0.16  # opacity of the previous robot
-GESTURE_TIME = 1.0
-"""Changes that follow each other faster, as those of a moved slider, count as one [s]."""
+GESTURE_TIME = 1.0  # changes that follow each other faster, as of a slider, count as one [s]
 _EDGE = 0.02  # share of the picture at its edges into which a robot may not reach
 
 

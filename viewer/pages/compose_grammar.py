@@ -38,10 +38,8 @@ from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess, resolve_grammar, resolve_words
 
-_SHARE_OF_RANGE, _SHARE_OF_VALUE = 0.15, 0.3
-"""Standard deviation of a parameter: the smaller of these shares; tuned by eye."""
-_REPLACED = ("arm", "ee")
-"""Kinds of parts that may be replaced by others of the same kind and ports."""
+_SHARE_OF_RANGE, _SHARE_OF_VALUE = 0.15, 0.3  # deviation: the smaller one; tuned by eye
+_REPLACED = ("arm", "ee")  # kinds of parts that may be replaced by others with the same ports
 _NO_PART = "none"
 
 
@@ -227,8 +225,7 @@ Mode = Literal["typical", "drawn", "chosen"]
 """The typical robot, one that is drawn by seed and number, or the one that choices give."""
 _PLACE = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
 """Beginning of an error that names a place in a grammar."""
-ShowRobot = Callable[[Robot, Derivation, str, str], None]
-"""Shows a robot, given its derivation, the command that makes it, and its URI."""
+ShowRobot = Callable[[Robot, Derivation, str, str], None]  # also gets command and URI
 
 
 @dataclass(eq=False)
@@ -243,18 +240,15 @@ class GrammarTab:
     start: viser.GuiDropdownHandle[str]  # grammars to start from
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
-    too_long: viser.GuiHtmlHandle
-    """Message that the edited text does not fit into the address; else empty."""
+    too_long: viser.GuiHtmlHandle  # that the text does not fit into the address, or empty
     seed: viser.GuiNumberHandle[int]
     number: viser.GuiNumberHandle[int]
     num_parts: viser.GuiSliderHandle[int] = field(init=False)
     tree: viser.GuiHtmlHandle = field(init=False)
-    derivation: Derivation | None = None
-    """Derivation of the whole robot; fewer of its parts may be shown."""
+    derivation: Derivation | None = None  # of the whole robot; fewer parts may be shown
     choices: Choices = field(default_factory=dict)  # choices that gave the robot
     mode: Mode = "typical"  # which robot of the grammar is shown
-    on_shown: Callable[[Individual], object] | None = None
-    """Called after a whole robot of the grammar was shown."""
+    on_shown: Callable[[Individual], object] | None = None  # called with a whole robot
 
     @property
     def is_edited(self) -> bool:

@@ -51,8 +51,7 @@ COLOURS = (
 )
 """Colours of the robots, in their order."""
 _HEIGHT = 150  # height of a chart [pixels]
-_NOW = "#868e96"
-"""Colour of the line at the current time."""
+_NOW = "#868e96"  # colour of the line at the current time
 
 
 @dataclass(eq=False)
@@ -64,8 +63,7 @@ class EpisodePlots:
     charts: list[viser.GuiUplotHandle] = field(default_factory=list)
     """Charts of the distance and of the score; empty until an episode is shown."""
     step: int = 0  # number of control steps that the scene shows
-    scores: list[list[float]] = field(default_factory=list)
-    """Score after every step by robot, as far as it was computed."""
+    scores: list[list[float]] = field(default_factory=list)  # after each step, by robot
 
 
 def start_plots(plots: EpisodePlots, episode: Episode) -> None:
@@ -166,8 +164,7 @@ def _axis(label: str, *, dark: bool) -> uplot.Axis:
     )
 
 
-ACTIONS = ("replace", "add", "only")
-"""Actions on the chosen robot: replace the first, add it, or remove all others."""
+ACTIONS = ("replace", "add", "only")  # replace the first robot, add one, or remove all others
 
 
 @dataclass(eq=False)

@@ -55,8 +55,7 @@ ARRANGEMENTS = {
 }
 """Labels of the arrangements by their key in the address."""
 MIDDLE = 0.5  # position of a slider whose joints are at home
-CAMERA_DIRECTION = (0.08, -0.8, 0.6)
-"""Direction to the camera: rows run from left to right, and their order is the reader's."""
+CAMERA_DIRECTION = (0.08, -0.8, 0.6)  # to the camera: rows are read from left to right
 _NUM_NAMED = 5  # selected robots that are listed
 
 

@@ -100,31 +100,25 @@ class RobotPage:
     q: Array  # independent joint positions, shape (dof,) [rad or m]
     sliders: list[viser.GuiSliderHandle[float]] = field(default_factory=list)
     """Sliders in the order of q."""
-    slider_scales: list[float] = field(default_factory=list)
-    """Value of each slider per unit of q: 1, or 57.3 for an angle in degrees."""
-    slider_values: list[float] = field(default_factory=list)
-    """Values of the sliders when they were last read or set."""
-    slider_box: viser.GuiFolderHandle | None = None
-    """Holds the folders of sliders; None until the Move tab is there."""
+    slider_scales: list[float] = field(default_factory=list)  # per unit of q: 57.3 for degrees
+    slider_values: list[float] = field(default_factory=list)  # when last read or set
+    slider_box: viser.GuiFolderHandle | None = None  # holds the folders of sliders
     slider_folders: list[viser.GuiFolderHandle] = field(default_factory=list)
     angle_choice: viser.GuiDropdownHandle[str] | None = None
     """Dropdown of the unit of angles; None for robots without rotational joints."""
-    hover_channel: viser.GuiTextHandle | None = None
-    """Hidden text field in which the browser names the joint under the pointer."""
+    hover_channel: viser.GuiTextHandle | None = None  # hidden; names the joint at the pointer
     angles: str = "rad"  # unit of the sliders of rotational joints, `rad` or `deg`
     selected: str = ""  # name of the selected link; empty if none is
     range_row: int | None = None  # index in q of the joint whose axis and range are drawn
     findings: tuple[Finding, ...] = ()  # findings of the checks, once they are there
     link_choice: viser.GuiDropdownHandle[str] | None = None
-    primitives: Sequence[Sequence[Shape]] | None = None
-    """Primitives by link; None until they were shown."""
+    primitives: Sequence[Sequence[Shape]] | None = None  # by link, once they were shown
     workspace: Workspace | None = None  # controls of the workspace; None for robots without a tool
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     gizmo: viser.TransformControlsHandle | None = None
     is_dragging: bool = False
-    checker: SelfCollisionChecker | None = None
-    """None until the checker is built, or if its meshes cannot be read."""
+    checker: SelfCollisionChecker | None = None  # None until built, or if meshes are unreadable
 
 
 def show(session: Session) -> None:
@@ -446,8 +440,7 @@ def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, targ
     return q
 
 
-ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}
-"""Units of angles and their number per radian."""
+ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}  # number per radian
 MAX_TRIES = 500  # random configurations that are tested to find one without collision
 
 

@@ -28,8 +28,7 @@ from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
 
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
-PANEL_SHARE = 0.36
-"""Largest share of the window that the controls take, so that names on the map are readable."""
+PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
 NUM_PLAYED = 4  # test robots of the link to a rollout
 
 

@@ -23,8 +23,7 @@ from morphgen.viewer.scene.robot import RobotView, robot_extent
 from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, grown_triangles, triangles
 
 NUM_POINTS = 200_000  # configurations that are sampled for a workspace
-_SHELL_SUBDIVISIONS = 3
-"""Subdivisions of the icosahedron whose 642 vertices are the directions of the shell."""
+_SHELL_SUBDIVISIONS = 3  # of the icosahedron whose 642 vertices are the shell's directions
 _CELLS = 48  # cells of a slice along the longest side of the workspace
 
 
@@ -34,8 +33,7 @@ class Slice:
 
     centres: Array  # shape (n, 3) [m]
     side: float  # side of a cell [m]
-    density: Array
-    """Share of the configurations near the cell, relative to the most frequent cell, shape (n,)."""
+    density: Array  # configurations near each cell, relative to the most, shape (n,)
 
 
 def sample_workspace(robot: Robot) -> Array:
@@ -82,8 +80,7 @@ _AMBER: Rgb = (232, 89, 12)  # colour of the inertia of links with findings abou
 _SHELL: Rgb = (76, 110, 245)
 SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
 """Colours of a slice of the workspace where few and where most configurations lead."""
-_INERTIA_CODES = ("inertia", "mass", "com-", "density")
-"""Beginnings of the codes of findings about mass and inertia."""
+_INERTIA_CODES = ("inertia", "mass", "com-", "density")  # of findings about inertia begin so
 _NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
 
@@ -269,12 +266,9 @@ def extend_trail(overlays: Overlays, position: Array) -> None:
         overlays.nodes["trail"] = [node]
 
 
-SELECTED: Rgb = (0, 190, 220)
-"""Colour of the selected link's outline, of its slider and its card. Red means collision only."""
-RANGE: Rgb = (250, 176, 5)
-"""Colour of a joint's range; its axis is orange or blue as in the overlay of all axes."""
-_OUTLINE_COLOUR: Rgb = (60, 240, 255)
-"""Brighter than ``SELECTED``, because the outline is in the shade of its link."""
+SELECTED: Rgb = (0, 190, 220)  # outline, slider and card of the link; red means collision only
+RANGE: Rgb = (250, 176, 5)  # range of a joint; its axis is orange or blue, as in the overlay
+_OUTLINE_COLOUR: Rgb = (60, 240, 255)  # brighter: the outline is in its link's shade
 _OUTLINE = 0.009  # thickness of the outline, in extents of the robot
 _RADIUS = 0.18  # radius of the arc that shows a range, in extents of the robot
 _ARC_STEPS = 48

@@ -222,12 +222,9 @@ def _add_mesh(
 
 
 COLUMNS = 3
-CAMERA_DIRECTION = (0.08, -0.8, 0.62)
-"""Direction to the camera: columns run from left to right, and the first row is the farthest."""
+CAMERA_DIRECTION = (0.08, -0.8, 0.62)  # to the camera: the first row is the farthest
 _GAP = 1.25  # distance of two columns in widths of the widest robot
-_ROW = 0.8
-"""Smallest distance of two rows in the longest sides of the largest robot: rows are seen from
-above at an angle."""
+_ROW = 0.8  # smallest distance of rows in longest sides: they are seen from above at an angle
 
 
 @dataclass(eq=False)

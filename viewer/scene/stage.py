@@ -24,10 +24,8 @@ Rgb = tuple[int, int, int]
 Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]  # vertices (n, 3) [m] and faces (m, 3)
 
 GREY: Rgb = (176, 182, 190)  # colour of shapes without their own
-SHARP_ANGLE = np.radians(35.0)
-"""Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
-_MAX_SMOOTHED_FACES = 150_000
-"""Largest mesh whose sharp edges are searched; larger ones would take seconds [faces]."""
+SHARP_ANGLE = np.radians(35.0)  # larger angles are drawn as edges; tuned by eye on real arms
+_MAX_SMOOTHED_FACES = 150_000  # of larger meshes, a search for edges would take seconds
 
 
 def shape_colour(shape: Shape) -> Rgb:
@@ -110,10 +108,8 @@ def mesh_arrays(mesh: trimesh.Trimesh) -> Triangles:
 
 
 BRAND: Rgb = (24, 100, 171)  # colour of links, buttons and sliders
-CAMERA_DIRECTION = (0.72, -0.60, 0.34)
-"""Direction from a robot to the camera, that of the thumbnails (``formats.picture``)."""
-MIN_EXTENT = 0.05
-"""Smallest extent of a robot by which axes, markers and the scale bar are drawn [m]."""
+CAMERA_DIRECTION = (0.72, -0.60, 0.34)  # to the camera, that of the thumbnails
+MIN_EXTENT = 0.05  # smallest extent by which axes, markers and the scale bar are drawn [m]
 _BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
     False: ((246, 248, 250), (206, 212, 219)),
     True: ((52, 57, 64), (24, 26, 30)),
@@ -121,15 +117,12 @@ _BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
 """Colours at the top and bottom of the background, for light and dark pages. The light one is grey
 enough for white robots."""
 _GRADIENT_ROWS = 128
-_LIGHT: Literal["studio"] = "studio"
-"""Environment map that is installed with viser: soft boxes in a grey room."""
+_LIGHT: Literal["studio"] = "studio"  # environment map of viser: soft boxes in a grey room
 _LIGHT_INTENSITY, _KEY_INTENSITY = 0.35, 0.75
 """Factor on the environment map, and intensity of the light that casts shadows; tuned by eye, so
 that white robots keep their edges."""
-_KEY_POSITION = (0.9, -1.0, 2.4)
-"""Direction to the light that casts shadows: above the camera's shoulder."""
-_GRID: Rgb = (150, 157, 166)
-"""Colour of the lines on the ground, visible on light and on dark backgrounds."""
+_KEY_POSITION = (0.9, -1.0, 2.4)  # of the light with shadows: above the camera's shoulder
+_GRID: Rgb = (150, 157, 166)  # visible on light and on dark backgrounds
 _SHADOW_OPACITY = 0.3
 _FADE = 5.0  # distance at which the ground has faded, in sizes of what stands on it
 _FOV = math.radians(35.0)  # vertical field of view [rad], that of the thumbnails
