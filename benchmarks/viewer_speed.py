@@ -348,6 +348,7 @@ def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
+    from morphgen.viewer import population
     from morphgen.viewer.app.app import serve
     from morphgen.viewer.pages import population as page_population
     from morphgen.viewer.pages import robot as page_robot
@@ -363,7 +364,7 @@ def _serve(told: Path) -> None:
         return call
 
     update_scene = timed(page_robot.update_scene, times["robot"])
-    move = timed(page_population.move, times["population"])
+    move = timed(population.move, times["population"])
     with (
         patch.object(page_robot, "update_scene", update_scene),
         patch.object(page_population, "move", move),

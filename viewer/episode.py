@@ -86,10 +86,6 @@ class _About:
     bodies: tuple[_Body, ...]
 
 
-_SHARED = ("task", "policy", "seed", "obstacles", "simulator", "period")
-"""Fields of an episode that ``about`` has, in the order of both."""
-
-
 class EpisodeError(MorphgenError):
     """A file is not an episode, or its robot has changed."""
 
@@ -153,8 +149,10 @@ def snapshot(episode: Episode) -> Episode:
     tracks = []
     for track in episode.tracks:
         n = min(track.num_steps, len(track.score))
-        at_moments = {"q": track.q[: n + 1], "block": track.block[: n + 1]}
-        of_steps = {name: getattr(track, name)[:n] for name in ("score", "distance", "success")}
+        at_moments: dict[str, Any] = {"q": track.q[: n + 1], "block": track.block[: n + 1]}
+        of_steps: dict[str, Any] = {
+            name: getattr(track, name)[:n] for name in ("score", "distance", "success")
+        }
         poses = {name: poses[: n + 1] for name, poses in track.marker_poses.items()}
         tracks.append(replace(track, marker_poses=poses, **at_moments, **of_steps))
     return replace(episode, tracks=tracks)
@@ -162,8 +160,10 @@ def snapshot(episode: Episode) -> Episode:
 
 def episode_bytes(episode: Episode) -> bytes:
     """Return an episode's file; the same episode gives the same bytes."""
-    shared = (getattr(episode, name) for name in _SHARED)
-    about = _About(FORMAT, version("morphgen"), *shared, tuple(map(_body, episode.tracks)))
+    bodies = tuple(map(_body, episode.tracks))
+    about = _About(
+        format=FORMAT, morphgen=version("morphgen"), bodies=bodies, **_shared_fields(episode)
+    )
     arrays: dict[str, Any] = {"about": np.array(json.dumps(msgspec.to_builtins(about)))}
     for i, track in enumerate(episode.tracks):
         arrays |= {f"{i}/{name}": values for name, values in _arrays(track).items()}
@@ -193,7 +193,13 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
         msgspec.MsgspecError,
     ) as error:
         raise EpisodeError(f"{path} is not an episode of morphgen view: {error}") from error
-    return Episode(*(getattr(about, name) for name in _SHARED), tracks)
+    return Episode(tracks=tracks, **_shared_fields(about))
+
+
+def _shared_fields(record: Episode | _About) -> dict[str, Any]:
+    """Return what an episode and the text ``about`` of its file both have."""
+    names = ("task", "policy", "seed", "obstacles", "simulator", "period")
+    return {name: getattr(record, name) for name in names}
 
 
 def _body(track: Track) -> _Body:

@@ -21,7 +21,7 @@ from morphgen.viewer.comparison import (
     similarity_table,
     with_roles,
 )
-from morphgen.viewer.figures import heatmap_svg, map_svg, spread
+from morphgen.viewer.figures import heatmap_svg, map_svg
 
 LIBRARY = default_library()
 
@@ -96,17 +96,10 @@ def test_figures_link_to_robots_and_escape_names():
     assert "b and &lt;a&gt;: 0.300" in heatmap
 
 
-def test_points_at_one_place_are_spread():
-    points = spread(np.zeros((300, 2)))
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2) + 9 * np.eye(300)
-    assert distance.min() > 0.6
-    assert np.abs(points).max() < 20
-    far = np.array([[0.0, 0.0], [10.0, 0.0]])
-    np.testing.assert_allclose(spread(far), far, atol=0.1)
-
-
-def test_pictures_of_a_map_do_not_cover_each_other():
-    points = np.random.default_rng(0).normal(size=(60, 2))
+@pytest.mark.parametrize(
+    "points", [np.random.default_rng(0).normal(size=(60, 2)), np.zeros((60, 2))]
+)
+def test_pictures_of_a_map_do_not_cover_each_other(points):
     names = [str(i) for i in range(60)]
     text = map_svg(points, names, ["test"] * 60, names, {})
     pattern = r'class="point" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"'

@@ -90,9 +90,6 @@ def test_mutants_of_a_robot_without_a_grammar_need_no_other_button(shared_viewer
         client.shows('data-do="adopt" data-value="8"')
 
 
-LIBRARY = default_library()
-
-
 def around(derivation):
     text = grammar_around(derivation, LIBRARY)
     grammar = grammar_from_text(text, "around")

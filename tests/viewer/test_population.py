@@ -4,7 +4,6 @@ import shutil
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from helpers.viser_client import PlainClient
 from morphgen.grammar.library import default_library
@@ -21,7 +20,6 @@ from morphgen.viewer.population import (
     grid,
     make_population,
     move_roles,
-    quaternions,
     read_robots,
     rows_by_fact,
     shape_poses,
@@ -72,17 +70,6 @@ def test_a_role_moves_in_every_robot_by_the_same_share(population):
         expected = with_roles(robot, np.array(robot.home), {"joint 1": 1.0, "joint 2": -0.5})
         np.testing.assert_allclose(q[i, : robot.dof], expected)
     np.testing.assert_array_equal(move_roles(population, population.home, {}), population.home)
-
-
-def test_quaternions_are_those_of_the_rotations():
-    turns = Rotation.random(500, np.random.default_rng(0))
-    halves = Rotation.from_rotvec(np.pi * np.eye(3))
-    poses = np.tile(np.eye(4, dtype=np.float32), (503, 1, 1))
-    poses[:, :3, :3] = Rotation.concatenate([turns, halves]).as_matrix()
-    expected = Rotation.concatenate([turns, halves]).as_quat()[:, [3, 0, 1, 2]]
-    similarity = np.abs((quaternions(poses) * expected).sum(axis=1))
-    np.testing.assert_allclose(similarity, 1, atol=1e-6)
-    assert quaternions(poses[:0]).shape == (0, 4)
 
 
 def test_rows_are_sorted_and_labelled_by_their_first_robot():

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 from helpers.pages import choose, field, nodes, press, wait_until
-from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.model.kinematics import frame_pose
 from morphgen.viewer.pages.robot import format_joints
@@ -81,21 +80,6 @@ def test_workspace_trail_and_gizmo(see, viewer, picture):
 
 
 @pytest.mark.slow
-def test_links_and_findings_are_shown(see, viewer):
-    on = viewer()
-    uri = "words:arm=panda ee=panda_hand"
-    page = see(f"?robot={uri}", on=on)
-    wait_for_page(page)
-    show_tab(page, "Links")
-    page.get_by_role("cell", name="ee_panda_rightfinger").wait_for()
-    show_tab(page, "Check")
-    codes = {finding.code for finding in check(read_robot_uri(uri, on.files))}
-    assert len(codes) > 0
-    for code in codes:
-        page.get_by_text(code, exact=True).first.wait_for()
-
-
-@pytest.mark.slow
 def test_a_bundle_is_downloaded_whole(see, folder):
     page = see(ARM)
     wait_for_page(page)
@@ -110,15 +94,6 @@ def test_a_bundle_is_downloaded_whole(see, folder):
     picture = Image.open(io.BytesIO(found.value.path().read_bytes()))
     assert picture.size[0] > 300
     assert len(picture.convert("RGB").getcolors(10**6)) > 20
-
-
-@pytest.mark.slow
-def test_a_broken_robot_shows_its_findings(see, picture):
-    page = see("?robot=robots/broken")
-    page.locator(".tag.error").first.wait_for()
-    assert page.get_by_text(re.compile("lost")).first.is_visible()
-    page.get_by_role("link", name="Library").first.wait_for()
-    picture(page)
 
 
 @pytest.mark.slow

@@ -89,10 +89,12 @@ def test_score_counts_the_steps_so_far(episode):
     assert score_until(track, "push", 2) == track.score[1]
 
 
-def test_episode_is_restored_from_its_file(episode, files, root):
+def test_episode_is_restored_from_its_file(episode, files, root, monkeypatch):
     content = episode_bytes(episode)
     assert content == episode_bytes(episode)
     (root / "episode.npz").write_bytes(content)
+    monkeypatch.chdir(root)
+    assert start_address(("episode.npz",), files) == Address("play", ("episode.npz",))
     read = read_episode(root / "episode.npz", files)
     assert (read.task, read.policy, read.seed, read.simulator) == ("reach", "ik", 3, "mujoco")
     for one, other in zip(read.tracks, episode.tracks, strict=True):
@@ -134,12 +136,6 @@ def test_an_episode_without_a_period_is_an_error(episode, files, root, period):
     np.savez(path, **(arrays | {"about": np.array(json.dumps(about))}))
     with pytest.raises(EpisodeError, match=f"a period of {period} s"):
         read_episode(path, files)
-
-
-def test_a_viewer_can_be_started_for_an_episode(episode, files, root, monkeypatch):
-    monkeypatch.chdir(root)
-    (root / "episode.npz").write_bytes(episode_bytes(episode))
-    assert start_address(("episode.npz",), files) == Address("play", ("episode.npz",))
 
 
 def test_an_episode_at_its_start_can_be_saved(files, root, cache):

@@ -31,6 +31,7 @@ from morphgen.viewer.app.frame import frame_page
 from morphgen.viewer.app.viser_internals import (
     ACCEPTED_MESSAGES,
     GuiUpdate,
+    Handler,
     ScenePointer,
     UploadPart,
     UploadStart,
@@ -224,7 +225,7 @@ class MessageFilter:
         """Replace viser's handlers of values for controls and of uploads."""
         self._client, self._report = client, report
         self._upload, self._rest = "", 0
-        own = {
+        own: dict[type[Any], Handler] = {
             GuiUpdate: self.update,
             UploadStart: self.start_upload,
             UploadPart: self.receive_part,
