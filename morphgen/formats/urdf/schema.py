@@ -16,15 +16,104 @@ from morphgen.formats.urdf.write import MUJOCO_BOUNDS
 from morphgen.model.findings import Finding, left_out
 from morphgen.model.robot import JOINT_KINDS
 
-_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")  # neither NaN nor hex
+MAX_NUMBER = 1e20  # largest number that a URDF may hold; simulators overflow above it
+MIN_LENGTH = 1e-6  # smallest length of a primitive [m]; simulators round smaller ones to zero
+MAX_TEXT = 1000  # longest name or file name in a URDF [characters]
+MAX_LINKS = 1000  # largest number of links, and of joints, that is read
+MAX_SHAPES = 10_000  # largest number of visual and collision shapes that is read
+MAX_ERRORS = 50  # number of errors after which the check stops
+
+_SCHEMA = f"""
+robot      name! version             > link* joint* material* mujoco morphgen
+link       name!                     > inertial visual* collision*
+inertial                             > origin mass inertia
+visual     name                      > origin geometry material
+collision  name                      > origin geometry
+geometry                             > box capsule cylinder sphere mesh
+material   name                      > color
+joint      name! type!               > origin parent child axis limit mimic dynamics
+joint                                > calibration? safety_controller?
+parent     link!
+child      link!
+mimic      joint! multiplier=1 offset=1
+origin     xyz=3 rpy=3 quat_xyzw=4
+axis       xyz=3
+limit      lower=1 upper=1 effort=1 velocity=1
+dynamics   damping=1 friction=1
+calibration        rising=1 falling=1
+safety_controller  soft_lower_limit=1 soft_upper_limit=1 k_position=1 k_velocity=1
+mass       value=1!
+inertia    ixx=1! ixy=1! ixz=1! iyy=1! iyz=1! izz=1!
+box        size=3!+
+sphere     radius=1!+
+capsule    radius=1!+ length=1+ fromto=6
+cylinder   radius=1!+ length=1!+
+mesh       filename! scale=1,3
+color      rgba=4
+mujoco                               > compiler
+compiler   meshdir strippath fusestatic discardvisual {" ".join(MUJOCO_BOUNDS)}
+morphgen                             > home frame
+home       joint position
+frame      name
+"""
+"""Elements of URDF that are read: their attributes and, after ``>``, their children.
+
+An attribute that must be there has a ``!``, one of numbers their valid counts after ``=``, and one
+of lengths a ``+``. Children that may repeat have a ``*``. Those with a ``?`` are not read, but
+their numbers are checked: loaders refuse invalid ones.
+"""
 
 
-MAX_NUMBER = 1e20
-"""Largest number that a URDF may hold; simulators overflow above it."""
-MIN_LENGTH = 1e-6
-"""Smallest length of a primitive [m]; simulators round smaller ones to zero."""
-MAX_TEXT = 1000
-"""Longest name or file name in a URDF [characters]."""
+@dataclass(frozen=True)
+class _Attribute:
+    name: str
+    counts: tuple[int, ...]  # valid counts of numbers; empty for a text
+    required: bool
+    positive: bool
+
+
+def _parsed(
+    schema: str,
+) -> tuple[dict[str, list[_Attribute]], dict[str, list[str]], dict[str, str]]:
+    """Return the attributes and the children of every element by tag, and the marks of children."""
+    attributes: dict[str, list[_Attribute]] = {}
+    children: dict[str, list[str]] = {}
+    marks: dict[str, str] = {}
+    for line in schema.strip().splitlines():
+        own, _, inside = line.partition(">")
+        tag, *words = own.split()
+        for name, counts, mark, plus in re.findall(r"(\w+)=?([\d,]*)(!?)(\+?)", " ".join(words)):
+            numbers = tuple(map(int, filter(None, counts.split(","))))
+            attribute = _Attribute(name, numbers, bool(mark), bool(plus))
+            attributes.setdefault(tag, []).append(attribute)
+        for name, mark in re.findall(r"(\w+)([*?]?)", inside):
+            children.setdefault(tag, []).append(name)
+            marks[name] = mark
+    return attributes, children, marks
+
+
+_ATTRIBUTES, CHILDREN, _MARKS = _parsed(_SCHEMA)
+_READ_ATTRIBUTES = {tag: [each.name for each in rules] for tag, rules in _ATTRIBUTES.items()}
+_READ_CHILDREN = {tag: [n for n in names if _MARKS[n] != "?"] for tag, names in CHILDREN.items()}
+_EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
+    "joint": {"parent": "", "child": ""},
+    "inertial": {
+        "mass": "its <inertial> without <mass> was left out",
+        "inertia": "the missing <inertia> was read as zero",
+    },
+    "visual": {"geometry": "a <visual> without <geometry> was left out"},
+    "collision": {"geometry": "a <collision> without <geometry> was left out"},
+}
+"""Children that an element should have, with the repair if one is missing; empty: an error."""
+_WITH_COMMAS = ("size", "scale")  # attributes that MuJoCo alone refuses with commas
+_EXTENSIONS = (
+    "acceleration calibration collision_checking contact contact_coefficients controller_gains "
+    "deceleration deformable dont_collapse gazebo gravity inertial_frame jerk joint_properties "
+    "kinematic ros2_control safety_controller self_collision_checking self_filter sensor specular "
+    "surface texture transmission type verbose"
+)
+"""Names that robot software knows and that a robot has no place for; others may be slips."""
 
 
 def _finding(
@@ -41,134 +130,6 @@ def _finding(
     return Finding(code, "warning" if repair else "error", where, why, fix, repair)
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """An attribute that holds numbers."""
-
-    attribute: str
-    counts: tuple[int, ...] = (1,)
-    """Valid counts of numbers."""
-    required: bool = False
-    """Whether a missing attribute is an error."""
-    positive: bool = False
-    nonzero: bool = False
-    accepts_commas: bool = False
-    """Whether commas between the numbers are repaired instead of refused."""
-    accepts_surplus: bool = False
-    """Whether surplus numbers are ignored instead of refused."""
-
-
-CHILDREN = {
-    "link": ("inertial", "visual", "collision"),
-    "inertial": ("origin", "mass", "inertia"),
-    "visual": ("origin", "geometry", "material"),
-    "collision": ("origin", "geometry"),
-    "geometry": ("box", "capsule", "cylinder", "sphere", "mesh"),
-    "material": ("color",),
-    "joint": (
-        "origin",
-        "parent",
-        "child",
-        "axis",
-        "limit",
-        "mimic",
-        "dynamics",
-        "calibration",
-        "safety_controller",
-    ),
-}
-"""Child elements that are read, by parent element."""
-
-_UNREAD = ("calibration", "safety_controller")
-"""Children that are not read, but whose numbers are checked: loaders refuse invalid ones."""
-_READ_CHILDREN = {
-    "robot": ("link", "joint", "material", "mujoco", "morphgen"),
-    **{tag: tuple(n for n in names if n not in _UNREAD) for tag, names in CHILDREN.items()},
-    "mujoco": ("compiler",),
-    "morphgen": ("home", "frame"),
-}
-_REPEATABLE = ("visual", "collision")
-_EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
-    "joint": {"parent": "", "child": ""},
-    "inertial": {
-        "mass": "its <inertial> without <mass> was left out",
-        "inertia": "the missing <inertia> was read as zero",
-    },
-    "visual": {"geometry": "a <visual> without <geometry> was left out"},
-    "collision": {"geometry": "a <collision> without <geometry> was left out"},
-}
-"""Children that an element should have, with the repair if one is missing; empty: an error."""
-_REQUIRED_TEXT = {
-    "robot": ("name",),
-    "link": ("name",),
-    "joint": ("name", "type"),
-    "parent": ("link",),
-    "child": ("link",),
-    "mimic": ("joint",),
-    "mesh": ("filename",),
-}
-_NUMBERS = {
-    "origin": (Numbers("xyz", (3,)), Numbers("rpy", (3,)), Numbers("quat_xyzw", (4,))),
-    "axis": (Numbers("xyz", (3,)),),
-    "limit": tuple(Numbers(name) for name in ("lower", "upper", "effort", "velocity")),
-    "mimic": (Numbers("multiplier"), Numbers("offset")),
-    "dynamics": (Numbers("damping"), Numbers("friction")),
-    "calibration": (Numbers("rising"), Numbers("falling")),
-    "safety_controller": tuple(
-        Numbers(name)
-        for name in ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity")
-    ),
-    "mass": (Numbers("value", required=True),),
-    "inertia": tuple(
-        Numbers(name, required=True) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    ),
-    "box": (Numbers("size", (3,), required=True, positive=True, accepts_commas=True),),
-    "sphere": (Numbers("radius", required=True, positive=True),),
-    "capsule": (
-        Numbers("radius", required=True, positive=True),
-        Numbers("length", positive=True),
-        Numbers("fromto", (6,)),
-    ),
-    "cylinder": (
-        Numbers("radius", required=True, positive=True),
-        Numbers("length", required=True, positive=True),
-    ),
-    "mesh": (Numbers("scale", (1, 3), nonzero=True, accepts_commas=True, accepts_surplus=True),),
-    "color": (Numbers("rgba", (4,)),),
-}
-
-
-_LABELS = {
-    "robot": ("version",),
-    "visual": ("name",),
-    "collision": ("name",),
-    "material": ("name",),
-    "geometry": (),
-    "mujoco": (),
-    "compiler": ("meshdir", "strippath", "fusestatic", "discardvisual", *MUJOCO_BOUNDS),
-    "morphgen": (),
-    "home": ("joint", "position"),
-    "frame": ("name",),
-}
-"""Further attributes that are read or only say how to load the file."""
-_ATTRIBUTES = {
-    tag: (
-        *_REQUIRED_TEXT.get(tag, ()),
-        *(numbers.attribute for numbers in _NUMBERS.get(tag, ())),
-        *_LABELS.get(tag, ()),
-    )
-    for tag in (*_REQUIRED_TEXT, *_NUMBERS, *_LABELS)
-}
-"""Attributes that are read, by element."""
-_EXTENSIONS = (
-    "acceleration calibration collision_checking contact contact_coefficients controller_gains "
-    "deceleration deformable dont_collapse gazebo gravity inertial_frame jerk joint_properties "
-    "kinematic ros2_control safety_controller self_collision_checking self_filter sensor specular "
-    "surface texture transmission type verbose"
-)
-"""Names that robot software knows and that a robot has no place for; others may be slips."""
-
-
 def unread_findings(root: etree._Element) -> Iterator[Finding]:
     """Yield a finding for each kind of attribute, element and text that is not read.
 
@@ -181,7 +142,7 @@ def unread_findings(root: etree._Element) -> Iterator[Finding]:
         element = todo.pop()
         tag = str(element.tag)
         for name in map(str, element.attrib):
-            if name not in _ATTRIBUTES.get(tag, ()):
+            if name not in _READ_ATTRIBUTES.get(tag, ()):
                 unread.setdefault((tag, "attribute", name), []).append(element)
         if any(text and text.strip() for text in (element.text, *(c.tail for c in element))):
             unread.setdefault((tag, "text", ""), []).append(element)
@@ -196,7 +157,7 @@ def unread_findings(root: etree._Element) -> Iterator[Finding]:
 
 def _unread_finding(tag: str, kind: str, name: str, found: list[etree._Element]) -> Finding:
     first, local = found[0], etree.QName(name).localname if name else ""
-    valid: tuple[str, ...] = ()
+    valid: Sequence[str] = ()
     what = f"{len(found)} text of <{tag}>"
     if kind == "element":
         prefix = f"{first.prefix}:" if first.prefix else ""
@@ -204,7 +165,7 @@ def _unread_finding(tag: str, kind: str, name: str, found: list[etree._Element])
     elif kind == "attribute":
         prefixes = {namespace: prefix for prefix, namespace in first.nsmap.items()}
         prefix = f"{prefixes.get(etree.QName(name).namespace)}:" if local != name else ""
-        what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _ATTRIBUTES.get(tag, ())
+        what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _READ_ATTRIBUTES.get(tag, ())
     code, where = f"{kind}-unread", _finding(first, "", "", "").where
     if name in _EXTENSIONS.split() or local != name:
         return left_out(code, where, what)
@@ -224,22 +185,22 @@ def counted_elements(elements: Sequence[etree._Element], name: str, parent: str)
 def content_findings(element: etree._Element) -> Iterator[Finding]:
     """Check an element and everything that is read inside it."""
     tag = element.tag
-    numbers = (_number_faults(element, numbers) for numbers in _NUMBERS.get(tag, ()))
-    checks = (_text_faults(element), *numbers, _missing_faults(element))
-    for fault in chain(*checks, _alternative_faults(element)):
+    checks = [
+        _number_faults(element, attribute) if attribute.counts else _text_faults(element, attribute)
+        for attribute in _ATTRIBUTES.get(tag, ())
+    ]
+    for fault in chain(*checks, _missing_faults(element), _alternative_faults(element)):
         yield _finding(element, *fault)
     if tag == "geometry":
         yield from _geometry_findings(element)
-    for name in CHILDREN.get(tag, ()):
+    for name in (
+        CHILDREN.get(tag, ()) if tag != "robot" else ()
+    ):  # its parts have checks of their own
         children = element.findall(name)
-        if len(children) > 1 and name not in _REPEATABLE:
-            yield _finding(
-                children[1],
-                "element-repeated",
-                f"<{tag}> has {len(children)} <{name}>; the first one counts",
-                "keep one",
-                f"of {len(children)} <{name}> the first one was taken",
-            )
+        if len(children) > 1 and _MARKS[name] != "*":
+            why = f"<{tag}> has {len(children)} <{name}>; the first one counts"
+            repair = f"of {len(children)} <{name}> the first one was taken"
+            yield _finding(children[1], "element-repeated", why, "keep one", repair)
         for child in children:
             yield from content_findings(child)
 
@@ -248,122 +209,88 @@ _Fault: TypeAlias = tuple[str, ...]
 """Code, reason and advice of a finding about an element, and its repair if there is one."""
 
 
-def _text_faults(element: etree._Element) -> Iterator[_Fault]:
-    tag = element.tag
-    for name in _REQUIRED_TEXT.get(tag, ()):
-        value = element.get(name, "")
-        if len(value) > MAX_TEXT or not value.isprintable():
-            yield (
-                "text-invalid",
-                f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
-                f"cannot be printed, or more than {MAX_TEXT} characters",
-                "write a shorter text of printable characters",
-            )
-        if not value.strip():
-            yield ("attribute-missing", f"<{tag}> has no {name}", f'write <{tag} {name}="...">')
+def _text_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_Fault]:
+    tag, name = element.tag, attribute.name
+    value = element.get(name, "")
+    if not attribute.required:
+        return
+    if len(value) > MAX_TEXT or not value.isprintable():
+        why = (
+            f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
+            f"cannot be printed, or more than {MAX_TEXT} characters"
+        )
+        yield "text-invalid", why, "write a shorter text of printable characters"
+    if not value.strip():
+        yield "attribute-missing", f"<{tag}> has no {name}", f'write <{tag} {name}="...">'
 
 
 def _missing_faults(element: etree._Element) -> Iterator[_Fault]:
     tag = element.tag
     for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
         if element.find(name) is None:
-            yield (
-                "element-missing",
-                f"<{tag}> has no <{name}>",
-                f"add <{name}> or drop <{tag}>",
-                repair,
-            )
+            why, fix = f"<{tag}> has no <{name}>", f"add <{name}> or drop <{tag}>"
+            yield "element-missing", why, fix, repair
 
 
 def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
     kinds = CHILDREN["geometry"]
+    tags = ", ".join(f"<{name}>" for name in kinds)
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
-        yield _finding(
-            element,
-            "geometry-missing",
-            "<geometry> is empty",
-            f"put one of {_tags(kinds)} into it",
-            "a shape with an empty <geometry> was left out",
-        )
+        fix, repair = f"put one of {tags} into it", "a shape with an empty <geometry> was left out"
+        yield _finding(element, "geometry-missing", "<geometry> is empty", fix, repair)
         return
     known = [shape for shape in shapes if shape.tag in kinds]
     for shape in shapes:
         if shape not in known:
-            yield _finding(
-                shape,
-                "geometry-unknown",
-                f"<{shortened(shape.tag)}> is not a geometry of URDF",
-                f"use one of {_tags(kinds)}",
-                f"the geometry <{shortened(shape.tag)}> was left out",
-            )
+            tag = f"<{shortened(shape.tag)}>"
+            why, fix = f"{tag} is not a geometry of URDF", f"use one of {tags}"
+            yield _finding(shape, "geometry-unknown", why, fix, f"the geometry {tag} was left out")
     if len(known) > 1:
-        yield _finding(
-            known[1],
-            "element-repeated",
-            f"<geometry> holds {len(known)} shapes; the first one counts",
-            "give each its own <visual> or <collision>",
-            f"of {len(known)} shapes in one <geometry> the first one was taken",
-        )
+        why = f"<geometry> holds {len(known)} shapes; the first one counts"
+        fix = "give each its own <visual> or <collision>"
+        repair = f"of {len(known)} shapes in one <geometry> the first one was taken"
+        yield _finding(known[1], "element-repeated", why, fix, repair)
 
 
-def _number_faults(element: etree._Element, numbers: Numbers) -> Iterator[_Fault]:
-    name = numbers.attribute
+def _number_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_Fault]:
+    name, counts = attribute.name, attribute.counts
     text = element.get(name)
     if text is None:
-        if numbers.required:
-            yield (
-                "attribute-missing",
-                f"<{element.tag}> has no {name}{_others(element)}",
-                f'write <{element.tag} {name}="...">',
-            )
+        if attribute.required:
+            why = f"<{element.tag}> has no {name}{_others(element)}"
+            yield "attribute-missing", why, f'write <{element.tag} {name}="...">'
         return
     shown = f'<{element.tag} {name}="{shortened(text)}">'
-    counts = " or ".join(str(count) for count in numbers.counts)
-    vector = max(numbers.counts) > 1
-    words = text.replace(",", " ").split() if vector else text.split()
+    words = text.replace(",", " ").split() if max(counts) > 1 else text.split()
     wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
-        yield (
-            "number-malformed",
-            f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number",
-            "write decimal numbers with a point, separated by spaces",
-        )
+        why = f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number"
+        fix = "write decimal numbers with a point, separated by spaces"
+        yield "number-malformed", why, fix
         return
-    if len(words) not in numbers.counts:
-        surplus = numbers.accepts_surplus and len(words) > max(numbers.counts)
-        yield (
-            "number-count",
-            f"{shown} holds {len(words)} numbers",
-            f"write {counts}",
-            f"of {shown} the first {max(numbers.counts)} numbers were taken" if surplus else "",
-        )
+    if len(words) not in counts:
+        surplus = name == "scale" and len(words) > max(counts)  # as of some exporters
+        repair = f"of {shown} the first {max(counts)} numbers were taken" if surplus else ""
+        fix = f"write {' or '.join(map(str, counts))}"
+        yield "number-count", f"{shown} holds {len(words)} numbers", fix, repair
         if not surplus:
             return
-        words = words[: max(numbers.counts)]
+        words = words[: max(counts)]
     if "," in text:
-        yield (
-            "number-commas",
-            f"{shown} separates numbers by commas, which MuJoCo refuses",
-            "separate them by spaces",
-            f"the commas of {shown} were read as spaces" if numbers.accepts_commas else "",
-        )
+        why = f"{shown} separates numbers by commas, which MuJoCo refuses"
+        repair = f"the commas of {shown} were read as spaces" if name in _WITH_COMMAS else ""
+        yield "number-commas", why, "separate them by spaces", repair
     values = [float(word) for word in words]
-    if max(map(abs, values)) > MAX_NUMBER or (numbers.positive and 0 < min(values) < MIN_LENGTH):
-        yield (
-            "number-absurd",
-            f"{shown} is out of range",
-            f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units",
-        )
-    if numbers.positive and min(values) <= 0:
-        yield (
-            "size-not-positive",
-            f"{shown} is not positive",
-            "write lengths above 0, in metres",
-            f"the shape {shown} was left out" if min(values) == 0 else "",
-        )
-    if numbers.nonzero and 0.0 in values:
-        yield ("mesh-scale-invalid", f"{shown} flattens the mesh", "write factors other than 0")
+    if max(map(abs, values)) > MAX_NUMBER or (attribute.positive and 0 < min(values) < MIN_LENGTH):
+        fix = f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units"
+        yield "number-absurd", f"{shown} is out of range", fix
+    if attribute.positive and min(values) <= 0:
+        repair = f"the shape {shown} was left out" if min(values) == 0 else ""
+        fix = "write lengths above 0, in metres"
+        yield "size-not-positive", f"{shown} is not positive", fix, repair
+    if name == "scale" and 0.0 in values:
+        yield "mesh-scale-invalid", f"{shown} flattens the mesh", "write factors other than 0"
 
 
 def _alternative_faults(element: etree._Element) -> Iterator[_Fault]:
@@ -373,40 +300,22 @@ def _alternative_faults(element: etree._Element) -> Iterator[_Fault]:
         (element.get("rpy") and element.get("quat_xyzw"))
         or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
     ):
-        yield (
-            "rotation-invalid",
-            "its quat_xyzw is zero, or beside rpy",
-            "write one rotation, as a quaternion of length 1 or as rpy",
-        )
+        fix = "write one rotation, as a quaternion of length 1 or as rpy"
+        yield "rotation-invalid", "its quat_xyzw is zero, or beside rpy", fix
     ends = element.get("fromto", "").split()
-    if (
-        element.tag == "capsule"
-        and not element.get("length")
-        and (not ends or ends[:3] == ends[3:])
-    ):
-        yield (
-            "attribute-missing",
-            f"<capsule> has no length{_others(element)}, and no two end points as fromto",
-            'write <capsule length="...">',
-        )
+    has_ends = bool(ends) and ends[:3] != ends[3:]
+    if element.tag == "capsule" and not element.get("length") and not has_ends:
+        why = f"<capsule> has no length{_others(element)}, and no two end points as fromto"
+        yield "attribute-missing", why, 'write <capsule length="...">'
 
 
 def _others(element: etree._Element) -> str:
     """Return the first attribute that is not read, for an error about one that is missing."""
-    others = [name for name in map(str, element.attrib) if name not in _ATTRIBUTES[element.tag]]
+    valid = _READ_ATTRIBUTES[element.tag]
+    others = [name for name in map(str, element.attrib) if name not in valid]
     return f", but {shortened(others[0])}" if others else ""
 
 
-def _tags(names: tuple[str, ...]) -> str:
-    return ", ".join(f"<{name}>" for name in names)
-
-
-MAX_LINKS = 1000
-"""Largest number of links, and of joints, that is read."""
-MAX_SHAPES = 10_000
-"""Largest number of visual and collision shapes that is read."""
-MAX_ERRORS = 50
-"""Number of errors after which the check stops."""
 _REPLACEMENT = {
     "floating": "fix the body to the world, or use three prismatic and three revolute joints",
     "planar": "use two prismatic joints and a revolute one",
@@ -435,14 +344,13 @@ def _document_findings(root: etree._Element) -> list[Finding]:
     # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
     name = f"<xacro:{etree.QName(unexpanded).localname}>"
-    xacro_finding = _finding(
-        unexpanded,
-        "xacro-unexpanded",
+    why, fix = (
         f"{name} is left in the document",
         "give the file the suffix .xacro, or expand it first",
-        "" if broken else f"{name} was left out",
-        owner=f"robot {shortened(root.get('name', ''))!r}" if root.get("name") else "",
     )
+    repair = "" if broken else f"{name} was left out"
+    owner = f"robot {shortened(root.get('name', ''))!r}" if root.get("name") else ""
+    xacro_finding = _finding(unexpanded, "xacro-unexpanded", why, fix, repair, owner)
     return [xacro_finding] if broken else [xacro_finding, *findings]
 
 
@@ -455,12 +363,9 @@ def _size_findings(root: etree._Element) -> Iterator[Finding]:
     ):
         count = sum(1 for _ in elements)
         if count > max_count:
-            yield _finding(
-                root,
-                "robot-too-large",
-                f"it has {count} <{tag}> elements; at most {max_count} are read",
-                "leave out everything that is not part of the robot",
-            )
+            why = f"it has {count} <{tag}> elements; at most {max_count} are read"
+            fix = "leave out everything that is not part of the robot"
+            yield _finding(root, "robot-too-large", why, fix)
 
 
 def _first(findings: Iterator[Finding]) -> list[Finding]:
@@ -515,12 +420,8 @@ def _duplicates(elements: Sequence[etree._Element]) -> Iterator[Finding]:
     for element in elements:
         name = element.get("name")
         if name in first:
-            yield _finding(
-                element,
-                f"{element.tag}-duplicate",
-                f"the name is taken by the {element.tag} on line {first[name].sourceline}",
-                "rename one of them",
-            )
+            why = f"the name is taken by the {element.tag} on line {first[name].sourceline}"
+            yield _finding(element, f"{element.tag}-duplicate", why, "rename one of them")
         elif name:
             first[name] = element
 
@@ -536,47 +437,35 @@ def _ends(joint: etree._Element) -> tuple[str | None, str | None]:
 def _tree(links: Sequence[etree._Element], joints: Sequence[etree._Element]) -> Iterator[Finding]:
     by_name = {name: link for link in links if (name := link.get("name"))}
     parent_of: dict[str, str] = {}
-    joint_above: dict[str, etree._Element] = {}
-    """Joint whose child a link is, by the link's name."""
+    joint_above: dict[str, etree._Element] = {}  # joint whose child a link is, by the link's name
     for joint in joints:
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
-                yield _finding(
-                    joint,
-                    "joint-link-unknown",
+                why, fix = (
                     f"its {role} {name!r} is not a link",
                     f"name a link{nearest(name, by_name)}",
                 )
+                yield _finding(joint, "joint-link-unknown", why, fix)
         if not child or child not in by_name:
             continue
         if child in joint_above:
-            yield _finding(
-                joint,
-                "link-two-parents",
-                f"link {child!r} is already the child of joint {joint_above[child].get('name')!r} "
-                f"(line {joint_above[child].sourceline})",
-                "remove one joint: a robot is a tree, loops are not supported",
-            )
+            other = f"{joint_above[child].get('name')!r} (line {joint_above[child].sourceline})"
+            why = f"link {child!r} is already the child of joint {other}"
+            fix = "remove one joint: a robot is a tree, loops are not supported"
+            yield _finding(joint, "link-two-parents", why, fix)
             continue
         joint_above[child] = joint
         if parent in by_name:
             parent_of[child] = parent
     for cycle in _cycles(parent_of):
-        yield _finding(
-            joint_above[cycle[0]],
-            "cycle",
-            "links form a loop: " + " -> ".join([*cycle, cycle[0]]),
-            "remove one of the joints",
-        )
+        why = "links form a loop: " + " -> ".join([*cycle, cycle[0]])
+        yield _finding(joint_above[cycle[0]], "cycle", why, "remove one of the joints")
     roots = [name for name in by_name if name not in joint_above]
     for name in roots[1:]:
-        yield _finding(
-            by_name[name],
-            "disconnected",
-            f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root",
-            "attach it by a fixed joint, or remove it",
-        )
+        why = f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root"
+        fix = "attach it by a fixed joint, or remove it"
+        yield _finding(by_name[name], "disconnected", why, fix)
 
 
 def _cycles(parent_of: dict[str, str]) -> Iterator[list[str]]:
@@ -603,8 +492,7 @@ def above_free_base(root: etree._Element) -> list[etree._Element]:
     children: dict[str | None, list[str | None]] = {}
     for parent, child in map(_ends, joints):
         children.setdefault(parent, []).append(child)
-    below = {}
-    """Links below each free joint."""
+    below = {}  # links below each free joint
     for joint in joints:
         if joint.get("type") in _REPLACEMENT:
             reached, todo = set[str | None](), [_ends(joint)[1]]
@@ -616,6 +504,7 @@ def above_free_base(root: etree._Element) -> list[etree._Element]:
             below[joint] = reached
     if not below:
         return []
+    # The smallest part that moves freely is the robot; another free joint may stand above it.
     base = min(below, key=lambda joint: len(below[joint]))
     outside = [joint for joint in joints if _ends(joint)[0] not in below[base]]
     if any(
@@ -635,28 +524,19 @@ def _kinds(root: etree._Element) -> Iterator[Finding]:
             links = [element for element in left_out if element.tag == "link"]
             names = ", ".join(repr(link.get("name")) for link in links[:5])
             shapes = sum(1 for link in links for _ in link.iterchildren("visual", "collision"))
-            yield _finding(
-                joint,
-                "base-free",
-                f"it is {kind} and lets the whole robot move; the base of a robot is fixed",
-                "attach the robot by a joint of type fixed, if it stands",
+            why = f"it is {kind} and lets the whole robot move; the base of a robot is fixed"
+            fix = "attach the robot by a joint of type fixed, if it stands"
+            repair = (
                 f"joint {joint.get('name')!r} of type {kind} and {len(links)} links above it with "
-                f"{shapes} shapes, {names}, were left out",
+                f"{shapes} shapes, {names}, were left out"
             )
+            yield _finding(joint, "base-free", why, fix, repair)
         elif kind in _REPLACEMENT:
-            yield _finding(
-                joint,
-                "joint-type-unsupported",
-                f"joints of type {kind!r} are not supported",
-                _REPLACEMENT[kind],
-            )
+            why = f"joints of type {kind!r} are not supported"
+            yield _finding(joint, "joint-type-unsupported", why, _REPLACEMENT[kind])
         elif kind and kind not in JOINT_KINDS:
-            yield _finding(
-                joint,
-                "joint-type-unknown",
-                f"{kind!r} is not a joint type",
-                f"use one{nearest(kind, JOINT_KINDS)}",
-            )
+            why, fix = f"{kind!r} is not a joint type", f"use one{nearest(kind, JOINT_KINDS)}"
+            yield _finding(joint, "joint-type-unknown", why, fix)
 
 
 def _mimics(joints: Sequence[etree._Element]) -> Iterator[Finding]:
@@ -670,18 +550,10 @@ def _mimics(joints: Sequence[etree._Element]) -> Iterator[Finding]:
         if leader in by_name:
             leader_of[name] = leader
         else:
-            yield _finding(
-                mimic,
-                "mimic-unknown",
-                f"it mimics {leader!r}, which is not a joint",
-                f"name a joint{nearest(leader, by_name)}",
-                f"its <mimic> of {leader!r}, which is not a joint, was left out: "
-                "it moves independently",
-            )
+            unknown = f"{leader!r}, which is not a joint"
+            fix = f"name a joint{nearest(leader, by_name)}"
+            repair = f"its <mimic> of {unknown}, was left out: it moves independently"
+            yield _finding(mimic, "mimic-unknown", f"it mimics {unknown}", fix, repair)
     for cycle in _cycles(leader_of):
-        yield _finding(
-            by_name[cycle[0]],
-            "mimic-cycle",
-            "joints mimic each other: " + " -> ".join([*cycle, cycle[0]]),
-            "let one of them move independently",
-        )
+        why = "joints mimic each other: " + " -> ".join([*cycle, cycle[0]])
+        yield _finding(by_name[cycle[0]], "mimic-cycle", why, "let one of them move independently")
