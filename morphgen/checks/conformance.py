@@ -47,10 +47,8 @@ from morphgen.model.robot import (
 )
 from morphgen.typing import Array
 
-POSITION_TOLERANCE = 1e-5
-"""Largest accepted distance between a loader's tool and morphgen's [m]."""
-ROTATION_TOLERANCE = 1e-5
-"""Largest accepted angle between a loader's tool and morphgen's [rad]."""
+POSITION_TOLERANCE = 1e-5  # largest accepted distance between a loader's tool and morphgen's [m]
+ROTATION_TOLERANCE = 1e-5  # largest accepted angle between a loader's tool and morphgen's [rad]
 MAX_POSITION = 10.0
 """Bound of the compared joint positions [rad or m], because PyBullet uses single precision."""
 MASS_TOLERANCE = 1e-6
@@ -70,16 +68,14 @@ _WITHOUT_VELOCITY = (None, 0.0, math.inf)
 GRAVITY_TOLERANCE = 1e-6
 """Largest accepted difference of a force that holds the weight, relative to the robot's largest one
 or to ``MIN_FORCE``."""
-MIN_FORCE = 1e-3
-"""Force below which a difference is not relative [N m or N]."""
+MIN_FORCE = 1e-3  # force below which a difference is not relative [N m or N]
 INERTIA_TOLERANCE = 1e-5
 """Largest accepted difference of an entry of the joint-space inertia; see ``inertia_error``. In
 addition, MuJoCo may add ``BOUND_MASS`` and ``BOUND_INERTIA`` to links without mass."""
 MIN_INERTIA = 1e-8
 """Diagonal entry below which a difference is not relative [kg m^2 or kg]: that of a joint that
 carries no mass is whatever the loader adds."""
-BUNDLE, FILE = "bundle", "file"
-"""Sources of a row."""
+BUNDLE, FILE = "bundle", "file"  # sources of a row
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,8 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Joint, Robot
 from morphgen.typing import Array
 
-HOLD_S = 5.0
-"""Duration of holding [s]."""
-MAX_DRIFT = 0.02
-"""Largest accepted distance of a joint from home while holding [rad or m]."""
+HOLD_S = 5.0  # duration of holding [s]
+MAX_DRIFT = 0.02  # largest accepted distance of a joint from home while holding [rad or m]
 SOLVER_ITERATIONS = 200
 """Iterations of PyBullet's constraint solver, as in the simulator of the tasks. With the default of
 50, motors of an arm with a hand of many light joints do not agree: the arm turns on and on."""
@@ -43,22 +41,18 @@ MORE_ITERATIONS = 1000
 
 STEP = {"prismatic": 0.02, "revolute": 0.2, "continuous": 0.2}
 """Step of an independent joint by its kind, unless its range has less room [m or rad]."""
-MAX_STEP = 0.8
-"""Largest part of the room to a limit that a step takes."""
+MAX_STEP = 0.8  # largest part of the room to a limit that a step takes
 BAND = 0.1
 """Distance from the target at which a joint has settled, relative to its step: 0.02 rad or 2 mm of
 a whole step, as for the drift."""
 MAX_FOLLOWER_ERROR = {"prismatic": 0.005, "revolute": 0.02, "continuous": 0.02}
 """Largest accepted distance of a mimic joint from its leader's position, at any time during a step
 [m or rad]: 5 mm are 0.02 rad at 25 cm."""
-STEP_S = 3.0
-"""Duration within which a step must settle [s]."""
-SETTLED_S = 0.2
-"""Duration for which all joints must be settled, after which a step ends [s]."""
+STEP_S = 3.0  # duration within which a step must settle [s]
+SETTLED_S = 0.2  # duration for which all joints must be settled, after which a step ends [s]
 
 
-MIN_TIMESTEP = 1e-4
-"""Smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding."""
+MIN_TIMESTEP = 1e-4  # smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding
 
 CHANGES: Mapping[str, Callable[[Joint], Joint]] = {
     "it settles without the joint damping": lambda joint: replace(joint, damping=0.0),

@@ -23,8 +23,7 @@ from morphgen.typing import Array
 if TYPE_CHECKING:
     import fcl
 
-_Triangles: TypeAlias = Array
-"""Corners of triangles, shape (n, 3, 3) [m]."""
+_Triangles: TypeAlias = Array  # corners of triangles, shape (n, 3, 3) [m]
 
 MAX_GAP = 5e-3
 """Largest distance between the visual shapes of a link and its parent [m].
@@ -32,10 +31,8 @@ MAX_GAP = 5e-3
 Correct models of real arms and grippers have slits of up to 3.6 mm at their joints (SAKE EZ 3.6,
 Fetch 3, UR5 3).
 """
-_COARSE_TRIANGLES = 500
-"""Number of triangles per shape in the first, coarse distance test."""
-_ROUNDING = 1e-9
-"""Upper bound of the rounding error of a distance [m]."""
+_COARSE_TRIANGLES = 500  # number of triangles per shape in the first, coarse distance test
+_ROUNDING = 1e-9  # upper bound of the rounding error of a distance [m]
 
 
 def check_links_apart(robot: Robot) -> Iterator[Finding]:

@@ -14,8 +14,7 @@ from morphgen.model.robot import Inertial, Link, Robot
 from morphgen.model.tree import RigidGroup, rigid_groups
 from morphgen.typing import Array
 
-DEFAULT_DENSITY = 1000.0
-"""Density of a link whose source gives no mass [kg/m^3]; that of water."""
+DEFAULT_DENSITY = 1000.0  # density of a link whose source gives no mass [kg/m^3]; that of water
 GYRATION_FACTOR = 5.0
 """Largest plausible ratio between radii of gyration and those of the solid geometry."""
 COM_MARGIN = 0.5

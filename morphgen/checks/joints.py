@@ -10,8 +10,7 @@ import numpy as np
 from morphgen.model.findings import Finding, Severity
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Robot
 
-AXIS_TOLERANCE = 1e-3
-"""Deviation of an axis from unit length that counts as rounding in a file."""
+AXIS_TOLERANCE = 1e-3  # deviation of an axis from unit length that counts as rounding in a file
 REVOLUTE_SPAN = 4 * 2 * math.pi
 """Widest plausible range of a revolute joint [rad]; wider limits are likely degrees."""
 PRISMATIC_SPAN = 10.0

@@ -16,14 +16,11 @@ from morphgen.model.mesh import MAX_STL_FACES, convex_hull, left_out, load_mesh
 from morphgen.model.robot import TOOL, Inertial, Link, Robot
 from morphgen.model.tree import rigid_groups, take_name
 
-EXTENT_RANGE = (1e-3, 10.0)
-"""Plausible range of a link's longest edge [m]."""
+EXTENT_RANGE = (1e-3, 10.0)  # plausible range of a link's longest edge [m]
 UNIT_RATIOS = {1000.0: "mm and m", 25.4: "inch and mm", 39.37: "inch and m"}
 """Ratios of lengths that indicate a mistaken unit."""
-UNIT_TOLERANCE = 1.2
-"""Factor within which a ratio counts as one of ``UNIT_RATIOS``."""
-MIN_SOLIDITY = 1e-9
-"""Volume over the cube of the longest edge below which shapes count as flat."""
+UNIT_TOLERANCE = 1.2  # factor within which a ratio counts as one of UNIT_RATIOS
+MIN_SOLIDITY = 1e-9  # volume over the cube of the longest edge below which shapes count as flat
 
 _ONLY_DRAWN = re.compile(r"materials? |texture|\d+ (lines?|points?|spline)")
 """Notes of a mesh file about what has no triangles: they change a picture, and no contact."""
@@ -151,8 +148,7 @@ def _extent(shapes: Sequence[Shape]) -> float | None:
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.\-]")
 _WORLD = "world"
-MAX_ROBOT_NAME = 200
-"""Longest name of a robot [characters]."""
+MAX_ROBOT_NAME = 200  # longest name of a robot [characters]
 
 
 def check_names(robot: Robot) -> Iterator[Finding]:

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     import yourdfpy
 
 
-DYNAMICS_SAMPLES = 20
-"""Number of configurations in which forces and inertia are compared."""
+DYNAMICS_SAMPLES = 20  # number of configurations in which forces and inertia are compared
 
 
 @dataclass(frozen=True)
@@ -85,10 +84,8 @@ class Reading:
     kg m or kg], without armature and with mimic joints uncoupled."""
 
 
-_MASS_SCALE = 2.0**-20
-"""Factor of the masses with which PyBullet computes forces."""
-_SLIDE, _HINGE = 2, 3
-"""MuJoCo's types of the joints that a robot has."""
+_MASS_SCALE = 2.0**-20  # factor of the masses with which PyBullet computes forces
+_SLIDE, _HINGE = 2, 3  # MuJoCo's types of the joints that a robot has
 
 Read = Callable[[Path, str, Mapping[str, Array], int], Reading]
 """Function of a folder, the name of a frame, or of none for the root, the positions of every

@@ -28,8 +28,7 @@ from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
 REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
 """Reasons in the order in which they apply; a pair gets the first one."""
-MATRIX_SAMPLES = 10_000
-"""Number of sampled configurations, the default of MoveIt's setup assistant."""
+MATRIX_SAMPLES = 10_000  # number of sampled configurations, the default of MoveIt's setup assistant
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ PENETRATION = 1e-4
 """Smallest overlap that counts as penetration [m]; faces that only touch stay below it."""
 ALWAYS_SHARE = 0.95
 """Share of random configurations in which a pair must penetrate to count as always penetrating."""
-SAMPLES = 128
-"""Number of random configurations that ``survey_collisions`` tests."""
+SAMPLES = 128  # number of random configurations that survey_collisions tests
 _MUJOCO_MEMORY = "16M"
 _EPA_WARNING = "EPA"
 """Part of MuJoCo's warning that its penetration-depth algorithm (EPA) did not converge."""

@@ -11,12 +11,9 @@ import yaml
 
 from morphgen.errors import FormatError
 
-MAX_FILE_BYTES = 64 * 2**20
-"""Largest data file that is read [bytes]."""
-MAX_DEPTH = 100
-"""Deepest nesting of lists and objects that is read."""
-MAX_YAML_VALUES = 1_000_000
-"""Largest number of values in a YAML file, with every alias expanded."""
+MAX_FILE_BYTES = 64 * 2**20  # largest data file that is read [bytes]
+MAX_DEPTH = 100  # deepest nesting of lists and objects that is read
+MAX_YAML_VALUES = 1_000_000  # largest number of values in a YAML file, with every alias expanded
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 

@@ -16,10 +16,8 @@ from morphgen.formats.urdf.read import read_urdf, require_description_file
 from morphgen.formats.xml import root_tag
 from morphgen.model.robot import Robot
 
-SUFFIXES = (".urdf", ".xacro", ".xml")
-"""File name suffixes of robot descriptions."""
-_MAX_HEAD = 2**20
-"""Number of bytes within which the root element of an MJCF begins."""
+SUFFIXES = (".urdf", ".xacro", ".xml")  # file name suffixes of robot descriptions
+_MAX_HEAD = 2**20  # number of bytes within which the root element of an MJCF begins
 
 
 def read_description(
@@ -52,8 +50,7 @@ def is_mjcf(path: Path) -> bool:
         return root_tag(file.read(_MAX_HEAD)) == "mujoco"
 
 
-MENAGERIE, DESCRIPTIONS = "mujoco_menagerie", "robot_descriptions"
-"""Modules of the packages."""
+MENAGERIE, DESCRIPTIONS = "mujoco_menagerie", "robot_descriptions"  # modules of the packages
 _PATHS = ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")
 """Names of the paths in a module of ``robot_descriptions``; the first one that exists is taken."""
 

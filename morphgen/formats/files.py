@@ -20,8 +20,7 @@ from morphgen.formats.resolve import file_stamp
 
 SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file managers write into the folders that they show."""
-LOCK = ".lock"
-"""Name of the lock file in a folder."""
+LOCK = ".lock"  # name of the lock file in a folder
 
 
 def file_sha256(path: Path) -> str:
@@ -217,8 +216,7 @@ def _swap(folder: Path, partial: Path) -> None:
     shutil.rmtree(backup)
 
 
-MANIFEST = "export.json"
-"""File that lists the other files of an exported folder with their SHA-256."""
+MANIFEST = "export.json"  # file that lists the other files of an exported folder with their SHA-256
 
 
 @contextmanager

@@ -41,12 +41,9 @@ from morphgen.model.geometry import (
 from morphgen.model.robot import Link, Robot
 
 _LOGGER = logging.getLogger(__name__)
-SUFFIX = ".primitives.json"
-"""Suffix of the file of fits beside a part's manifest."""
-FITS = "primitives.json"
-"""Name of the file of fits in a bundle."""
-MAX_PRIMITIVES = 32
-"""Largest number of primitives in a link's fit."""
+SUFFIX = ".primitives.json"  # suffix of the file of fits beside a part's manifest
+FITS = "primitives.json"  # name of the file of fits in a bundle
+MAX_PRIMITIVES = 32  # largest number of primitives in a link's fit
 FITTER_VERSION = 2
 """Version of the fitter; it rises when the fitter gives other primitives for the same meshes."""
 

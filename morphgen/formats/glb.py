@@ -17,8 +17,7 @@ from morphgen.model.robot import Robot
 from morphgen.model.tree import take_name
 from morphgen.typing import Array
 
-GREY: Rgba = (0.7, 0.7, 0.7, 1.0)
-"""Colour of shapes without their own."""
+GREY: Rgba = (0.7, 0.7, 0.7, 1.0)  # colour of shapes without their own
 T_GLTF_ROOT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the robot's root in the scene: up is y in glTF and z in a robot; shape (4, 4)."""
 _SHARP_ANGLE = np.radians(35.0)

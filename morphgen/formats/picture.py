@@ -21,14 +21,10 @@ from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
-SIZE = (640, 480)
-"""Width and height of a picture [px]."""
-_FOV = 35.0
-"""Vertical field of view [deg]."""
-_YAW, _PITCH = 50.0, -20.0
-"""Direction of the camera [deg]."""
-_MARGIN = 0.92
-"""Share of the picture that the robot may fill."""
+SIZE = (640, 480)  # width and height of a picture [px]
+_FOV = 35.0  # vertical field of view [deg]
+_YAW, _PITCH = 50.0, -20.0  # direction of the camera [deg]
+_MARGIN = 0.92  # share of the picture that the robot may fill
 
 
 class GlContext(Protocol):

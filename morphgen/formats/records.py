@@ -36,11 +36,9 @@ from msgspec import Meta
 from morphgen.errors import FormatError, MorphgenError, nearest, shortened
 
 T = TypeVar("T")
-KeyPath = tuple[str | int, ...]
-"""Keys and list indices from the top of the data to a value."""
+KeyPath = tuple[str | int, ...]  # keys and list indices from the top of the data to a value
 
-_LARGEST = 1e12
-"""Largest size of a number: more than a robot can hold in SI units."""
+_LARGEST = 1e12  # largest size of a number: more than a robot can hold in SI units
 FiniteNumber = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
 """A number that is neither NaN nor infinite, nor beyond what a robot can hold in SI units."""
 PositiveNumber = Annotated[float, Meta(gt=0, le=_LARGEST)]

@@ -34,8 +34,7 @@ _PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
 _PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
 _LICENCE_TAG = re.compile(rb"<license[^>]*>([^<]{1,200})<")
-_MAX_MANIFEST = 2**20
-"""Part of a ``package.xml`` that is searched for name and licence [bytes]."""
+_MAX_MANIFEST = 2**20  # part of a package.xml that is searched for name and licence [bytes]
 _NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 
 

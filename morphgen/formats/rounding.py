@@ -25,8 +25,7 @@ _ROTATION_DECIMALS = 10
 """Decimals of a quaternion divided by its largest entry; angles of 12 digits err up to 1.5e-11."""
 _TIE_TOLERANCE = 1e-6
 """Entries of a quaternion that differ by less from the largest count as equal to it."""
-_UNIT_TOLERANCE = 1e-9
-"""Largest difference of a rounded unit axis's length from 1."""
+_UNIT_TOLERANCE = 1e-9  # largest difference of a rounded unit axis's length from 1
 
 
 def format_number(value: float) -> str:

@@ -129,8 +129,7 @@ def _join(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-MAX_SRDF_BYTES = 16 * 2**20
-"""Size of the largest SRDF that is read [bytes]."""
+MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]
 
 
 class _Rule(NamedTuple):
@@ -269,8 +268,7 @@ def with_disabled_pairs(robot: Robot, root: etree._Element, origin: str = "SRDF"
     return replace(robot, ignore_pairs=tuple(sorted({*robot.ignore_pairs, *known})))
 
 
-CUROBO_CONFIG = "robot.yml"
-"""Name of the configuration in an exported folder."""
+CUROBO_CONFIG = "robot.yml"  # name of the configuration in an exported folder
 _CUROBO_VERSION = 2.0
 
 

@@ -24,10 +24,8 @@ _MARKUP = re.compile(r"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<![^>]*>", re.DO
 _BARE = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[1-9][0-9]{0,5}|#x[1-9A-Fa-f][0-9A-Fa-f]{0,4});)")
 _SOUND_TAIL = re.compile(r"<!--(?:(?!--).)*-->|<\?.*?\?>", re.DOTALL)
 _INVALID = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_UNDECLARED = "undeclared:"
-"""Begin of the namespace of a prefix that the document does not declare."""
-_MAX_PREFIXES = 20
-"""Largest number of prefixes in a document that is repaired."""
+_UNDECLARED = "undeclared:"  # begin of the namespace of a prefix that the document does not declare
+_MAX_PREFIXES = 20  # largest number of prefixes in a document that is repaired
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:

@@ -22,19 +22,14 @@ from numpy.typing import NDArray
 from morphgen.errors import FormatError, shortened
 from morphgen.formats.files import replacing_file
 
-_ENTRY_SIGNATURE = b"PK\x01\x02"
-"""First bytes of every entry in a zip's table of contents."""
+_ENTRY_SIGNATURE = b"PK\x01\x02"  # first bytes of every entry in a zip's table of contents
 _COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Accepted methods; others (LZMA) can allocate gigabytes before they return a byte."""
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of all written entries: the earliest that a zip can hold."""
-_MODE = 0o100644
-"""Mode of all written entries: a regular file that its owner may write."""
-_UNIX = 3
-"""System that written entries name as their creator."""
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # time of all written entries: the earliest that a zip can hold
+_MODE = 0o100644  # mode of all written entries: a regular file that its owner may write
+_UNIX = 3  # system that written entries name as their creator
 _LEVEL = 9
-_CHUNK = 2**20
-"""Bytes that are unpacked at once."""
+_CHUNK = 2**20  # bytes that are unpacked at once
 
 UNREADABLE = (
     zipfile.BadZipFile,
@@ -193,8 +188,7 @@ def _require_distinct(paths: Sequence[str]) -> None:
 
 UNREADABLE_NPZ = (*UNREADABLE, tokenize.TokenError, KeyError, MemoryError, OverflowError)
 """Errors of NumPy for malformed archives; a header may claim any shape."""
-MAX_BYTES = 2**30
-"""Largest total size of the arrays of an archive [bytes]."""
+MAX_BYTES = 2**30  # largest total size of the arrays of an archive [bytes]
 
 
 def read_npz(source: Path | IO[bytes], names: Sequence[str]) -> list[NDArray[Any]]:

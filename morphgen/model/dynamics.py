@@ -11,10 +11,8 @@ from morphgen.model.kinematics import forward_kinematics, link_jacobians
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
-GRAVITY = 9.81
-"""Gravity along -z [m/s^2]."""
-BANDWIDTH = 30.0
-"""Natural frequency of the position control [rad/s]."""
+GRAVITY = 9.81  # gravity along -z [m/s^2]
+BANDWIDTH = 30.0  # natural frequency of the position control [rad/s]
 MIN_RELATIVE_INERTIA = 0.05
 """Smallest inertia of a joint, relative to the robot's largest among its revolute or its prismatic
 joints.
@@ -29,8 +27,7 @@ MIN_ROTATIONAL_INERTIA = 0.02
 It stands for the motor of a small hobby arm, without which the friction of a 0.1 kg block would
 turn the wrist that pushes it. MuJoCo Menagerie (SO-ARM100, UR10e) has 0.1 in every joint.
 """
-MIN_SLIDING_MASS = 1e-5
-"""Smallest inertia of a prismatic joint [kg]."""
+MIN_SLIDING_MASS = 1e-5  # smallest inertia of a prismatic joint [kg]
 COUPLED_INERTIA = 0.5
 """Smallest inertia of a leader, relative to that of its followers and itself, and smallest armature
 of a follower, relative to the inertia that it carries.

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     import manifold3d
     import trimesh
 
-_CYLINDER_SECTIONS = 48
-"""Number of sides of a tessellated cylinder."""
+_CYLINDER_SECTIONS = 48  # number of sides of a tessellated cylinder
 _CORNER_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Signs of the eight corners of a box, shape (8, 3)."""
 

@@ -414,12 +414,10 @@ def _transform(T: Pose, points: Array) -> Array:
 DAMPING = 0.02
 """Damping of position tasks [m/rad or 1]; in ``solve_pose_ik`` it is relative to the largest
 singular value of the Jacobian."""
-MAX_STEP = 0.3
-"""Largest change of a joint position in one iteration [rad or m]."""
+MAX_STEP = 0.3  # largest change of a joint position in one iteration [rad or m]
 POSE_ITERATIONS = 24
 """Maximum number of iterations of ``solve_pose_ik``, which runs while the user drags a gizmo."""
-POSE_TOLERANCE = 1e-5
-"""Weighted pose error at which ``solve_pose_ik`` stops [m]."""
+POSE_TOLERANCE = 1e-5  # weighted pose error at which solve_pose_ik stops [m]
 
 
 def dls_step(J: Array, error: Array, damping: float) -> Array:

@@ -403,12 +403,10 @@ def _select(poses: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
     return poses[torch.arange(len(poses), device=poses.device)[:, None], columns]
 
 
-ROTATION_DAMPING = 0.1
-"""Damping of rotations [joint units per radian]."""
+ROTATION_DAMPING = 0.1  # damping of rotations [joint units per radian]
 START_DAMPING = 0.05
 """Damping of ``solve_from_starts`` [joint units per metre]: more than of paths that start near."""
-START_MAX_STEP = 0.5
-"""Largest change of a joint in one iteration of ``solve_from_starts`` [rad or m]."""
+START_MAX_STEP = 0.5  # largest change of a joint in one iteration of solve_from_starts [rad or m]
 
 _ROTATION_SHARES = (0.25, 0.5, 0.75, 1.0)
 """Fractions of a rotation step that are compared with the rotation budget."""

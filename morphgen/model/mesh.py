@@ -22,20 +22,16 @@ if TYPE_CHECKING:
 
     from morphgen.model.robot import Robot
 
-MAX_STL_FACES = 200_000
-"""Number of triangles of the largest STL file that MuJoCo reads."""
+MAX_STL_FACES = 200_000  # number of triangles of the largest STL file that MuJoCo reads
 MAX_ROBOT_BYTES = 96 * 2**20
 """Size of all mesh files of a robot [bytes]. The largest of 1,441 real robots, B1 with an arm, has
 61 MiB."""
 MAX_ROBOT_FACES = 1_500_000
 """Number of triangles in all mesh files of a robot. The largest, Vega, has 0.94 million."""
-MAX_ROBOT_PIXELS = 2**26
-"""Number of pixels in all textures of a robot's mesh files."""
-FLATNESS_TOLERANCE = 1e-7
-"""Ratio of thickness to size below which points count as flat."""
+MAX_ROBOT_PIXELS = 2**26  # number of pixels in all textures of a robot's mesh files
+FLATNESS_TOLERANCE = 1e-7  # ratio of thickness to size below which points count as flat
 
-_Triangles: TypeAlias = tuple[Array, NDArray[np.int64]]
-"""Vertices (n, 3) [m] and faces (m, 3)."""
+_Triangles: TypeAlias = tuple[Array, NDArray[np.int64]]  # vertices (n, 3) [m] and faces (m, 3)
 
 
 @dataclass(frozen=True)

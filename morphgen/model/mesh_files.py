@@ -40,8 +40,7 @@ MAX_HULL_VERTICES = 500_000
 """Number of vertices of the largest file without triangles that is read: its hull takes seconds."""
 _FLAT = 1e-6
 """Thickness of a flat point cloud, relative to its size: the precision of 32-bit floats."""
-_HEADER = 16
-"""Size of the four counts [bytes]."""
+_HEADER = 16  # size of the four counts [bytes]
 _ROW_SIZES = (12, 12, 8, 12)
 """Size of a vertex, a normal, a texture coordinate and a triangle [bytes]."""
 
@@ -90,8 +89,7 @@ def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
     return points, faces.astype(np.int64)
 
 
-_MAX_TOKENS = 20_000_000
-"""Number of words in the largest OBJ file that is read."""
+_MAX_TOKENS = 20_000_000  # number of words in the largest OBJ file that is read
 _MAX_HEADER = 2**16
 """Size of the longest header of a PLY file, and of the longest line of an OBJ file [bytes]."""
 

@@ -21,8 +21,7 @@ JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
 Pair = tuple[str, str]
 
-TOOL = "tool"
-"""Name of the frame at a robot's working point."""
+TOOL = "tool"  # name of the frame at a robot's working point
 
 DEFAULT_EFFORT = 100.0
 """Effort limit of a joint that names none, where a file format requires one [N m or N]."""

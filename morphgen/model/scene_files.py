@@ -52,10 +52,8 @@ MAX_FACES = 1_000_000
 """Number of triangles of the largest mesh that is read, every instance counted. Reading as many
 from an STL takes 0.5 GiB and 1 s of CPU (``python benchmarks/mesh_counts.py FILE``); text takes
 longer, an ASCII PLY of the largest size 8 s."""
-MAX_PIXELS = 2**25
-"""Number of pixels of all textures that are read for one mesh, each use counted."""
-MAX_COORDINATE = 1e9
-"""Coordinate above which a mesh file counts as broken [m]."""
+MAX_PIXELS = 2**25  # number of pixels of all textures that are read for one mesh, each use counted
+MAX_COORDINATE = 1e9  # coordinate above which a mesh file counts as broken [m]
 MAX_SETS = 5_000
 """Number of triangle sets in the largest scene that is read, every instance counted."""
 _PICTURE_FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
@@ -263,10 +261,8 @@ def _opacity(properties: dict[str, Any]) -> float | None:
     return None
 
 
-_MAX_NODES = 20_000
-"""Number of nodes of the largest scene that is read, every instance counted."""
-_MAX_DEPTH = 100
-"""Largest nesting depth of nodes in a scene."""
+_MAX_NODES = 20_000  # number of nodes of the largest scene that is read, every instance counted
+_MAX_DEPTH = 100  # largest nesting depth of nodes in a scene
 MAX_DAE_SIZE = 40 * 2**20
 """Size of the largest DAE file: its numbers as text take twenty times their bytes [bytes]."""
 _MAX_MARKUP = 500_000
@@ -275,8 +271,7 @@ _MAX_MARKUP = 500_000
 
 _COMPONENT_SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _ACCESSOR_SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_ATTRIBUTES = ("POSITION", "TEXCOORD_0", "COLOR_0")
-"""Attributes of a glTF primitive that are read."""
+_ATTRIBUTES = ("POSITION", "TEXCOORD_0", "COLOR_0")  # attributes of a glTF primitive that are read
 _HARMLESS_EXTENSIONS = re.compile(r"KHR_(materials|texture|lights)_\w+|EXT_texture_\w+|KHR_xmp\w*")
 """Extensions of glTF that do not change triangles."""
 _GLTF_MODES = {0: "point sets", 1: "line sets", 2: "line loops", 3: "line strips", 6: "fans"}

@@ -29,12 +29,10 @@ from morphgen.model.mesh import load_mesh
 from morphgen.model.rotation import Vec3
 from morphgen.model.scene_files import MAX_COORDINATE, MAX_FACES
 
-_REFUSALS = (ValueError, mujoco.FatalError)
-"""Exceptions by which MuJoCo refuses a document."""
+_REFUSALS = (ValueError, mujoco.FatalError)  # exceptions by which MuJoCo refuses a document
 MAX_CONVEX_FACES = 50_000
 """Largest number of triangles of a mesh whose inertia is that of its convex hull."""
-_FEWEST = 4
-"""Smallest number of vertices of a convex hull that MuJoCo accepts."""
+_FEWEST = 4  # smallest number of vertices of a convex hull that MuJoCo accepts
 _ARRAYS = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "dof_damping", "dof_frictionloss", "key_qpos"),
@@ -142,8 +140,7 @@ ELLIPSOID_SUBDIVISIONS = 2
 within 1.2% of the radii."""
 _CACHE = "mjcf-meshes-1"
 """Folder in the user's cache; the number rises when the same content gives another file."""
-_MAX_STEM = 60
-"""Longest file name of a kept mesh, without its suffix [characters]."""
+_MAX_STEM = 60  # longest file name of a kept mesh, without its suffix [characters]
 
 
 def ellipsoid_mesh(radii: Vec3) -> Mesh:

@@ -20,14 +20,10 @@ from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding, left_out
 from morphgen.model.mesh import require_bounded_files
 
-MAX_MJCF_BYTES = 8 * 2**20
-"""Largest MJCF that is read, with all its includes [bytes]."""
-MAX_INCLUDES = 100
-"""Largest number of files that an MJCF includes."""
-MAX_DEPTH = 40
-"""Deepest nesting of includes."""
-MAX_COPIES = 10_000
-"""Largest number of elements that the ``<replicate>`` elements of an MJCF make."""
+MAX_MJCF_BYTES = 8 * 2**20  # largest MJCF that is read, with all its includes [bytes]
+MAX_INCLUDES = 100  # largest number of files that an MJCF includes
+MAX_DEPTH = 40  # deepest nesting of includes
+MAX_COPIES = 10_000  # largest number of elements that the <replicate> elements of an MJCF make
 MAX_ELEMENTS = {"*": 20_000, "body": MAX_LINKS, "default": 1000, "mesh": 2000, "replicate": 100}
 """Largest number of elements of an MJCF with its includes, of all tags and of some. MuJoCo's time
 grows with the square of it."""

@@ -46,8 +46,7 @@ from morphgen.model.rotation import Vec3
 from morphgen.model.tree import take_name
 from morphgen.typing import Array
 
-WORLD = 0
-"""Index of the world body."""
+WORLD = 0  # index of the world body
 _JOINT = mujoco.mjtJoint
 _REFUSED_JOINTS = {
     _JOINT.mjJNT_BALL: ("type ball; expected hinge or slide, such as three hinges at one place"),
@@ -198,10 +197,8 @@ def _below(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
 
 
 _GEOM = mujoco.mjtGeom
-_LAST_DRAWN_GROUP = 2
-"""Last geom group that MuJoCo's viewers show."""
-_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""Colour of a geom that names none."""
+_LAST_DRAWN_GROUP = 2  # last geom group that MuJoCo's viewers show
+_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # colour of a geom that names none
 
 
 @dataclass(frozen=True)
@@ -692,10 +689,8 @@ def _largest_force(model: mujoco.MjModel, actuator: int) -> float | None:
     return None
 
 
-_HOME = "home"
-"""Name of the keyframe that is the home configuration."""
-_TOLERANCE = 1e-9
-"""Excess over a limit at which a home position is still within it [rad or m]."""
+_HOME = "home"  # name of the keyframe that is the home configuration
+_TOLERANCE = 1e-9  # excess over a limit at which a home position is still within it [rad or m]
 
 
 def read_mjcf(

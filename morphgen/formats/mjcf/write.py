@@ -24,10 +24,8 @@ from morphgen.typing import Array
 
 MeshFile = Callable[[Mesh], str]
 """Function that writes a mesh, or finds it, and returns its path for the document."""
-FLAT = 1e-5
-"""Extent below which a collision hull counts as flat [m]; MuJoCo refuses flat hulls."""
-FLAT_THICKNESS = 1e-4
-"""Thickness that a flat collision hull gets [m]."""
+FLAT = 1e-5  # extent below which a collision hull counts as flat [m]; MuJoCo refuses flat hulls
+FLAT_THICKNESS = 1e-4  # thickness that a flat collision hull gets [m]
 
 
 class Meshes:
@@ -149,8 +147,7 @@ log_mujoco_warnings()
 
 TIMESTEP = 0.002
 """Physics step of the written model, MuJoCo's default [s]; environments set their own."""
-VISUAL_GROUP, COLLISION_GROUP = 2, 3
-"""Geom groups; MuJoCo's viewers show groups 0 to 2."""
+VISUAL_GROUP, COLLISION_GROUP = 2, 3  # geom groups; MuJoCo's viewers show groups 0 to 2
 _SITE_GROUP = 4
 MJCF_COMPILER = {"angle": "radian", "inertiafromgeom": "false", **MUJOCO_BOUNDS}
 """Attributes of ``<compiler/>``: inertias as written, massless links allowed."""

@@ -47,8 +47,7 @@ from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic,
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
-MAX_URDF_BYTES = 8 * 2**20
-"""Largest URDF that is read [bytes]."""
+MAX_URDF_BYTES = 8 * 2**20  # largest URDF that is read [bytes]
 _MESH = "geometry[1]/mesh"
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 

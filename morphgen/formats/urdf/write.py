@@ -12,10 +12,8 @@ from morphgen.formats.rounding import format_inertia, format_number, rounded_axi
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
-CAPSULE_SUFFIX = "_capsule"
-"""End of the names of a capsule's three elements."""
-_TOLERANCE = 1e-9
-"""Largest difference of a sphere from an end of its cylinder [m]."""
+CAPSULE_SUFFIX = "_capsule"  # end of the names of a capsule's three elements
+_TOLERANCE = 1e-9  # largest difference of a sphere from an end of its cylinder [m]
 
 
 def urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
@@ -64,12 +62,10 @@ def _capsule(pieces: list[Shape]) -> Shape | None:
     return capsule if are_same else None
 
 
-MORPHGEN_TAG = "morphgen"
-"""Tag of the URDF element for data that only morphgen reads."""
+MORPHGEN_TAG = "morphgen"  # tag of the URDF element for data that only morphgen reads
 BOUND_MASS = 1e-12
 """Mass that MuJoCo gives a massless link [kg]; it refuses moving bodies without mass."""
-BOUND_INERTIA = 1e-14
-"""Smallest principal inertia that MuJoCo gives a link [kg m^2]."""
+BOUND_INERTIA = 1e-14  # smallest principal inertia that MuJoCo gives a link [kg m^2]
 MUJOCO_BOUNDS = {"boundmass": f"{BOUND_MASS:g}", "boundinertia": f"{BOUND_INERTIA:g}"}
 _MUJOCO_COMPILER = {
     "strippath": "false",  # mesh paths stay relative to the URDF
@@ -79,8 +75,7 @@ _MUJOCO_COMPILER = {
 }
 """Attributes of ``<mujoco><compiler/></mujoco>``, so that MuJoCo reads a URDF as others do."""
 
-MeshUri = Callable[[Mesh], str]
-"""Maps a mesh to the file name to write for it."""
+MeshUri = Callable[[Mesh], str]  # maps a mesh to the file name to write for it
 
 
 def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:

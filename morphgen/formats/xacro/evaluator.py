@@ -13,22 +13,17 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, TypeAlias
 
-MAX_BITS = 1024
-"""Largest whole number of an expression [bits]: what a float can hold."""
+MAX_BITS = 1024  # largest whole number of an expression [bits]: what a float can hold
 MAX_SIZE = 200_000
 """Largest text, list or dictionary of an expression [characters and entries, nested ones too]."""
-MAX_FACTORIAL = 170
-"""Largest argument of ``factorial``; the factorial of 171 is beyond a float."""
-MAX_CHOOSE = 1000
-"""Largest argument of ``comb`` and ``perm``."""
-MAX_DIGITS = 1000
-"""Largest width, precision or rounding place [digits]."""
+MAX_FACTORIAL = 170  # largest argument of factorial; the factorial of 171 is beyond a float
+MAX_CHOOSE = 1000  # largest argument of comb and perm
+MAX_DIGITS = 1000  # largest width, precision or rounding place [digits]
 
 _CONVERSION = re.compile(r"%[-+ #0]*(\(|\*|\d*)(?:\.(\*|\d*))?")
 
 
-Value: TypeAlias = Any
-"""Value of an expression: a number, a text, a list, ..., or a symbol for one."""
+Value: TypeAlias = Any  # value of an expression: a number, a text, a list, ..., or a symbol for one
 
 
 class RefusedError(ValueError):
@@ -632,12 +627,10 @@ def _charged(value: Value, scope: Scope) -> Value:
     return value
 
 
-MAX_LENGTH = 10_000
-"""Longest expression [characters]."""
+MAX_LENGTH = 10_000  # longest expression [characters]
 
 _ORIGIN = "<expression>"
-_PARSING = threading.Lock()
-"""Held while Python's warnings are off: they are those of all threads."""
+_PARSING = threading.Lock()  # held while Python's warnings are off: they are those of all threads
 
 
 class Expression:

@@ -40,15 +40,12 @@ from morphgen.formats.xacro.evaluator import (
 )
 from morphgen.formats.xml import parse_xml
 
-MAX_FILE = 16 * 2**20
-"""Largest file that an expansion reads [bytes]."""
-MAX_OUTPUT = 20_000_000
-"""Largest expanded document [characters]."""
+MAX_FILE = 16 * 2**20  # largest file that an expansion reads [bytes]
+MAX_OUTPUT = 20_000_000  # largest expanded document [characters]
 MAX_CLONES = 200_000
 """Largest number of elements that an expansion may copy, as macros do; the PR2 has 6,978 nodes."""
 
-Untyped: TypeAlias = Any
-"""Objects of minidom and xacro, which have no type hints."""
+Untyped: TypeAlias = Any  # objects of minidom and xacro, which have no type hints
 
 _LOCATION = "morphgen-location"
 
@@ -151,13 +148,10 @@ def _serialised(node: minidom.Node | None) -> Iterator[str]:
         yield f"</{node.tagName}>"
 
 
-Engine: TypeAlias = Any
-"""A ``xacro`` module, which has no type hints."""
+Engine: TypeAlias = Any  # a xacro module, which has no type hints
 
-MAX_ELEMENTS = 50_000
-"""Largest number of elements that an expansion may process; the PR2 has 2,734."""
-MAX_TEXT = 20_000_000
-"""Largest text that the substitutions of an expansion may create [characters]."""
+MAX_ELEMENTS = 50_000  # largest number of elements that an expansion may process; the PR2 has 2,734
+MAX_TEXT = 20_000_000  # largest text that the substitutions of an expansion may create [characters]
 
 _NAME = "morphgen.formats._xacro"
 _READERS = ("parse", "load_yaml", "list_files", "eval_extension")
@@ -334,8 +328,7 @@ def _load_package() -> CodeType:
 _BODY = _load_package()
 
 
-CPU_LIMIT = 8
-"""Longest computation of an expansion [s of CPU time]."""
+CPU_LIMIT = 8  # longest computation of an expansion [s of CPU time]
 WALL_LIMIT = 30
 """Longest wait for an expansion [s]. On Windows, which has no other limit, the only one."""
 MEMORY_LIMIT = 2**30
@@ -343,8 +336,7 @@ MEMORY_LIMIT = 2**30
 MAX_RECORDS = 1000
 """Most warnings of a document that are passed on to the log, and longest of them [characters]."""
 
-_RECURSION_LIMIT = 4000
-"""Python frames for nested macros; one level takes about ten."""
+_RECURSION_LIMIT = 4000  # Python frames for nested macros; one level takes about ten
 _CHILD_CODE = (
     "import json, sys; request = json.load(sys.stdin); sys.path[:] = request['sys_path']; "
     "from morphgen.formats.xacro.expand import serve; serve(request)"
@@ -460,10 +452,8 @@ def limit_process(cpu: int, memory: int) -> None:
             resource.setrlimit(kind, (soft, hard))
 
 
-MAX_INCLUDE_DEPTH = 40
-"""Deepest nesting of includes; deeper ones are taken for a loop."""
-MAX_REASON = 400
-"""Longest reason in an error [characters]; expressions can be long."""
+MAX_INCLUDE_DEPTH = 40  # deepest nesting of includes; deeper ones are taken for a loop
+MAX_REASON = 400  # longest reason in an error [characters]; expressions can be long
 
 _COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
 _FAULTS = (*MALFORMED, ExpatError)
