@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from lxml import etree
 
 from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker
-from morphgen.formats.srdf import (
-    Chain,
-    EndEffector,
-    Group,
-    GroupState,
-    LinkSpheres,
-    Srdf,
-    require_tool,
-    srdf_text,
-)
+from morphgen.formats.srdf import LinkSpheres, require_tool
 from morphgen.model.geometry import Mesh
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
@@ -126,36 +118,60 @@ def robot_srdf_text(
     seed: int = 0,
     spheres: tuple[LinkSpheres, ...] = (),
 ) -> str:
-    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment."""
-    require_tool(robot)
-    matrix = collision_matrix(robot, samples=samples, seed=seed)
-    srdf = replace(robot_srdf(robot, matrix), link_spheres=spheres)
-    return srdf_text(srdf, matrix_evidence(robot, matrix))
+    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
 
-
-def robot_srdf(robot: Robot, matrix: CollisionMatrix) -> Srdf:
-    """Return the SRDF of a robot; its names are those of the URDF that morphgen writes.
-
-    Every tool has a group ``arm``: the chain from the root to the tool. It has a group ``ee`` if
-    the robot has an end-effector there: the links of its part, or in a robot that was not composed
-    of parts, the links around the joints that do not move the tool, such as those of a gripper.
-    The groups of a robot with several limbs are named after them, such as ``left_arm``.
+    Its names are those of the URDF that morphgen writes. Every tool has a group ``arm``: the chain
+    from the root to the tool. It has a group ``ee`` if the robot has an end-effector there: the
+    links of its part, or in a robot that was not composed of parts, the links around the joints
+    that do not move the tool, such as those of a gripper. The groups of a robot with several limbs
+    are named after them, such as ``left_arm``.
     """
     require_tool(robot)
-    groups: list[Group] = []
-    end_effectors = []
-    for arm, hand in _limbs(robot):
-        groups += (arm, hand) if hand else (arm,)
-        if hand:
-            carrier = robot.links[robot.parents[robot.link_index[hand.links[0]]]].name
-            end_effectors.append(EndEffector(hand.name, carrier, hand.name, arm.name))
-    return Srdf(
-        robot.name,
-        groups=tuple(groups),
-        group_states=tuple(_home_states(robot, groups)),
-        end_effectors=tuple(end_effectors),
-        disabled_pairs=matrix.reasons,
-    )
+    matrix = collision_matrix(robot, samples=samples, seed=seed)
+    root = etree.Element("robot", name=robot.name)
+    _write_limbs(root, robot, [*_limbs(robot)])
+    for link, balls in spheres:
+        element = etree.SubElement(root, "link_sphere_approximation", link=link)
+        for center, radius in balls:
+            values = {"center": _numbers(*center), "radius": _numbers(radius)}
+            etree.SubElement(element, "sphere", values)
+    root.append(etree.Comment(f" {matrix_evidence(robot, matrix)} "))
+    for (a, b), reason in matrix.reasons.items():
+        etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
+    etree.indent(root)
+    return etree.tostring(root, encoding="unicode") + "\n"
+
+
+def _write_limbs(root: etree._Element, robot: Robot, limbs: Sequence[_Limb]) -> None:
+    """Write the groups of limbs, their home configuration and the end-effectors."""
+    joints_of: dict[str, list[str]] = {}
+    for limb in limbs:
+        group = etree.SubElement(root, "group", name=limb.arm)
+        etree.SubElement(group, "chain", base_link=robot.root.name, tip_link=limb.tool)
+        chain = robot.joint_chain(robot.frame(limb.tool).link)
+        joints_of[limb.arm] = [robot.joints[k].name for k in chain]
+        if limb.links:
+            group = etree.SubElement(root, "group", name=limb.hand)
+            for name in limb.links:
+                etree.SubElement(group, "link", name=name)
+            joints_of[limb.hand] = [j.name for j in robot.joints if j.child in limb.links]
+    names = (robot.joints[k].name for k in robot.independent_joints)
+    home = dict(zip(names, robot.home, strict=True))
+    for group_name, joints in joints_of.items():
+        if movable := [name for name in joints if name in home]:
+            state = etree.SubElement(root, "group_state", name="home", group=group_name)
+            for name in movable:
+                etree.SubElement(state, "joint", name=name, value=_numbers(home[name]))
+    for limb in limbs:
+        if limb.links:
+            carrier = robot.links[robot.parents[robot.link_index[limb.links[0]]]].name
+            ends = {"name": limb.hand, "parent_link": carrier, "group": limb.hand}
+            etree.SubElement(root, "end_effector", ends | {"parent_group": limb.arm})
+
+
+def _numbers(*values: float) -> str:
+    """Return numbers with all their digits, so that reading them back is exact."""
+    return " ".join(repr(float(value)) for value in values)
 
 
 def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
@@ -174,18 +190,23 @@ def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
     )
 
 
-def _limbs(robot: Robot) -> Iterator[tuple[Group, Group | None]]:
-    """Yield the groups of every arm and its end-effector, if it has one.
+class _Limb(NamedTuple):
+    """An arm and its end-effector."""
 
-    ``tool`` of a robot with several is the tool of the last and left out.
-    """
+    arm: str
+    tool: str
+    hand: str
+    links: list[str]  # of the end-effector; none without one
+
+
+def _limbs(robot: Robot) -> Iterator[_Limb]:
+    """Yield the limbs; ``tool`` of a robot with several is the tool of the last and left out."""
     tools = [frame for frame in robot.frames if frame.name.endswith(f"_{TOOL}")]
     for tool in tools or [robot.frame(TOOL)]:
         prefix = tool.name.removesuffix(TOOL).removesuffix("arm_")
-        arm = Group(f"{prefix}arm", chains=(Chain(robot.root.name, tool.name),))
-        names = _part_links(robot, f"{prefix}ee") or _gripper_links(robot, tool)
-        has_parent = bool(names) and names[0] != robot.root.name
-        yield arm, Group(f"{prefix}ee", tuple(names)) if has_parent else None
+        links = _part_links(robot, f"{prefix}ee") or _gripper_links(robot, tool)
+        has_parent = bool(links) and links[0] != robot.root.name
+        yield _Limb(f"{prefix}arm", tool.name, f"{prefix}ee", links if has_parent else [])
 
 
 def _part_links(robot: Robot, label: str) -> list[str]:
@@ -226,19 +247,3 @@ def _below(robot: Robot, root: int) -> list[int]:
         if robot.parents[i] in below:
             below.append(i)
     return below
-
-
-def _home_states(robot: Robot, groups: Iterable[Group]) -> Iterator[GroupState]:
-    """Yield the home configuration of every group that has independent joints."""
-    home = {
-        robot.joints[k].name: position
-        for k, position in zip(robot.independent_joints, robot.home, strict=True)
-    }
-    for group in groups:
-        names = [joint.name for joint in robot.joints if joint.child in group.links]
-        for chain in group.chains:
-            indices = robot.joint_chain(robot.frame(chain.tip_link).link)
-            names += (robot.joints[k].name for k in indices)
-        positions = tuple((name, home[name]) for name in names if name in home)
-        if positions:
-            yield GroupState("home", group.name, positions)

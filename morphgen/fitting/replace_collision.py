@@ -24,7 +24,7 @@ from morphgen.formats.fits import (
     shapes_scale,
 )
 from morphgen.formats.rounding import as_written
-from morphgen.formats.srdf import BoundingSphere, LinkSpheres
+from morphgen.formats.srdf import LinkSpheres
 from morphgen.model.geometry import Shape, Sphere, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
 
@@ -109,7 +109,7 @@ def link_spheres(robot: Robot) -> tuple[LinkSpheres, ...]:
         LinkSpheres(
             link.name,
             tuple(
-                BoundingSphere(shape.T_link_shape.position, shape.geometry.radius)
+                (shape.T_link_shape.position, shape.geometry.radius)
                 for shape in link.collisions
                 if isinstance(shape.geometry, Sphere)
             ),

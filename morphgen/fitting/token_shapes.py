@@ -41,7 +41,7 @@ from morphgen.model.geometry import (
     scale_shape,
     volume,
 )
-from morphgen.model.inertia import union_integrals
+from morphgen.model.inertia import union_volume
 from morphgen.model.robot import Robot
 from morphgen.progress import report
 from morphgen.typing import Array
@@ -417,8 +417,8 @@ def _dominant_primitive(shapes: Sequence[Shape]) -> Shape | None:
     """
     if not are_primitives(shapes):
         return None
-    largest = max(shapes, key=lambda shape: union_integrals([shape]).volume)
-    share = union_integrals([largest]).volume / union_integrals(shapes).volume
+    largest = max(shapes, key=lambda shape: union_volume([shape]))
+    share = union_volume([largest]) / union_volume(shapes)
     return canonical(replace(largest, rgba=None)) if share >= DOMINANT_SHARE else None
 
 

@@ -281,19 +281,6 @@ def write_fits(robot: Robot, folder: Path) -> None:
 
 CARD_FORMAT = 1
 
-_PROVENANCE = (
-    "derivation",
-    "source",
-    "choices",
-    "repairs",
-    "parts",
-    "accepted",
-    "primitives",
-    "convex",
-    "packages",
-)
-"""Keys of a card that become the robot's ``provenance``."""
-
 
 class _CardRecord(Record, frozen=True):
     """The keys of a card that a robot is read from; the others only describe the robot."""
@@ -314,6 +301,10 @@ class _CardRecord(Record, frozen=True):
     def __post_init__(self) -> None:
         if any(not {"label", "part"} <= part.keys() for part in self.parts):
             raise ValueError("parts: expected objects with the keys 'label' and 'part'")
+
+
+_KEYS = _CardRecord.__struct_fields__
+_PROVENANCE = _KEYS[_KEYS.index("derivation") :]  # keys that become the robot's provenance
 
 
 def robot_card(
@@ -374,7 +365,7 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         raise FormatError(
             f"{origin}: card format {card['format']!r}; this version reads {CARD_FORMAT}"
         )
-    known = {key: card[key] for key in _CardRecord.__struct_fields__ if key in card}
+    known = {key: card[key] for key in _KEYS if key in card}
     record = read_record(known, _CardRecord, origin)
     robot = with_frames(robot, tuple(record.frames))
     try:

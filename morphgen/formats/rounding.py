@@ -111,19 +111,18 @@ def _joint(joint: Joint) -> Joint:
         return Joint(joint.name, joint.kind, joint.parent, joint.child, T_parent_joint)
     limits = None if joint.is_continuous else joint.limits
     mimic = joint.mimic
-    return Joint(
-        joint.name,
-        "continuous" if joint.is_continuous else joint.kind,
-        joint.parent,
-        joint.child,
-        T_parent_joint,
-        rounded_axis(joint),
-        limits and (round_number(limits[0]), round_number(limits[1])),
-        DEFAULT_EFFORT if joint.effort is None else round_number(joint.effort),
-        DEFAULT_VELOCITY if joint.velocity is None else round_number(joint.velocity),
-        round_number(joint.damping),
-        round_number(joint.friction),
-        mimic and Mimic(mimic.joint, round_number(mimic.multiplier), round_number(mimic.offset)),
+    return replace(
+        joint,
+        kind="continuous" if joint.is_continuous else joint.kind,
+        T_parent_joint=T_parent_joint,
+        axis=rounded_axis(joint),
+        limits=limits and (round_number(limits[0]), round_number(limits[1])),
+        effort=round_number(DEFAULT_EFFORT if joint.effort is None else joint.effort),
+        velocity=round_number(DEFAULT_VELOCITY if joint.velocity is None else joint.velocity),
+        damping=round_number(joint.damping),
+        friction=round_number(joint.friction),
+        mimic=mimic
+        and Mimic(mimic.joint, round_number(mimic.multiplier), round_number(mimic.offset)),
     )
 
 

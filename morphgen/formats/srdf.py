@@ -1,11 +1,11 @@
-"""Descriptions for motion planners: SRDF, which MoveIt reads beside a URDF, and cuRobo's file."""
+"""Read SRDF, the planning description beside a URDF, and write cuRobo's configuration."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,69 +19,13 @@ from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 
 
-class Chain(NamedTuple):
-    """The joints and links between two links."""
-
-    base_link: str
-    tip_link: str
-
-
-class Group(NamedTuple):
-    """A planning group: links and chains."""
-
-    name: str
-    links: tuple[str, ...] = ()
-    chains: tuple[Chain, ...] = ()
-
-
-class GroupState(NamedTuple):
-    """A named configuration of a group."""
-
-    name: str
-    group: str
-    positions: tuple[tuple[str, float], ...]
-    """Joints with their positions [rad or m]."""
-
-
-class EndEffector(NamedTuple):
-    """A group that is an end-effector of another one."""
-
-    name: str
-    parent_link: str
-    """Link that carries the end-effector."""
-    group: str
-    parent_group: str
-    """Group that moves the end-effector."""
-
-
-class BoundingSphere(NamedTuple):
-    """A sphere that bounds a part of a link."""
-
-    center: Vec3
-    """Centre in the link's frame [m]."""
-    radius: float
-    """Radius [m]; MoveIt gives a link no collision shape if its only sphere has radius zero."""
-
-
 class LinkSpheres(NamedTuple):
     """Spheres that approximate a link."""
 
     link: str
-    spheres: tuple[BoundingSphere, ...]
-
-
-@dataclass(frozen=True)
-class Srdf:
-    """The content of an SRDF that morphgen writes; each kind of element is in its order."""
-
-    robot: str
-    """Name of the robot."""
-    groups: tuple[Group, ...] = ()
-    group_states: tuple[GroupState, ...] = ()
-    end_effectors: tuple[EndEffector, ...] = ()
-    link_spheres: tuple[LinkSpheres, ...] = ()
-    disabled_pairs: Mapping[Pair, str] = field(default_factory=dict)
-    """Reason why a pair of links needs no test, such as ``Adjacent`` or ``Never``."""
+    spheres: tuple[tuple[Vec3, float], ...]
+    """Centre in the link's frame and radius of each [m]; MoveIt gives a link no collision shape if
+    its only sphere has radius zero."""
 
 
 def require_tool(robot: Robot) -> None:
@@ -91,42 +35,6 @@ def require_tool(robot: Robot) -> None:
             f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
             "tool (morphgen import FILE --tool LINK)"
         )
-
-
-def srdf_text(srdf: Srdf, evidence: str = "") -> str:
-    """Write SRDF, with the evidence of its disabled pairs as a comment."""
-    root = etree.Element("robot", name=srdf.robot)
-    for group in srdf.groups:
-        _write_group(root, group)
-    for state in srdf.group_states:
-        element = etree.SubElement(root, "group_state", name=state.name, group=state.group)
-        for joint, position in state.positions:
-            etree.SubElement(element, "joint", name=joint, value=_join([position]))
-    for end_effector in srdf.end_effectors:
-        etree.SubElement(root, "end_effector", end_effector._asdict())
-    for link, spheres in srdf.link_spheres:
-        element = etree.SubElement(root, "link_sphere_approximation", link=link)
-        for center, radius in spheres:
-            etree.SubElement(element, "sphere", center=_join(center), radius=_join([radius]))
-    if evidence:
-        root.append(etree.Comment(f" {evidence} "))
-    for (a, b), reason in srdf.disabled_pairs.items():
-        etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
-    etree.indent(root)
-    return etree.tostring(root, encoding="unicode") + "\n"
-
-
-def _write_group(root: etree._Element, group: Group) -> None:
-    element = etree.SubElement(root, "group", name=group.name)
-    for name in group.links:
-        etree.SubElement(element, "link", name=name)
-    for chain in group.chains:
-        etree.SubElement(element, "chain", chain._asdict())
-
-
-def _join(values: Iterable[float]) -> str:
-    """Return numbers with all their digits, so that reading them back is exact."""
-    return " ".join(repr(float(value)) for value in values)
 
 
 MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]
@@ -302,7 +210,7 @@ def curobo_text(
         "collision_link_names": links,
         "collision_spheres": {
             link.link: [
-                {"center": list(sphere.center), "radius": sphere.radius} for sphere in link.spheres
+                {"center": list(center), "radius": radius} for center, radius in link.spheres
             ]
             for link in spheres
         },

@@ -192,16 +192,14 @@ MAX_BYTES = 2**30  # largest total size of the arrays of an archive [bytes]
 
 
 def read_npz(source: Path | IO[bytes], names: Sequence[str]) -> list[NDArray[Any]]:
-    """Return arrays of an archive by their names; see ``read_all``."""
-    return [*_read(source, names).values()]
+    """Return arrays of an archive by their names."""
+    return [*read_all(source, names).values()]
 
 
-def read_all(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
-    """Return all arrays of an archive."""
-    return _read(source, None)
-
-
-def _read(source: Path | IO[bytes], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
+def read_all(
+    source: Path | IO[bytes], names: Sequence[str] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return arrays of an archive by their names, all of them by default."""
     try:
         with zipfile.ZipFile(source) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -37,33 +37,6 @@ _CORNER_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Signs of the eight corners of a box, shape (8, 3)."""
 
 
-@dataclass(frozen=True)
-class VolumeIntegrals:
-    """Integrals over the volume of a solid, about the link's origin in link axes."""
-
-    volume: float
-    """Integral of 1 [m^3]."""
-    first: Array
-    """Integral of x, shape (3,) [m^4]."""
-    second: Array
-    """Integral of x x^T, shape (3, 3) [m^5]."""
-
-    @classmethod
-    def zero(cls) -> VolumeIntegrals:
-        """Return the integrals of an empty solid."""
-        return cls(0.0, np.zeros(3), np.zeros((3, 3)))
-
-    def __add__(self, other: VolumeIntegrals) -> VolumeIntegrals:
-        return VolumeIntegrals(
-            self.volume + other.volume, self.first + other.first, self.second + other.second
-        )
-
-    def __sub__(self, other: VolumeIntegrals) -> VolumeIntegrals:
-        return VolumeIntegrals(
-            self.volume - other.volume, self.first - other.first, self.second - other.second
-        )
-
-
 def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     """Return the mass properties of solid shapes with uniform density, overlaps counted once.
 
@@ -71,14 +44,15 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     The overlap of shapes is measured on their tessellations by exact booleans. The density is in
     kg/m^3; without shapes the mass is zero.
     """
-    integrals = union_integrals(shapes)
-    if integrals.volume <= 0:
+    moments = _union_moments(*_cache_key(shapes))
+    volume = float(moments[3, 3])
+    if volume <= 0:
         return Inertial(0.0)
-    com = integrals.first / integrals.volume
-    central = integrals.second - integrals.volume * np.outer(com, com)
+    com = moments[:3, 3] / volume
+    central = moments[:3, :3] - volume * np.outer(com, com)
     inertia = density * (np.trace(central) * np.eye(3) - central)
     x, y, z = com.tolist()
-    return Inertial.from_matrix(density * integrals.volume, (x, y, z), inertia)
+    return Inertial.from_matrix(density * volume, (x, y, z), inertia)
 
 
 def with_inertia(link: Link, density: float) -> Link:
@@ -95,16 +69,18 @@ def inertial_from_mass(link: Link, mass: float) -> Inertial:
     return Inertial.from_matrix(mass, unit.com, unit.matrix * (mass / unit.mass))
 
 
-def union_integrals(shapes: Sequence[Shape]) -> VolumeIntegrals:
-    """Return the volume integrals of the union of shapes; cached until a mesh file changes."""
-    return _union_integrals(*_cache_key(shapes))
+def union_volume(shapes: Sequence[Shape]) -> float:
+    """Return the volume of the union of shapes [m^3]; cached until a mesh file changes."""
+    return float(_union_moments(*_cache_key(shapes))[3, 3])
 
 
 @lru_cache(maxsize=4096)
-def _union_integrals(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> VolumeIntegrals:
-    total = VolumeIntegrals.zero()
-    for shape in shapes:
-        total += _integrals(shape)
+def _union_moments(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Array:
+    """Return the integral of (x, 1) (x, 1)^T over a union, about the link's origin, (4, 4).
+
+    It holds the second moments [m^5], the first ones [m^4] and the volume [m^3].
+    """
+    total = sum(map(_moments, shapes), np.zeros((4, 4)))
     boxes = [bounding_box([shape]) for shape in shapes]
     if not any(
         np.all(a[0] < b[1]) and np.all(b[0] < a[1]) for a, b in itertools.combinations(boxes, 2)
@@ -115,11 +91,9 @@ def _union_integrals(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Vol
     # Closed forms are exact, but booleans are not defined on them: subtract only the overlap,
     # which is the difference between the separate tessellations and their union.
     solids = [_manifold(shape) for shape in shapes]
-    separate = VolumeIntegrals.zero()
-    for solid in solids:
-        separate += _mesh_integrals(_from_manifold(solid))
+    separate = sum((_mesh_moments(_from_manifold(s)) for s in solids), np.zeros((4, 4)))
     union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    return total - (separate - _mesh_integrals(_from_manifold(union)))
+    return np.asarray(total - (separate - _mesh_moments(_from_manifold(union))))
 
 
 def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
@@ -203,14 +177,18 @@ def _corners(shape: Shape) -> Array:
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
 
-def _integrals(shape: Shape) -> VolumeIntegrals:
+def _moments(shape: Shape) -> Array:
     geometry, T = shape.geometry, shape.T_link_shape.matrix
     if isinstance(geometry, Mesh):
-        return _mesh_integrals(_mesh_in_link(shape))
+        return _mesh_moments(_mesh_in_link(shape))
     v = volume(geometry)
     R, p = T[:3, :3], T[:3, 3]
     central = np.diag(_central_second(geometry))
-    return VolumeIntegrals(v, v * p, R @ central @ R.T + v * np.outer(p, p))
+    return _moment_matrix(v, v * p, R @ central @ R.T + v * np.outer(p, p))
+
+
+def _moment_matrix(volume: float, first: Array, second: Array) -> Array:
+    return np.block([[second, first[:, None]], [first, volume]])
 
 
 def _central_second(primitive: Primitive) -> tuple[float, float, float]:
@@ -231,14 +209,14 @@ def _central_second(primitive: Primitive) -> tuple[float, float, float]:
             return (side, side, along)
 
 
-def _mesh_integrals(mesh: trimesh.Trimesh) -> VolumeIntegrals:
+def _mesh_moments(mesh: trimesh.Trimesh) -> Array:
     v = float(mesh.volume)
     if v <= 0:
-        return VolumeIntegrals.zero()
+        return np.zeros((4, 4))
     com = np.asarray(mesh.center_mass)
     inertia = np.asarray(mesh.moment_inertia) / mesh.density
     central = np.trace(inertia) / 2 * np.eye(3) - inertia  # inverse of I = tr(C) 1 - C
-    return VolumeIntegrals(v, v * com, central + v * np.outer(com, com))
+    return _moment_matrix(v, v * com, central + v * np.outer(com, com))
 
 
 def _mesh_in_link(shape: Shape) -> trimesh.Trimesh:

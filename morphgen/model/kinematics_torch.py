@@ -19,7 +19,7 @@ Arguments that the functions share:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -420,30 +420,6 @@ def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tens
     return (J.transpose(-1, -2) @ scaled)[..., 0]
 
 
-def solve_position_ik(
-    chain: FrameChain,
-    robot_index: torch.Tensor,
-    q: torch.Tensor,
-    positions: torch.Tensor,
-    limits: tuple[torch.Tensor, torch.Tensor],
-    *,
-    iterations: int = 25,
-    damping: float = DAMPING,
-    max_step: float = MAX_STEP,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to positions by damped least squares, within the joint limits.
-
-    Returns:
-        Configurations, shape (n, J), and the remaining position errors, shape (n, 3) [m].
-    """
-
-    def task(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
-        return J_root_tool[:, :3], positions - T_root_tool[:, :3, 3]
-
-    return _solve(task, q, limits, iterations, damping, max_step)
-
-
 def pose_task(
     T_root_tool: torch.Tensor,
     J_root_tool: torch.Tensor,
@@ -462,33 +438,43 @@ def pose_task(
     return torch.cat([J_root_tool[:, :3], angular], dim=1), torch.cat(errors, dim=1)
 
 
-def solve_pose_ik(
+def solve_ik(
     chain: FrameChain,
     robot_index: torch.Tensor,
     q: torch.Tensor,
     positions: torch.Tensor,
-    rotations: torch.Tensor,
+    rotations: torch.Tensor | None,
     limits: tuple[torch.Tensor, torch.Tensor],
     *,
-    rotation_weight: float,
+    rotation_weight: float = 0.0,
     iterations: int = 25,
     damping: float = DAMPING,
     max_step: float = MAX_STEP,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to poses by damped least squares, within the joint limits.
+    """Move tools to positions, or to poses, by damped least squares, within the joint limits.
 
     Position and rotation have the same priority. From random starts this finds more solutions than
     repeating ``pose_ik_step``, which is made for paths that start near their goals.
 
+    rotations: None if only positions matter.
+
     Returns:
-        Configurations, shape (n, J), and the remaining errors of ``pose_task``, shape (n, 6) [m].
+        Configurations, shape (n, J), and the remaining errors, shape (n, 3) or, for poses as of
+        ``pose_task``, (n, 6) [m].
     """
 
     def task(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
+        if rotations is None:
+            return J_root_tool[:, :3], positions - T_root_tool[:, :3, 3]
         return pose_task(T_root_tool, J_root_tool, positions, rotations, rotation_weight)
 
-    return _solve(task, q, limits, iterations, damping, max_step)
+    q = torch.clamp(q, *limits)
+    for _ in range(iterations):
+        J, error = task(q)
+        step = dls_step(J, error, damping)
+        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
+    return q, task(q)[1]
 
 
 def solve_from_starts(
@@ -502,36 +488,26 @@ def solve_from_starts(
     rotation_weight: float,
     iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to positions or poses from several starts each; see ``solve_position_ik``.
+    """Move tools to positions or poses from several starts each; see ``solve_ik``.
 
     starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
-    rotations: None if only positions matter.
 
     Returns:
-        Configurations, shape (S, n, J), and the remaining errors, shape (S, n, 3) or, for poses as
-        of ``pose_task``, (S, n, 6) [m].
+        Configurations, shape (S, n, J), and the remaining errors, shape (S, n, 3) or (S, n, 6) [m].
     """
     count = len(starts)
-    robots, q = robot_index.repeat(count), starts.flatten(0, 1)
-    goals = positions.repeat(count, 1)
-    all_limits = limits[0].repeat(count, 1), limits[1].repeat(count, 1)
-    constants = {"damping": START_DAMPING, "max_step": START_MAX_STEP}
-    if rotations is None:
-        q, error = solve_position_ik(
-            chain, robots, q, goals, all_limits, iterations=iterations, **constants
-        )
-    else:
-        q, error = solve_pose_ik(
-            chain,
-            robots,
-            q,
-            goals,
-            rotations.repeat(count, 1, 1),
-            all_limits,
-            rotation_weight=rotation_weight,
-            iterations=iterations,
-            **constants,
-        )
+    q, error = solve_ik(
+        chain,
+        robot_index.repeat(count),
+        starts.flatten(0, 1),
+        positions.repeat(count, 1),
+        None if rotations is None else rotations.repeat(count, 1, 1),
+        (limits[0].repeat(count, 1), limits[1].repeat(count, 1)),
+        rotation_weight=rotation_weight,
+        iterations=iterations,
+        damping=START_DAMPING,
+        max_step=START_MAX_STEP,
+    )
     return q.view_as(starts), error.view(count, len(positions), -1)
 
 
@@ -575,26 +551,6 @@ def pose_ik_step(
         target = q + (step + rotation_step)[..., 0]
         free = free & (target >= lower) & (target <= upper)
     return torch.clamp(target, lower, upper)
-
-
-def _solve(
-    task: Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
-    q: torch.Tensor,
-    limits: tuple[torch.Tensor, torch.Tensor],
-    iterations: int,
-    damping: float,
-    max_step: float,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Repeat steps of damped least squares; return configurations and the remaining errors.
-
-    task: Function from configurations (n, J) to Jacobians (n, m, J) and errors (n, m).
-    """
-    q = torch.clamp(q, *limits)
-    for _ in range(iterations):
-        J, error = task(q)
-        step = dls_step(J, error, damping)
-        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
-    return q, task(q)[1]
 
 
 def _limit_rotation(

@@ -8,10 +8,10 @@ import pytest
 
 from helpers.composed import composed
 from helpers.robots import arm
-from morphgen.checks.robot_srdf import collision_matrix, robot_srdf, robot_srdf_text
+from morphgen.checks.robot_srdf import collision_matrix, robot_srdf_text
 from morphgen.checks.self_collision import ALWAYS_SHARE, PENETRATION
 from morphgen.errors import FormatError
-from morphgen.formats.srdf import EndEffector, Group, GroupState, parse_srdf, with_disabled_pairs
+from morphgen.formats.srdf import LinkSpheres, parse_srdf, read_srdf, with_disabled_pairs
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
@@ -120,29 +120,54 @@ def test_srdf_holds_the_matrix_with_its_evidence():
     assert set(with_disabled_pairs(robot, srdf).ignore_pairs) == set(matrix.reasons)
 
 
-def test_gripper_of_an_imported_arm_is_an_end_effector():
-    robot = arm()
-    srdf = robot_srdf(robot, collision_matrix(robot, samples=10))
-    assert srdf.groups[0].chains[0].tip_link == "tool"
-    assert srdf.groups[1] == Group("ee", ("left", "right"))
-    assert srdf.end_effectors == (EndEffector("ee", "slider", "ee", "arm"),)
-    assert srdf.group_states == (
-        GroupState("home", "arm", (("shoulder", 0.4), ("elbow", 0.5), ("extend", 0.01))),
-        GroupState("home", "ee", (("left", 0.02),)),
-    )
+TEXT = """\
+<robot name="arm &amp; &quot;hand&quot;">
+  <group name="arm">
+    <chain base_link="base" tip_link="tool"/>
+  </group>
+  <group name="ee">
+    <link name="left"/>
+    <link name="right"/>
+  </group>
+  <group_state name="home" group="arm">
+    <joint name="shoulder" value="0.30000000000000004"/>
+    <joint name="elbow" value="-1e-17"/>
+    <joint name="extend" value="0.01"/>
+  </group_state>
+  <group_state name="home" group="ee">
+    <joint name="left" value="0.02"/>
+  </group_state>
+  <end_effector name="ee" parent_link="slider" group="ee" parent_group="arm"/>
+  <link_sphere_approximation link="upper">
+    <sphere center="0.1 -0.2 0.14285714285714285" radius="0.05"/>
+  </link_sphere_approximation>
+  <!-- """
+
+
+def test_gripper_of_an_imported_arm_is_an_end_effector(tmp_path):
+    robot = replace(arm(), name='arm & "hand"', home=(0.1 + 0.2, -1e-17, 0.01, 0.02))
+    spheres = (LinkSpheres("upper", (((0.1, -0.2, 1 / 7), 0.05),)),)
+    text = robot_srdf_text(robot, samples=10, spheres=spheres)
+    assert text.startswith(TEXT)
+    (tmp_path / "arm.srdf").write_text(text)
+    assert read_srdf(tmp_path / "arm.srdf").get("name") == robot.name
+
+
+def groups(robot):
+    root = parse_srdf(robot_srdf_text(robot, samples=10).encode(), "x")
+    return root, {group.get("name"): group for group in root.findall("group")}
 
 
 def test_arm_without_end_effector_has_one_group():
-    robot = balls()
-    assert [g.name for g in robot_srdf(robot, collision_matrix(robot, samples=1)).groups] == ["arm"]
+    assert [*groups(balls())[1]] == ["arm"]
 
 
 def test_parts_of_composed_robots_are_end_effectors():
     robot = composed("base=planar ee=cube")
-    srdf = robot_srdf(robot, collision_matrix(robot, samples=10))
-    assert [group.name for group in srdf.groups] == ["arm", "ee"]
-    assert all(name.startswith("ee_") for name in srdf.groups[1].links)
-    assert srdf.end_effectors[0].parent_link in robot.link_index
+    root, found = groups(robot)
+    assert [*found] == ["arm", "ee"]
+    assert all(link.get("name").startswith("ee_") for link in found["ee"])
+    assert root.find("end_effector").get("parent_link") in robot.link_index
 
 
 def test_robot_without_tool_is_refused():

@@ -1,4 +1,4 @@
-"""SRDF and cuRobo: what is written, refusals, and the pairs that an SRDF disables."""
+"""SRDF and cuRobo: refusals, the pairs that an SRDF disables, and what cuRobo gets."""
 
 import re
 from dataclasses import replace
@@ -10,52 +10,14 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.fitting.replace_collision import link_spheres
 from morphgen.formats.srdf import (
-    BoundingSphere,
-    Chain,
-    EndEffector,
-    Group,
-    GroupState,
-    LinkSpheres,
-    Srdf,
     curobo_text,
     disabled_link_pairs,
     parse_srdf,
-    read_srdf,
-    srdf_text,
     with_disabled_pairs,
 )
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.robot import Frame
 
-TEXT = """\
-<robot name="arm &amp; &quot;hand&quot;">
-  <group name="arm">
-    <chain base_link="base" tip_link="tool"/>
-  </group>
-  <group name="hand">
-    <link name="left"/>
-    <link name="right"/>
-  </group>
-  <group_state name="home" group="arm">
-    <joint name="shoulder" value="0.30000000000000004"/>
-    <joint name="elbow" value="-1e-17"/>
-  </group_state>
-  <end_effector name="hand" parent_link="slider" group="hand" parent_group="arm"/>
-  <link_sphere_approximation link="upper">
-    <sphere center="0.1 -0.2 0.14285714285714285" radius="0.05"/>
-  </link_sphere_approximation>
-  <!-- found by counting -->
-  <disable_collisions link1="base" link2="upper" reason="Adjacent"/>
-</robot>
-"""
-FULL = Srdf(
-    'arm & "hand"',
-    (Group("arm", chains=(Chain("base", "tool"),)), Group("hand", ("left", "right"))),
-    (GroupState("home", "arm", (("shoulder", 0.1 + 0.2), ("elbow", -1e-17))),),
-    (EndEffector("hand", "slider", "hand", "arm"),),
-    (LinkSpheres("upper", (BoundingSphere((0.1, -0.2, 1 / 7), 0.05),)),),
-    {("base", "upper"): "Adjacent"},
-)
 FOREIGN = """
 <virtual_joint name="fixed_base" type="fixed" parent_frame="world" child_link="base"/>
 <group name="arm"><link name="upper"/><joint name="shoulder"/></group>
@@ -73,13 +35,6 @@ FOREIGN = """
 
 def document(content):
     return f'<robot name="arm">\n{content}\n</robot>'.encode()
-
-
-def test_content_is_written_with_all_digits_and_is_valid(tmp_path):
-    assert srdf_text(FULL, "found by counting") == TEXT
-    path = tmp_path / "arm.srdf"
-    path.write_text(TEXT)
-    assert read_srdf(path).get("name") == FULL.robot
 
 
 @pytest.mark.parametrize(

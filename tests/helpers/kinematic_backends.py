@@ -94,8 +94,8 @@ class TorchBackend:
         robot_index, padded = self.rows(index, q)
         goals = torch.from_numpy(positions).to(self.dtype)
         limits = self.limits(robot_index)
-        found, error = kinematics_torch.solve_position_ik(
-            self.chain, robot_index, padded, goals, limits, **options
+        found, error = kinematics_torch.solve_ik(
+            self.chain, robot_index, padded, goals, None, limits, **options
         )
         return found[:, : q.shape[1]].double().numpy(), error.numpy()
 

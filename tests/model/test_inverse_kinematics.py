@@ -25,11 +25,10 @@ from morphgen.model.kinematics_torch import (
     pose_task,
     quaternion_from_matrix,
     rotvec_from_matrix,
-    solve_position_ik,
+    solve_ik,
 )
 from morphgen.model.kinematics_torch import frame_jacobian as frame_jacobians
 from morphgen.model.kinematics_torch import frame_pose as frame_poses
-from morphgen.model.kinematics_torch import solve_pose_ik as solve_poses
 
 UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
     robot(words)
@@ -153,7 +152,7 @@ def test_poses_are_reached_from_random_starts_within_the_limits():
     random = torch.rand(2, *low.shape, generator=torch.Generator().manual_seed(0))
     goal_q = (low + (high - low) * random[0])[::starts].repeat_interleave(starts, 0)
     positions, rotations = solver.poses(goal_q)
-    q, error = solve_poses(
+    q, error = solve_ik(
         solver.chain,
         solver.robot_index,
         low + (high - low) * random[1],
@@ -226,7 +225,7 @@ def test_no_joint_exceeds_its_rotation_budget():
 def test_solutions_are_differentiable_in_their_goals():
     step = Stepper(0, 1)
     goals = (step.poses(step.home)[0] - 0.05).requires_grad_()
-    found, _ = solve_position_ik(step.chain, step.robot_index, step.home, goals, step.limits)
+    found, _ = solve_ik(step.chain, step.robot_index, step.home, goals, None, step.limits)
     tools = step.poses(found)[0]
     (gradient,) = torch.autograd.grad(tools.sum(), goals)
     torch.testing.assert_close(gradient, torch.ones_like(goals), atol=0.02, rtol=0)
