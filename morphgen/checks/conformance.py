@@ -317,42 +317,41 @@ def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | Non
     movable = [robot.joints[k].name for k in robot.movable_joints]
     shared = [name for name in movable if name in reading.joints]
     gains = {gain.joint: gain for gain in actuation(robot)} if reading.has_actuators else {}
-    limits: list[str] = []
-    damping: list[str] = []
-    gain_faults: list[str] = []
+    faults: dict[str, list[str]] = {"limits": [], "damping": [], "gains": []}
     for name in shared:
         joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
         # Without limits, a loader may read none, or those that a bundle has.
         is_open = joint.is_continuous or (joint.limits is None and read.limits == _NO_LIMITS)
         lower, upper = _NO_LIMITS if is_open else joint.effective_limits
-        limits += _differences(
-            name, ("lower limit", read.limits[0], lower), ("upper limit", read.limits[1], upper)
-        )
+        values: list[tuple[str, str, float | None, float]] = [
+            ("limits", "lower limit", read.limits[0], lower),
+            ("limits", "upper limit", read.limits[1], upper),
+            ("damping", "damping", read.damping, joint.damping),
+            ("damping", "friction", read.friction, joint.friction),
+        ]
         if read.effort not in _accepted_efforts(joint):
-            limits += _differences(name, ("effort", read.effort, joint.effort or 0.0))
+            values.append(("limits", "effort", read.effort, joint.effort or 0.0))
         if joint.velocity is not None or read.velocity not in _WITHOUT_VELOCITY:
             velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-            limits += _differences(name, ("velocity", read.velocity, velocity))
-        damping += _differences(
-            name,
-            ("damping", read.damping, joint.damping),
-            ("friction", read.friction, joint.friction),
-        )
+            values.append(("limits", "velocity", read.velocity, velocity))
         if name in gains:
             gain = gains[name]
-            gain_faults += _differences(
-                name,
-                ("stiffness", _or_nan(read.stiffness), gain.stiffness),
-                ("derivative gain", _or_nan(read.derivative_gain), gain.damping),
-                ("armature", _or_nan(read.armature), gain.armature),
-            )
+            values += [
+                ("gains", "stiffness", _or_nan(read.stiffness), gain.stiffness),
+                ("gains", "derivative gain", _or_nan(read.derivative_gain), gain.damping),
+                ("gains", "armature", _or_nan(read.armature), gain.armature),
+            ]
+        for column, quantity, value, expected in values:
+            if value is not None and not _is_close(value, expected):
+                fault = f"joint {name}: {quantity} {value:.6g}, not {expected:.6g}"
+                faults[column].append(fault)
     reads_damping = any(reading.joints[name].damping is not None for name in shared)
     mimics = reading.mimics
     return {
-        "limits": limits,
+        "limits": faults["limits"],
         "mimic": None if mimics is None else [*_mimic_differences(robot, mimics, shared)],
-        "damping": damping if reads_damping else None,
-        "gains": gain_faults if reading.has_actuators else None,
+        "damping": faults["damping"] if reads_damping else None,
+        "gains": faults["gains"] if reading.has_actuators else None,
     }
 
 
@@ -369,13 +368,6 @@ def _accepted_efforts(joint: Joint) -> tuple[float | None, ...]:
 def _or_nan(value: float | None) -> float:
     """Return a value that is required; a missing one differs from every number."""
     return math.nan if value is None else value
-
-
-def _differences(name: str, *values: tuple[str, float | None, float]) -> Iterator[str]:
-    """Describe values that differ, each given as its name, the loader's and the robot's."""
-    for quantity, read, expected in values:
-        if read is not None and not _is_close(read, expected):
-            yield f"joint {name}: {quantity} {read:.6g}, not {expected:.6g}"
 
 
 def _is_close(a: float, b: float) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from morphgen.checks.loaders import unit_density_inertial
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, Severity
 from morphgen.model.inertia import bounding_box
 from morphgen.model.robot import Inertial, Link, Robot
 from morphgen.model.tree import RigidGroup, rigid_groups
@@ -25,9 +25,6 @@ DENSITY_RANGE = (20.0, 25_000.0)
 TRIANGLE_MARGIN = 1e-12
 """Relative margin of the triangle inequality, because MuJoCo refuses values at the limit after
 rounding."""
-_FROM_SOLID = (
-    f"its mass and inertia were set to those of its solid geometry at {DEFAULT_DENSITY:g} kg/m^3"
-)
 
 
 def check_masses(robot: Robot) -> Iterator[Finding]:
@@ -36,25 +33,17 @@ def check_masses(robot: Robot) -> Iterator[Finding]:
         if not group.is_root:
             yield from _group_findings(group)
     for link in robot.links:
+        where = f"link {link.name}"
         if link.inertial is not None and not is_mass_valid(link.inertial):
-            yield Finding(
-                "mass-invalid",
-                "error",
-                f"link {link.name}",
-                f"mass {link.inertial.mass:g} kg with its centre at {link.inertial.com}",
-                f"write a finite mass of at least 0; the repair takes the solid geometry's at "
-                f"{DEFAULT_DENSITY:g} kg/m^3",
-                repair=_FROM_SOLID if unit_density_inertial(link) is not None else "",
-            )
+            why = f"mass {link.inertial.mass:g} kg with its centre at {link.inertial.com}"
+            solid = f"the solid geometry's at {DEFAULT_DENSITY:g} kg/m^3"
+            fix = f"write a finite mass of at least 0; the repair takes {solid}"
+            yield Finding("mass-invalid", "error", where, why, fix, _solid_repair(link))
         if is_inertia_without_mass(link):
-            yield Finding(
-                "inertia-without-mass",
-                "warning",
-                f"link {link.name}",
-                "it has a rotational inertia but no mass",
-                "give it a mass, or set its inertia to zero as the repair does",
-                repair="its inertia was set to zero: it has no mass",
-            )
+            why = "it has a rotational inertia but no mass"
+            fix = "give it a mass, or set its inertia to zero as the repair does"
+            repair = "its inertia was set to zero: it has no mass"
+            yield Finding("inertia-without-mass", "warning", where, why, fix, repair)
 
 
 def check_inertia(robot: Robot) -> Iterator[Finding]:
@@ -66,17 +55,15 @@ def check_inertia(robot: Robot) -> Iterator[Finding]:
         solid = unit_density_inertial(link)
         fault = inertia_fault(inertial)
         if fault is not None:
-            yield Finding(
-                "inertia-not-physical",
-                "error",
-                f"link {link.name}",
-                f"{fault}; MuJoCo refuses it, PyBullet takes zero",
+            fix = (
                 "correct the inertia; the repair takes, at the same mass, the solid geometry's or, "
-                f"without any, that of a ball of {DEFAULT_DENSITY:g} kg/m^3",
-                repair="its inertia was set to that of "
-                + ("a ball" if solid is None else "its solid geometry")
-                + f" at the same mass, {inertial.mass:g} kg",
+                f"without any, that of a ball of {DEFAULT_DENSITY:g} kg/m^3"
             )
+            body = "a ball" if solid is None else "its solid geometry"
+            repair = f"its inertia was set to that of {body} at the same mass, {inertial.mass:g} kg"
+            why = f"{fault}; MuJoCo refuses it, PyBullet takes zero"
+            where = f"link {link.name}"
+            yield Finding("inertia-not-physical", "error", where, why, fix, repair)
         if solid is not None:
             if fault is None:
                 yield from _gyration_findings(link, inertial, solid)
@@ -90,6 +77,13 @@ def is_mass_valid(inertial: Inertial) -> bool:
         and inertial.mass >= 0
         and all(map(math.isfinite, inertial.com))
     )
+
+
+def _solid_repair(link: Link) -> str:
+    """Return the repair of a link that gets the mass of its shapes; none without a volume."""
+    of_solid = f"those of its solid geometry at {DEFAULT_DENSITY:g} kg/m^3"
+    is_possible = unit_density_inertial(link) is not None
+    return f"its mass and inertia were set to {of_solid}" if is_possible else ""
 
 
 def is_inertia_without_mass(link: Link) -> bool:
@@ -132,15 +126,11 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
                 "it moves, has geometry and no mass: MuJoCo refuses that, PyBullet takes 1 kg "
                 "where <inertial> is missing and cannot move it where the mass is zero"
             )
-        yield Finding(
-            "inertia-missing",
-            "info" if group.mass > 0 else "error",
-            f"link {link.name}",
-            why,
-            f"give it mass and inertia; the repair takes those of its solid geometry at "
-            f"{DEFAULT_DENSITY:g} kg/m^3",
-            repair=_FROM_SOLID if unit_density_inertial(link) is not None else "",
-        )
+        severity: Severity = "info" if group.mass > 0 else "error"
+        of_solid = f"those of its solid geometry at {DEFAULT_DENSITY:g} kg/m^3"
+        fix = f"give it mass and inertia; the repair takes {of_solid}"
+        where = f"link {link.name}"
+        yield Finding("inertia-missing", severity, where, why, fix, _solid_repair(link))
     if group.mass > 0 or any(not link.is_empty for link in group.links):
         return
     where = f"link {group.links[0].name}"

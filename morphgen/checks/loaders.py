@@ -158,26 +158,21 @@ def check_names(robot: Robot) -> Iterator[Finding]:
             if name == safe_robot_name(name) if element == "robot" else is_name_safe(name):
                 continue
             characters = " ".join(repr(c) for c in dict.fromkeys(_UNSAFE.findall(name)))
-            yield Finding(
-                "name-characters",
-                "warning",
-                f"{element} {name}",
-                f"its name contains {characters or 'nothing'}, invalid in paths, scopes and USD"
-                if characters or not name
-                else "a bundle's folder cannot have its name",
+            why = "a bundle's folder cannot have its name"
+            if characters or not name:
+                contents = characters or "nothing"
+                why = f"its name contains {contents}, invalid in paths, scopes and USD"
+            fix = (
                 "use letters, digits, '_', '-' and '.', in a robot's name not first and at most "
-                f"{MAX_ROBOT_NAME}; the repair writes '_'",
-                repair="its name was rewritten with '_' for what loaders dislike",
+                f"{MAX_ROBOT_NAME}; the repair writes '_'"
             )
+            repair = "its name was rewritten with '_' for what loaders dislike"
+            yield Finding("name-characters", "warning", f"{element} {name}", why, fix, repair)
     if robot.link_index.get(_WORLD, 0) > 0:
-        yield Finding(
-            "name-reserved",
-            "error",
-            f"link {_WORLD}",
-            "MuJoCo reserves the name 'world' for the world body, and this link is not the root",
-            "rename the link, as the repair does",
-            repair="it was renamed: MuJoCo keeps that name for the world",
-        )
+        why = "MuJoCo reserves the name 'world' for the world body, and this link is not the root"
+        fix = "rename the link, as the repair does"
+        repair = "it was renamed: MuJoCo keeps that name for the world"
+        yield Finding("name-reserved", "error", f"link {_WORLD}", why, fix, repair)
     for frame in robot.frames:
         for element, name, taken in (
             ("link", frame.name, robot.link_index),

@@ -27,18 +27,15 @@ Change = Callable[[etree._Element, Path], None]
 class Quirk:
     """How a loader reads a URDF otherwise than morphgen."""
 
-    words: str
-    """Description of the deviation."""
-    change: Change
-    """Changes a URDF so that morphgen reads it as the loader does."""
+    words: str  # description of the deviation
+    change: Change  # changes a URDF so that morphgen reads it as the loader does
 
 
 @dataclass(frozen=True)
 class Refusal(Quirk):
     """A reason why a loader refuses a URDF; ``change`` takes it out of the file."""
 
-    pattern: str
-    """Regular expression of the loader's message."""
+    pattern: str  # regular expression of the loader's message
 
 
 def _add_inertia(root: etree._Element, urdf: Path) -> None:

@@ -120,12 +120,19 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def writing(what: object) -> Iterator[None]:
+    """Turn an ``OSError`` into the error that something cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise FormatError(f"cannot write {what}: {error.strerror}") from error
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file that the user named; several processes may write the same one."""
-    try:
+    with writing(path):
         _replace(path, content)
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
 
 def partial_path(path: Path) -> Path:
@@ -162,13 +169,11 @@ def locked_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other runs; the lock ends with its process."""
     lock = FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=0)
+        with writing(f"to {folder}"):
+            lock.acquire(timeout=0)
     except Timeout as error:
-        raise FormatError(
-            f"{folder} is being written by another run; wait until it ends"
-        ) from error
-    except OSError as error:
-        raise FormatError(f"cannot write to {folder}: {error.strerror}") from error
+        why = "is being written by another run; wait until it ends"
+        raise FormatError(f"{folder} {why}") from error
     try:
         yield
     finally:
@@ -180,11 +185,9 @@ def locked_folder(folder: Path) -> Iterator[None]:
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that replaces ``folder`` if the block succeeds."""
-    try:
+    with writing(f"to {folder.parent}"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise FormatError(f"cannot write to {folder.parent}: {error.strerror}") from error
     try:
         partial.chmod(0o755)
         yield partial

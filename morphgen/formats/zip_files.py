@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import FormatError, shortened
-from morphgen.formats.files import replacing_file
+from morphgen.formats.files import replacing_file, writing
 
 _ENTRY_SIGNATURE = b"PK\x01\x02"  # first bytes of every entry in a zip's table of contents
 _COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -47,24 +47,19 @@ UNREADABLE = (
 class ZipLimits:
     """Bounds on an archive that is read."""
 
-    max_bytes: int
-    """Largest total size of the unpacked files [bytes]."""
+    max_bytes: int  # largest total size of the unpacked files [bytes]
     max_files: int
-    max_name: int = 250
-    """Longest name of a file or folder [bytes]."""
-    max_depth: int = 20
-    """Longest path [names]."""
+    max_name: int = 250  # longest name of a file or folder [bytes]
+    max_depth: int = 20  # longest path [names]
 
 
 def write_zip(path: Path, files: Mapping[str, bytes | Path]) -> None:
     """Write an archive in place of an earlier one; nothing half-written stays."""
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing_file(path) as partial, partial.open("wb") as target:
             write_entries(target, files)
             target.close()
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
 
 def write_entries(target: IO[bytes], files: Mapping[str, bytes | Path]) -> None:

@@ -44,18 +44,12 @@ comes off by radians. Rods and gears of real linkages carry that reaction to the
 class Actuation:
     """Position control of one independent joint."""
 
-    joint: str
-    """Name of the joint."""
-    stiffness: float
-    """Proportional gain [N m/rad or N/m]."""
-    damping: float
-    """Derivative gain [N m s/rad or N s/m]."""
-    armature: float
-    """Inertia that the motor adds to the joint [kg m^2 or kg]."""
-    effort: float | None
-    """Effort limit [N m or N]; None if the source names none."""
-    velocity: float | None
-    """Velocity limit [rad/s or m/s]; None if the source names none."""
+    joint: str  # name of the joint
+    stiffness: float  # proportional gain [N m/rad or N/m]
+    damping: float  # derivative gain [N m s/rad or N s/m]
+    armature: float  # inertia that the motor adds to the joint [kg m^2 or kg]
+    effort: float | None  # effort limit [N m or N]; None if the source names none
+    velocity: float | None  # velocity limit [rad/s or m/s]; None if the source names none
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:

@@ -40,8 +40,7 @@ class MeshPart:
 
     rgba: Rgba | None
     """Colour, each channel in [0, 1], the mean of a texture; None if the file names none."""
-    faces: int
-    """Number of triangles."""
+    faces: int  # number of triangles
 
 
 @dataclass(frozen=True)

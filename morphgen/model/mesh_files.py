@@ -45,13 +45,14 @@ _ROW_SIZES = (12, 12, 8, 12)
 """Size of a vertex, a normal, a texture coordinate and a triangle [bytes]."""
 
 
-def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
-    """Return the vertices (n, 3) [m] and faces (m, 3) of a ``.msh`` file.
+def _read_msh(data: bytes, files: FolderResolver) -> list[Piece]:
+    """Read a ``.msh`` file, MuJoCo's legacy binary format.
 
     Nothing is allocated before the counts agree with the file's size. Normals and texture
     coordinates are left out. Without triangles, the faces are those of the convex hull, as in
     MuJoCo.
     """
+    del files
     if len(data) < _HEADER:
         raise ValueError(f"{len(data)} bytes; expected a header of {_HEADER}")
     counts = [int(count) for count in np.frombuffer(data, "<i4", 4)]
@@ -78,15 +79,19 @@ def read_msh(data: bytes) -> tuple[Array, NDArray[np.int64]]:
             )
         if np.linalg.matrix_rank(points - points.mean(axis=0), rtol=_FLAT) < 3:
             raise ValueError("has no triangles, and its vertices are flat")
-        hull = trimesh.convex.convex_hull(points)
-        return np.asarray(hull.vertices, np.float64), np.asarray(hull.faces, np.int64)
+        return _pieces(trimesh.convex.convex_hull(points))
     faces = np.frombuffer(data, "<i4", 3 * triangles, len(data) - sizes[-1]).reshape(-1, 3)
     if faces.min() < 0 or faces.max() >= vertices:
         raise ValueError(
             f"a triangle has the vertex {faces.min() if faces.min() < 0 else faces.max()}; "
             f"expected 0 to {vertices - 1}"
         )
-    return points, faces.astype(np.int64)
+    return _pieces(trimesh.Trimesh(points, faces.astype(np.int64), process=False))
+
+
+def _pieces(mesh: trimesh.Trimesh) -> list[Piece]:
+    require_faces(len(mesh.faces))
+    return scene_pieces(trimesh.Scene(mesh))
 
 
 _MAX_TOKENS = 20_000_000  # number of words in the largest OBJ file that is read
@@ -98,12 +103,10 @@ _MAX_HEADER = 2**16
 class MeshContent:
     """The content of a mesh file."""
 
-    pieces: tuple[Piece, ...]
-    """Colour and triangles of every geometry."""
+    pieces: tuple[Piece, ...]  # colour and triangles of every geometry
     left_out: tuple[str, ...]
     """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
-    pixels: int
-    """Number of pixels of the textures that were read, each use counted."""
+    pixels: int  # number of pixels of the textures that were read, each use counted
 
 
 def read_mesh_file(path: Path) -> MeshContent:
@@ -147,13 +150,6 @@ def _require_mesh(data: bytes, suffix: str) -> None:
         raise ValueError(f"the file has the content of a {actual} file; rename it")
 
 
-def _read_msh(data: bytes, files: FolderResolver) -> list[Piece]:
-    del files
-    vertices, faces = read_msh(data)
-    require_faces(len(faces))
-    return scene_pieces(trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False)))
-
-
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -167,7 +163,7 @@ def _read_stl(data: bytes, files: FolderResolver) -> list[Piece]:
         raise ValueError("holds no triangle")
     vertices = corners.reshape(-1, 3)
     faces = np.arange(len(vertices)).reshape(-1, 3)
-    return scene_pieces(trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False)))
+    return _pieces(trimesh.Trimesh(vertices, faces, process=False))
 
 
 def _ascii_stl(data: bytes) -> Array:
@@ -328,14 +324,11 @@ def _ply_pieces(
     require_faces(len(triangles))
     if not len(triangles):
         raise ValueError(f"holds {len(vertices)} vertices and no triangle")
-    mesh = trimesh.Trimesh(
-        vertices,
-        triangles,
-        vertex_colors=_ply_colours(vertex, len(vertices)),
-        face_colors=_ply_colours(face, len(triangles)),
-        process=False,
-    )
-    return scene_pieces(trimesh.Scene(mesh))
+    colours = {
+        "vertex_colors": _ply_colours(vertex, len(vertices)),
+        "face_colors": _ply_colours(face, len(triangles)),
+    }
+    return _pieces(trimesh.Trimesh(vertices, triangles, process=False, **colours))
 
 
 def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:

@@ -468,16 +468,13 @@ def _gltf_textures(
 def _gltf_nodes(document: dict[str, Any], files: FolderResolver) -> tuple[int, int]:
     """Return the numbers of triangles and of their sets in the scene, every instance counted."""
     nodes, meshes, accessors = (document[name] for name in ("nodes", "meshes", "accessors"))
-    sizes = []
-    for mesh in meshes:
-        counts = [
-            accessors[p.get("indices", p["attributes"]["POSITION"])]["count"] - 2 * (mode == 5)
-            for p in mesh["primitives"]
-            for mode in [p.get("mode", 4)]
-        ]
-        modes = [p.get("mode", 4) for p in mesh["primitives"]]
-        triangles = sum(max(n, 0) if m == 5 else n // 3 for n, m in zip(counts, modes, strict=True))
-        sizes.append((triangles, len(counts)))
+
+    def triangles_of(primitive: dict[str, Any]) -> int:
+        corners = primitive.get("indices", primitive["attributes"]["POSITION"])
+        count: int = accessors[corners]["count"]
+        return max(count - 2, 0) if primitive.get("mode", 4) == 5 else count // 3  # 5: a strip
+
+    sizes = [(sum(map(triangles_of, m["primitives"])), len(m["primitives"])) for m in meshes]
     scenes = document.get("scenes", [])
     stack = []
     if scenes:

@@ -154,12 +154,9 @@ class RigidGroup:
 
     links: tuple[Link, ...]
     """The links in topological order; a movable joint attaches the first, except for the root."""
-    is_root: bool
-    """Whether the group contains the robot's root."""
-    mass: float
-    """Mass of the group [kg]; negative masses count as zero."""
-    mass_beyond: float
-    """Mass of all groups below this one in the tree [kg]."""
+    is_root: bool  # whether the group contains the robot's root
+    mass: float  # mass of the group [kg]; negative masses count as zero
+    mass_beyond: float  # mass of all groups below this one in the tree [kg]
 
 
 def rigid_groups(robot: Robot) -> tuple[RigidGroup, ...]:

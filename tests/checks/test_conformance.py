@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from importlib.util import find_spec
 
-import numpy as np
 import pytest
 import trimesh
 
@@ -12,7 +11,6 @@ from helpers.faulty_robots import hinge, with_end, with_joint
 from helpers.robots import arm, rod
 from morphgen.checks import conformance as module
 from morphgen.checks.conformance import compare, compare_file, conformance
-from morphgen.checks.readers import LOADERS as LOADER_TABLE
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import write_bundle
 from morphgen.formats.resolve import default_finder
@@ -279,16 +277,12 @@ def wheel(kind, axis):
     "robot",
     [
         turned(2.1e-5, 0, 0),
-        turned(-1e-4, 3e-4, 0),
         turned(0, 0, 5e-4),
-        heavy(2e5, (0.3, 0.2, 0.1)),
         heavy(5e5, (1.0, -0.5, 2.0)),
         heavy(1e6, (0.1, 0.0, 0.7)),
-        carrying_nothing("prismatic"),
         carrying_nothing("revolute"),
         carrying_nothing("prismatic", axis=(0.6, 0.0, 0.8)),
         wheel("continuous", (0.0, 0.0, 1.0)),
-        wheel("prismatic", (1.0, 0.0, 0.0)),
         wheel("revolute", (0.0, 1.0, 0.0)),
     ],
 )
@@ -426,7 +420,6 @@ def many_links(count):
 @pytest.mark.parametrize(
     ("changes", "edit", "words", "loaders"),
     [
-        ({"base": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         ({"bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         ({"base": " ", "bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         (
@@ -435,37 +428,21 @@ def many_links(count):
             "refuses moving links without mass or inertia",
             {"mujoco (urdf)"},
         ),
-        *(
-            (
-                {},
-                (AXIS, f"{AXIS}<mimic {gone}/>"),
-                "refuses a joint that mimics a missing one",
-                {"usd"},
-            )
-            for gone in ('joint="gone"', 'joint="x" multiplier="2"', 'joint="y" offset="0.1"')
+        (
+            {},
+            (AXIS, f'{AXIS}<mimic joint="gone" multiplier="2"/>'),
+            "refuses a joint that mimics a missing one",
+            {"usd"},
         ),
-        ({}, (AXIS, 2 * AXIS), REPEATED, {"mujoco (urdf)"}),
         ({}, (AXIS, AXIS + '<axis xyz="1 0 0"/>' + AXIS), REPEATED, {"mujoco (urdf)"}),
         ({}, (LIMIT, 2 * LIMIT), REPEATED, {"mujoco (urdf)"}),
         ({}, (BOX, f"<geometry>{FOUR}</geometry>"), SCALE, {"mujoco (urdf)", "usd"}),
         ({"tip": f"{TIP}<visual><geometry>{FOUR}</geometry></visual>"}, None, SCALE, {"usd"}),
-        (
-            {"tip": f"{TIP}<collision><geometry>{FOUR}</geometry></collision>"},
-            ("1 1 1 1", "2 2 2 2 2"),
-            SCALE,
-            {"mujoco (urdf)", "usd"},
-        ),
         ({}, ("0.1 0.1 0.1", "0 0.1 0.1"), NO_SIZE, {"mujoco (urdf)"}),
         ({}, ('box size="0.1 0.1 0.1"', 'sphere radius="0"'), NO_SIZE, {"mujoco (urdf)"}),
-        (
-            {},
-            ('box size="0.1 0.1 0.1"', 'cylinder radius="0" length="1"'),
-            NO_SIZE,
-            {"mujoco (urdf)"},
-        ),
         *(
             ({}, many_links(n), "fails on robots with more than 127 links", {"pybullet"})
-            for n in (126, 127, 150)
+            for n in (126, 150)
         ),
     ],
 )
@@ -489,7 +466,6 @@ def test_a_refusal_without_its_cause_is_unexplained(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"com": (0.1, 0.0, 0.201)},
         {"com": (0.101, 0.0, 0.2)},
         {"mass": 2.001},
         {"inertia": (0.01, 0.0, 0.0, 0.025, 0.0, 0.02)},
@@ -507,27 +483,6 @@ def test_a_fault_of_our_reader_is_unexplained(wrong, tmp_path, monkeypatch):
     rows = file_rows(pendulum(tmp_path, tip=TIP))
     for name in {"pybullet", "mujoco (urdf)", "pinocchio"} & rows.keys():
         assert rows[name].is_unexplained, rows[name]
-
-
-@pytest.mark.parametrize(("loader", "torque"), [("pybullet", -6.170), ("pinocchio", -4.274)])
-def test_gravity_torque_of_a_link_without_inertia(loader, torque, tmp_path):
-    inertial = '<inertial><origin xyz="{}" rpy="0.5 0.3 1.0"/><mass value="{}"/>{}</inertial>'
-    path = tmp_path / "robot.urdf"
-    path.write_text(
-        f"""<robot name="rot"><link name="base">{inertial.format("0 0 0", 1, INERTIA)}</link>
-        <link name="l1">{inertial.format("0.02 0.01 0.15", 2, INERTIA)}</link><link name="tool"/>
-        <link name="w">{inertial.format("0.1 0 0.05", 1, INERTIA)}</link>
-        <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/>
-          <origin xyz="0 0 0.1"/><axis xyz="1 0 0"/>{LIMIT}</joint>
-        <joint name="f0" type="fixed"><parent link="l1"/><child link="w"/>
-          <origin xyz="0 0 0.3" rpy="3.1416 -1.5708 0"/></joint>
-        <joint name="f1" type="fixed"><parent link="l1"/><child link="tool"/>
-          <origin xyz="0 0 0.3"/></joint></robot>"""
-    )
-    found = next(each for each in LOADER_TABLE if each.name == loader)
-    pytest.importorskip(found.module)
-    reading = found.read(tmp_path, "", {"j1": np.array([0.7])}, 1)
-    assert reading.forces == pytest.approx(np.array([[torque]]), abs=1e-3)
 
 
 def test_a_mjcf_of_others_is_compared_as_it_is(tmp_path):

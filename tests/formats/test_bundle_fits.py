@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 import morphgen
-from morphgen.cli import main
 from morphgen.errors import FormatError
 from morphgen.fitting import token_shapes as module
 from morphgen.fitting.replace_collision import as_primitives
@@ -81,40 +80,6 @@ def test_fits_of_another_fitter_version_are_ignored(folder):
     data = json.loads((folder / FITS).read_text())
     (folder / FITS).write_text(json.dumps(data | {"fitter": 1}))
     assert read_bundle(folder).fits == {}
-
-
-def foreign(folder, change):
-    data = json.loads((folder / FITS).read_text())
-    change(data["links"][0])
-    (folder / FITS).write_text(json.dumps(data))
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (
-            lambda link: link["token"].update(cylinder=[0.1, -0.2]),
-            "cylinder[1]: invalid value -0.2; expected",
-        ),
-        (lambda link: link["token"].update(xyz=[float("nan"), 0, 0]), "xyz[0]: invalid value nan"),
-        (
-            lambda link: link.update(collision=[]),
-            "[]; expected a list of length >= 1",
-        ),
-        (lambda link: link.pop("shapes"), "links[0]: missing key 'shapes'"),
-        (
-            lambda link: link.update(token_iou=7),
-            "invalid value 7; expected a number <= 1",
-        ),
-    ],
-)
-def test_invalid_fits_are_a_one_line_error(folder, capsys, change, why):
-    foreign(folder, change)
-    assert main(["tokens", str(folder)]) == 2
-    error = capsys.readouterr().err.strip()
-    assert str(folder / FITS) in error
-    assert why in error
-    assert "\n" not in error
 
 
 def test_links_to_fits_outside_the_bundle_are_not_followed(folder, tmp_path):

@@ -63,12 +63,6 @@ def test_stored_fits_round_trip(tmp_path):
     assert read_stored_fits([tmp_path]) == fits
 
 
-def test_overlaps_are_stored_with_four_decimals(tmp_path):
-    write(tmp_path, fits_text({"key": replace(ARM, token_iou=2 / 3, collision_iou=1 / 3)}))
-    fit = read_stored_fits([tmp_path])["key"]
-    assert (fit.token_iou, fit.collision_iou) == (0.6667, 0.3333)
-
-
 def test_a_mesh_is_not_stored():
     with pytest.raises(ValueError, match=r"mesh m\.stl is not a primitive"):
         shape_to_data(Shape(Mesh(Path("m.stl"))))
@@ -87,44 +81,22 @@ def test_all_fit_files_of_all_folders_are_read_and_other_files_ignored(tmp_path)
 
 MALFORMED = {
     "empty": "",
-    "broken": "{",
     "list": "[]",
-    "number": "5",
-    "null": "null",
-    "nothing": "{}",
     "deep": "[" * 100_000,
     "no links": json.dumps({"fitter": FITTER_VERSION}),
-    "links a number": json.dumps({"fitter": FITTER_VERSION, "links": 5}),
-    "link a number": json.dumps({"fitter": FITTER_VERSION, "links": [5]}),
     "link empty": json.dumps({"fitter": FITTER_VERSION, "links": [{}]}),
-    "no name": changed(link=None),
-    "no key": changed(shapes=None),
-    "no token": changed(token=None),
-    "no collision": changed(collision=None),
-    "no overlap": changed(token_iou=None),
-    "collision a number": changed(collision=5),
-    "token a list": changed(token=[]),
     "no kind": changed(token=shape(cylinder=None)),
-    "cylinder of one": changed(token=shape(cylinder=[1])),
-    "cylinder of three": changed(token=shape(cylinder=[1, 2, 3])),
-    "box of two": changed(token=shape(cylinder=None, box=[1, 2])),
+    "two kinds": changed(token=shape(sphere=[0.1])),
     "cone": changed(token=shape(cylinder=None, cone=[1, 2])),
-    "cylinder a number": changed(token=shape(cylinder=5)),
-    "xyz of two": changed(token=shape(xyz=[1, 2])),
-    "no xyz": changed(token=shape(xyz=None)),
-    "quaternion of three": changed(token=shape(quaternion=[1, 0, 0])),
-    "words": changed(token=shape(cylinder=["a", "b"])),
+    "cylinder of three": changed(token=shape(cylinder=[1, 2, 3])),
     "nan": changed(token=shape(cylinder=[0.1, math.nan])),
     "negative": changed(token=shape(cylinder=[0.1, -1.0])),
-    "quaternion zero": changed(token=shape(quaternion=[0, 0, 0, 0])),
-    "endless": changed(token=shape(cylinder=[0.1, math.inf])),
     "too large": changed(token=shape(cylinder=[0.1, 10**400])),
-    "two kinds": changed(token=shape(sphere=[0.1])),
+    "quaternion zero": changed(token=shape(quaternion=[0, 0, 0, 0])),
     "long": changed(token=dict.fromkeys(map(str, range(10_000)), 0)),
     "no primitives": changed(collision=[]),
     "many primitives": changed(collision=[shape()] * 33),
     "overlap above one": changed(token_iou=1.5),
-    "overlap a word": changed(collision_iou="much"),
     "overlap nan": changed(collision_iou=math.nan),
 }
 
@@ -184,14 +156,6 @@ def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path / name)
         keys.add(shapes_key([Shape(Mesh(Path("m.stl")))]))
     assert len(keys) == 2
-
-
-def test_fits_follow_the_working_directory(tmp_path, monkeypatch):
-    for name, fit in (("a", ARM), ("b", replace(ARM, link="leg"))):
-        path = write(tmp_path / name / "parts", fits_text({"one": fit}))
-        os.utime(path, ns=(1, 1))
-        monkeypatch.chdir(tmp_path / name)
-        assert read_stored_fits([Path("parts")]) == {"one": fit}
 
 
 def test_changes_of_the_solid_change_the_key(mesh):

@@ -15,12 +15,8 @@ from morphgen.errors import FormatError
 from morphgen.formats.mjcf.write import FLAT_THICKNESS, mjcf_text, to_spec
 from morphgen.model.dynamics import MIN_ROTATIONAL_INERTIA, actuation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import (
-    frame_pose,
-    movable_positions,
-    random_configurations,
-)
-from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
+from morphgen.model.kinematics import movable_positions
+from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 
 
 def no_file(mesh):
@@ -35,14 +31,6 @@ def compiled(robot):
     return mujoco.MjModel.from_xml_string(text(robot))
 
 
-def place(model, robot, q):
-    data = mujoco.MjData(model)
-    for k, value in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
-        data.joint(robot.joints[k].name).qpos[0] = value
-    mujoco.mj_forward(model, data)
-    return data
-
-
 def single(shape, **kwargs):
     return Robot("one", (Link("body", Inertial(1.0, inertia=(1, 0, 0, 1, 0, 1)), **kwargs),))
 
@@ -51,16 +39,6 @@ def hinged(link, joint=None):
     """Return a link with a revolute joint on a massless root."""
     joint = joint or Joint("hinge", "revolute", "root", link.name, limits=(-1.0, 1.0))
     return Robot("hinged", (Link("root"), link), (joint,), home=(0.0,))
-
-
-def test_tool_pose_agrees_to_a_micrometre():
-    robot = arm()
-    model = compiled(robot)
-    for q in random_configurations(robot, 20, np.random.default_rng(0)):
-        site = place(model, robot, q).site("tool")
-        T = frame_pose(robot, q)
-        assert site.xpos == pytest.approx(T[:3, 3], abs=1e-9)
-        assert site.xmat.reshape(3, 3) == pytest.approx(T[:3, :3], abs=1e-9)
 
 
 def test_inertias_keep_their_digits():
@@ -74,13 +52,6 @@ def test_inertias_keep_their_digits():
     assert body.mass[0] == pytest.approx(0.0123456789, rel=1e-9)
     assert body.ipos == pytest.approx((0.1, 0.2, 1 / 3), abs=1e-9)
     assert R @ np.diag(body.inertia) @ R.T == pytest.approx(matrix, abs=1e-6 * 3e-8)
-
-
-def test_every_link_is_a_body_and_the_mass_is_unchanged():
-    robot = arm()
-    model = compiled(robot)
-    assert [model.body(i).name for i in range(1, model.nbody)] == [x.name for x in robot.links]
-    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
 
 
 def test_the_spec_equals_the_text():
@@ -111,21 +82,6 @@ def test_primitives_have_their_sizes_and_groups():
     assert model.geom_conaffinity.tolist() == [0] * 4 + [1] * 4
 
 
-def test_joints_keep_their_properties():
-    joint = Joint(
-        "slide", "prismatic", "root", "rod", axis=(0, 3, 4), limits=(-0.1, 0.3), damping=2.0,
-        friction=0.5, effort=7.0,
-    )  # fmt: skip
-    model = compiled(hinged(rod("rod"), joint))
-    slide = model.joint("slide")
-    assert slide.type[0] == mujoco.mjtJoint.mjJNT_SLIDE
-    assert slide.axis == pytest.approx((0, 0.6, 0.8))
-    assert slide.range.tolist() == [-0.1, 0.3]
-    assert model.jnt_limited.tolist() == [1]
-    assert model.dof_damping.ravel()[0] == 2.0
-    assert model.dof_frictionloss[0] == 0.5
-
-
 def test_continuous_and_unlimited_joints_have_no_range():
     for kind, limits in (("continuous", (-1.0, 1.0)), ("revolute", None)):
         joint = Joint("free", kind, "root", "rod", limits=limits)
@@ -133,21 +89,6 @@ def test_continuous_and_unlimited_joints_have_no_range():
         assert model.jnt_limited.tolist() == [0]
         assert model.actuator_ctrllimited.tolist() == [0]
         assert model.actuator_forcelimited.tolist() == [0]
-
-
-def test_actuators_have_the_gains_of_the_robot():
-    robot = arm()
-    model = compiled(robot)
-    assert model.nu == robot.dof
-    for i, gain in enumerate(actuation(robot)):
-        actuator = model.actuator(i)
-        joint = robot.joints[robot.joint_index[gain.joint]]
-        assert actuator.name == gain.joint
-        assert model.joint(actuator.trnid[0]).name == gain.joint
-        assert actuator.gainprm[0] == pytest.approx(gain.stiffness, rel=1e-5)
-        assert actuator.biasprm[1:3] == pytest.approx((-gain.stiffness, -gain.damping), rel=1e-5)
-        assert actuator.forcerange == pytest.approx((-joint.effort, joint.effort))
-        assert actuator.ctrlrange == pytest.approx(joint.limits)
 
 
 def test_home_is_a_keyframe_with_mimic_joints_that_the_actuators_hold():
@@ -199,11 +140,6 @@ def test_mimic_joints_follow_through_chains():
     assert model.eq_data[:, :3] == pytest.approx(np.array([[0.2, -0.5, 0], [0.5, -1.0, 0]]))
 
 
-def test_ignored_pairs_are_excluded():
-    robot = replace(arm(), ignore_pairs=(("base", "upper"), ("left", "right")))
-    assert compiled(robot).nexclude == 2
-
-
 def test_massless_moving_links_compile_and_add_no_mass():
     links = (Link("root"), Link("x"), Link("y"), rod("tip"), Link("leaf"))
     joints = (
@@ -223,15 +159,6 @@ def test_massless_moving_links_compile_and_add_no_mass():
         mujoco.mj_step(model, data)
     assert np.isfinite(data.qpos).all()
     assert data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
-
-
-def test_a_robot_of_one_link_compiles():
-    assert compiled(single("body", collisions=(Shape(Sphere(0.1)),))).nkey == 1
-
-
-def test_frames_are_sites_even_on_the_root():
-    robot = Robot("r", (Link("root"),), frames=(Frame("tool", "root", Pose((1, 2, 3))),))
-    assert compiled(robot).site("tool").pos.tolist() == [1, 2, 3]
 
 
 def test_a_root_named_world_is_the_world_body():

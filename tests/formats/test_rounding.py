@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import morphgen
 from helpers.robots import arm
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.rounding import as_written, format_number, rounded_pose
@@ -83,10 +82,3 @@ def test_rounded_robots_round_trip_through_a_file(tmp_path, robot):
         assert bare == replace(link, collisions=bare.collisions)
         shapes = [[replace(s, rgba=None) for s in each.collisions] for each in (link, other)]
         assert shapes[0] == shapes[1]
-
-
-@pytest.mark.slow
-def test_the_order_of_links_is_preserved(tmp_path):
-    robot = morphgen.compose("arm=yumi left.ee=plane right.ee=yumi_gripper")
-    back = read_bundle(write_bundle(robot, tmp_path / "r", picture=False))
-    assert [link.name for link in back.links] == [link.name for link in robot.links]

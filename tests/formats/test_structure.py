@@ -185,41 +185,6 @@ def test_every_cycle_is_reported_once():
     assert [why.partition(": ")[2] for why in cycles] == ["b -> c -> b", "f -> d -> e -> f"]
 
 
-def mutations() -> list[str]:
-    """Return copies of the valid document with one attribute or element changed or removed."""
-    texts = []
-    total = len(list(etree.fromstring(SOUND).iter()))
-    for i in range(total):
-        names = list(list(etree.fromstring(SOUND).iter())[i].attrib)
-        for name in names:
-            for value in (None, "", "x", "nan", "1,2,3", "1 2", "-1", "0"):
-                root = etree.fromstring(SOUND)
-                element = list(root.iter())[i]
-                if value is None:
-                    del element.attrib[name]
-                else:
-                    element.set(name, value)
-                texts.append(etree.tostring(root).decode())
-        if i:
-            root = etree.fromstring(SOUND)
-            element = list(root.iter())[i]
-            element.getparent().remove(element)
-            texts.append(etree.tostring(root).decode())
-    return texts
-
-
-@pytest.mark.slow
-def test_documents_without_errors_are_parsed_without_a_crash(read):
-    texts = mutations()
-    passed = [t for t in texts if not any(f.severity == "error" for f in findings(t))]
-    assert 0 < len(passed) < len(texts)
-    for text in passed:
-        if '<mesh filename="m.stl"' in text or "<mesh" not in text:
-            assert len(read(text).links) == 3
-        if not findings(text):
-            load(text)
-
-
 # code, what of SOUND is replaced, by what, what is left on link b: visuals, collisions, mass
 REPAIRED = [
     ("element-missing", ('<mass value="1"/>', ""), (2, 2, None)),
@@ -246,15 +211,11 @@ def test_faults_that_ros_tolerates_are_read_with_a_warning(read, code, change, l
     body = robot.link("b")
     mass = None if body.inertial is None else body.inertial.mass
     assert (len(body.visuals), len(body.collisions), mass) == left
+    assert robot.dof == (2 if code == "mimic-unknown" else 1)
     repaired, gone = fix(robot)
     assert finding in gone
     assert repaired.source_findings == ()
     assert f"{finding.where}: {finding.repair}" in repaired.provenance["repairs"]
-
-
-def test_an_invalid_mimic_joint_becomes_independent(read):
-    robot = read(changed(('mimic joint="j"', 'mimic joint="z"')))
-    assert robot.dof == 2
 
 
 @pytest.mark.parametrize("tag", ["link", "joint"])

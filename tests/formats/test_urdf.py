@@ -40,21 +40,27 @@ def test_a_robot_round_trips_through_urdf(tmp_path):
     np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
 
 
+def text_file(folder: Path, text: str) -> Path:
+    path = folder / "robot.urdf"
+    path.write_text(text)
+    return path
+
+
 def test_links_are_sorted_from_the_root(tmp_path):
-    path = tmp_path / "shuffled.urdf"
-    path.write_text(
+    path = text_file(
+        tmp_path,
         '<robot name="r"><link name="c"/><link name="a"/><link name="b"/>'
         '<joint name="j2" type="fixed"><parent link="b"/><child link="c"/></joint>'
-        '<joint name="j1" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+        '<joint name="j1" type="fixed"><parent link="a"/><child link="b"/></joint></robot>',
     )
     assert [link.name for link in read_urdf(path).links] == ["a", "b", "c"]
 
 
 def test_missing_limits_are_not_read_as_zero(tmp_path):
-    path = tmp_path / "free.urdf"
-    path.write_text(
+    path = text_file(
+        tmp_path,
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
-        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>',
     )
     joint = read_urdf(path).joints[0]
     assert joint.limits is None
@@ -91,11 +97,11 @@ def test_a_home_that_is_not_a_number_is_an_error(tmp_path, position):
 
 
 def test_a_rotated_inertial_frame_is_expressed_in_link_axes(tmp_path):
-    path = tmp_path / "turned.urdf"
-    path.write_text(
+    path = text_file(
+        tmp_path,
         '<robot name="r"><link name="a"><inertial><origin rpy="0 0 1.5707963267948966"/>'
         '<mass value="1"/><inertia ixx="1" iyy="2" izz="3" ixy="0" ixz="0" iyz="0"/></inertial>'
-        "</link></robot>"
+        "</link></robot>",
     )
     inertial = read_urdf(path).root.inertial
     assert inertial is not None
@@ -118,36 +124,17 @@ def test_a_capsule_is_written_as_cylinder_and_spheres_and_read_back(tmp_path):
     np.testing.assert_allclose((ends[0] + ends[1]) / 2, T.position, atol=1e-12)
 
 
-def test_links_without_mass_are_written_explicitly_for_pybullet(tmp_path):
-    text = urdf_text(Robot("r", (Link("a"),)), no_mesh)
-    assert '<mass value="0"/>' in text
-
-
-def test_structural_errors_have_a_line_number(tmp_path):
-    path = tmp_path / "two.urdf"
-    path.write_text('<robot name="r">\n<link name="a"/>\n<link name="a"/>\n</robot>')
-    with pytest.raises(UnsoundError, match=r"two\.urdf:3"):
-        read_urdf(path)
-
-
 def test_a_missing_mesh_is_an_error(tmp_path):
-    path = tmp_path / "bare.urdf"
-    path.write_text(
+    path = text_file(
+        tmp_path,
         '<robot name="r"><link name="a"><visual><geometry><mesh filename="gone.stl"/></geometry>'
-        "</visual></link></robot>"
+        "</visual></link></robot>",
     )
     with pytest.raises(UnsoundError, match=r"gone\.stl") as caught:
         read_urdf(path)
     assert caught.value.findings[0].code == "mesh-unresolved"
     sent = pickle.loads(pickle.dumps(caught.value))  # as a worker process sends it
     assert (str(sent), sent.findings) == (str(caught.value), caught.value.findings)
-
-
-def test_missing_files_and_arguments_without_a_xacro_are_errors(tmp_path):
-    with pytest.raises(FormatError, match="no such file"):
-        read_urdf(tmp_path / "none.urdf")
-    with pytest.raises(FormatError, match="not a xacro"):
-        read_urdf(written(arm(), tmp_path), {"a": "1"})
 
 
 @pytest.mark.parametrize(

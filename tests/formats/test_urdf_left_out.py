@@ -232,21 +232,6 @@ def test_missing_meshes_are_left_out_on_request(tmp_path, uri):
     assert any("3 shapes were left out" in repair for repair in repairs)
 
 
-def test_the_advice_for_a_missing_package_helps(tmp_path, capsys):
-    path = tmp_path / "mine" / "r.urdf"
-    mesh = mesh_file(tmp_path / "else" / "where" / "export" / "meshes" / "a.stl")
-    path.parent.mkdir()
-    path.write_text(urdf(base=MESH.format("package://export/meshes/a.stl")))
-    words = ["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"]
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert "give the folder that holds it as --root" in error
-    (option,) = re.findall(r"(--skip\S+)", error)
-    assert main([*words, option]) in (0, 1)
-    for folder in mesh.parents[:3]:
-        assert main([*words, "--root", str(folder)]) in (0, 1)
-
-
 @pytest.mark.parametrize(
     ("compiler", "uri", "place"),
     [

@@ -12,16 +12,13 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     arm_reach,
     forward_kinematics,
-    frame_jacobian,
-    frame_pose,
     joint_limits,
-    movable_positions,
     periodic_joints,
     random_configurations,
     reach,
     unwrap_joints,
 )
-from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Frame, Joint, Link, Robot
 
 
 def planar(lengths=(0.5, 0.3)):
@@ -48,22 +45,6 @@ def test_batch_is_the_stack_of_its_rows():
     batch = forward_kinematics(robot, q)
     assert batch.shape == (3, 4, len(robot.links), 4, 4)
     np.testing.assert_array_equal(batch[2, 1], forward_kinematics(robot, q[2, 1]))
-
-
-def test_mimic_joints_follow_through_chains():
-    hinge = {"axis": (0.0, 0.0, 1.0), "limits": (-1.0, 1.0)}
-    robot = Robot(
-        "chain",
-        tuple(Link(name) for name in "abcd"),
-        (
-            Joint("one", "revolute", "a", "b", **hinge),
-            Joint("two", "revolute", "b", "c", **hinge, mimic=Mimic("one", 2.0, 0.1)),
-            Joint("three", "revolute", "c", "d", **hinge, mimic=Mimic("two", -1.0, 0.5)),
-        ),
-        home=(0.0,),
-    )
-    assert robot.dof == 1
-    np.testing.assert_allclose(movable_positions(robot, [0.2]), [0.2, 0.5, 0.0], atol=1e-15)
 
 
 def test_q_of_wrong_length_is_refused_with_both_shapes():
@@ -98,26 +79,6 @@ def test_random_configurations_are_within_the_limits():
     limits = joint_limits(robot)
     assert (q >= limits[:, 0]).all()
     assert (q <= limits[:, 1]).all()
-
-
-@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "base=gantry ee=stick", "arm=panda", "own"])
-def test_jacobians_are_derivatives_of_poses(words):
-    robot = arm() if words == "own" else compose(words)
-    rng = np.random.default_rng(0)
-    q = random_configurations(robot, 2, rng)
-    T, jacobian = frame_jacobian(robot, q)
-    assert pytest.approx(frame_pose(robot, q)) == T
-    for k in range(robot.dof):
-        step = np.zeros(robot.dof)
-        step[k] = 1e-6
-        moved = (frame_pose(robot, q + step) - frame_pose(robot, q - step)) / 2e-6
-        spin = moved[:, :3, :3] @ T[:, :3, :3].swapaxes(1, 2)
-        turned = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
-        assert jacobian[:, :3, k] == pytest.approx(moved[:, :3, 3], abs=1e-6)
-        assert jacobian[:, 3:, k] == pytest.approx(turned, abs=1e-6)
-    one, of_one = frame_jacobian(robot, q[1])
-    assert (one == T[1]).all()
-    assert of_one == pytest.approx(jacobian[1])
 
 
 def test_unwrapped_configurations_are_nearest_to_the_reference():

@@ -1,4 +1,4 @@
-"""NumPy and torch kinematics agree with MuJoCo and Pinocchio for robots of every structure."""
+"""NumPy and torch kinematics agree with MuJoCo for robots of every structure."""
 
 from dataclasses import replace
 
@@ -11,14 +11,12 @@ import morphgen
 from helpers.kinematic_backends import BACKENDS, TorchBackend, backend
 from helpers.robots import arm
 from morphgen.formats.mjcf.write import MujocoKinematics
-from morphgen.formats.urdf.write import urdf_text
 from morphgen.model import kinematics_torch
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     FramePosition,
     frame_pose,
     frame_positions,
-    movable_positions,
     random_configurations,
 )
 from morphgen.model.kinematics_torch import (
@@ -128,37 +126,6 @@ def test_tool_jacobians_agree_with_mujoco(kinematics, index):
         np.testing.assert_allclose(J_root_tool, folded, atol=kinematics.tolerance)
 
 
-def test_tool_jacobians_agree_with_pinocchio(kinematics, index):
-    pinocchio = pytest.importorskip("pinocchio")
-    robot, q = ROBOTS[index], drawn(index)
-    bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
-    model = pinocchio.buildModelFromXML(urdf_text(robot.with_links(bare), str))
-    data, tool = model.createData(), robot.frame("tool")
-    names = [robot.joints[k].name for k in robot.movable_joints]
-    columns = [model.idx_vs[model.getJointId(name)] for name in names]
-    link = model.getFrameId(tool.link, pinocchio.FrameType.BODY)
-    frame = model.addFrame(
-        pinocchio.Frame(
-            "our tool",
-            model.frames[link].parentJoint,
-            model.frames[link].placement * pinocchio.SE3(tool.T_link_frame.matrix),
-            pinocchio.FrameType.OP_FRAME,
-        )
-    )
-    data = model.createData()
-    T, J = kinematics.frame_jacobian(index, q)
-    for i, positions in enumerate(movable_positions(robot, q)):
-        v = np.zeros(model.nv)
-        v[columns] = positions
-        configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
-        pinocchio_jacobian = pinocchio.computeFrameJacobian(
-            model, data, configuration, frame, pinocchio.LOCAL_WORLD_ALIGNED
-        )
-        folded = pinocchio_jacobian[:, columns] @ robot.mimic_map[0]
-        np.testing.assert_allclose(T[i], data.oMf[frame].homogeneous, atol=kinematics.tolerance)
-        np.testing.assert_allclose(J[i], folded, atol=kinematics.tolerance)
-
-
 def test_rows_of_different_robots_are_independent():
     kinematics = TorchBackend(ROBOTS, torch.float64)
     rows = [kinematics.rows(index, drawn(index)) for index in range(len(ROBOTS))]
@@ -176,23 +143,6 @@ def test_rows_of_different_robots_are_independent():
         np.testing.assert_allclose(T_root_tool[here].numpy(), T[own], atol=1e-14)
         dof = ROBOTS[index].dof
         np.testing.assert_allclose(J_root_tool[here][..., :dof].numpy(), J[own], atol=1e-14)
-
-
-def test_jacobians_are_the_derivatives_of_poses():
-    kinematics = TorchBackend(ROBOTS, torch.float64)
-    for index, robot in enumerate(ROBOTS):
-        robot_index, q = kinematics.rows(index, drawn(index, 2))
-        _, J = frame_jacobian(kinematics.chain, robot_index, q)
-        tool = robot.frame("tool")
-        link = robot.link_index[tool.link]
-        T_link_tool = torch.tensor(tool.T_link_frame.matrix)
-
-        def position(q, robot_index=robot_index, link=link, T_link_tool=T_link_tool):
-            T = forward_kinematics(kinematics.tree, robot_index, q)[:, link] @ T_link_tool
-            return T[:, :3, 3].sum(dim=0)
-
-        derivative = torch.autograd.functional.jacobian(position, q).transpose(0, 1)
-        torch.testing.assert_close(J[:, :3], derivative, atol=1e-12, rtol=0)
 
 
 def test_a_tree_can_be_padded_to_more_links():

@@ -149,12 +149,9 @@ def test_triangles_without_area_are_dropped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("empty.stl", b"", "empty.stl"),
-        ("none.stl", b"solid x\nendsolid x\n", "none.stl"),
         ("junk.stl", b"\x00\xff" * 300, "truncated or not STL"),
         ("junk.dae", b"<COLLADA", "not a readable dae"),
         ("junk.glb", b"glTF\x02\x00", "not a readable glb"),
-        ("junk.ply", b"ply\n", "ply"),
         (
             "flat.obj",
             b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n",

@@ -190,10 +190,8 @@ def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
 class _Meshes:
     """The meshes of a URDF."""
 
-    files: Mapping[str, Path]
-    """File of each mesh by its URI."""
-    packages: list[dict[str, str]]
-    """Installed packages that files come from, for the card."""
+    files: Mapping[str, Path]  # file of each mesh by its URI
+    packages: list[dict[str, str]]  # installed packages that files come from, for the card
     findings: list[Finding]
 
 
@@ -262,34 +260,24 @@ def _place_findings(
             groups.setdefault((file.place, file.package), []).append(file)
     packages, findings = [], []
     for (place, package), files in groups.items():
+        count, example = len(files), f"such as {files[0].path}"
         if place == "installed":
             source = package_source(files[0])
             packages.append({"package": package, **source})
-            findings.append(
-                Finding(
-                    "mesh-from-package",
-                    "warning",
-                    origin,
-                    f"package {package!r} is not around the file; {len(files)} meshes come from "
-                    f"the one in {source['source']}, such as {files[0].path}",
-                    "put the meshes beside the file, if these are not the ones",
-                    f"{len(files)} meshes of package {package!r} come from {source['source']}, "
-                    f"licence {source['licence']}",
-                )
+            code, come = "mesh-from-package", f"come from {source['source']}"
+            why = (
+                f"package {package!r} is not around the file; {count} meshes come from the one in "
             )
+            why += f"{source['source']}, {example}"
+            fix = "put the meshes beside the file, if these are not the ones"
+            repair = f"{count} meshes of package {package!r} {come}, licence {source['licence']}"
         else:
-            findings.append(
-                Finding(
-                    "mesh-beside",
-                    "warning",
-                    origin,
-                    f"package {package!r} is not known; {len(files)} of its meshes were found "
-                    f"beside the file, such as {files[0].path}",
-                    f"name the folder of the file {package!r}, or name the package by --root",
-                    f"{len(files)} meshes of the unknown package {package!r} were read from the "
-                    "file's own folders",
-                )
-            )
+            code, where = "mesh-beside", f"were found beside the file, {example}"
+            why = f"package {package!r} is not known; {count} of its meshes {where}"
+            fix = f"name the folder of the file {package!r}, or name the package by --root"
+            read = "were read from the file's own folders"
+            repair = f"{count} meshes of the unknown package {package!r} {read}"
+        findings.append(Finding(code, "warning", origin, why, fix, repair))
     return packages, findings
 
 
@@ -334,20 +322,15 @@ def _link(
     element: etree._Element, meshes: Mapping[str, Path], colours: Mapping[str, Rgba | None]
 ) -> Link:
     """Convert a ``<link>``; meshes are the files by URI, colours the robot's named materials."""
-    return Link(
-        element.get("name", ""),
-        _inertial(element.find("inertial")),
+    visuals, collisions = (
         joined_capsules(
-            (visual.get("name", ""), shape)
-            for visual in element.iterfind("visual")
-            if (shape := _shape(visual, meshes, _visual_rgba(visual, colours))) is not None
-        ),
-        joined_capsules(
-            (collision.get("name", ""), shape)
-            for collision in element.iterfind("collision")
-            if (shape := _shape(collision, meshes, None)) is not None
-        ),
+            (holder.get("name", ""), shape)
+            for holder in element.iterfind(kind)
+            if (shape := _shape(holder, meshes, _rgba(holder, colours))) is not None
+        )
+        for kind in ("visual", "collision")
     )
+    return Link(element.get("name", ""), _inertial(element.find("inertial")), visuals, collisions)
 
 
 def _joint(element: etree._Element) -> Joint:
@@ -390,15 +373,10 @@ def _named_colours(
     if not unknown:
         return colours, []
     names = ", ".join(dict.fromkeys(repr(shortened(m.get("name", ""))) for m in unknown[:5]))
-    finding = Finding(
-        "material-unknown",
-        "info",
-        f"{origin}:{unknown[0].sourceline}",
-        f"{len(unknown)} shapes have a <material> that has no <color>: {names}",
-        "define the material with a <color>",
-        f"{len(unknown)} shapes have no colour, because their material has none: {names}",
-    )
-    return colours, [finding]
+    where, fix = f"{origin}:{unknown[0].sourceline}", "define the material with a <color>"
+    why = f"{len(unknown)} shapes have a <material> that has no <color>: {names}"
+    repair = f"{len(unknown)} shapes have no colour, because their material has none: {names}"
+    return colours, [Finding("material-unknown", "info", where, why, fix, repair)]
 
 
 def _colour(material: etree._Element) -> Rgba | None:
@@ -484,8 +462,9 @@ def _end_points(capsule: etree._Element) -> tuple[Array, Array]:
     return points[0], points[1]
 
 
-def _visual_rgba(visual: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:
-    material = visual.find("material")
+def _rgba(holder: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:
+    """Return the colour of a ``<visual>``; None without one, and of a ``<collision>``."""
+    material = holder.find("material") if holder.tag == "visual" else None
     if material is None:
         return None
     return _colour(material) or colours.get(material.get("name", ""))

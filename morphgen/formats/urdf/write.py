@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from math import dist
 
 from lxml import etree
@@ -154,9 +154,7 @@ def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshU
         case Sphere(radius):
             etree.SubElement(element, "sphere", radius=format_number(radius))
         case Cylinder(radius, length):
-            etree.SubElement(
-                element, "cylinder", radius=format_number(radius), length=format_number(length)
-            )
+            etree.SubElement(element, "cylinder", _texts({"radius": radius, "length": length}))
         case Mesh():
             etree.SubElement(element, "mesh", filename=mesh_uri(geometry))
         case Capsule():
@@ -174,25 +172,24 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     etree.SubElement(element, "axis", xyz=_join(rounded_axis(joint)))
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-    limit = {"effort": format_number(effort), "velocity": format_number(velocity)}
+    limit = {"effort": effort, "velocity": velocity}
     if kind != "continuous":
         if joint.limits is None:
             raise FormatError(
                 f"joint {joint.name!r} is prismatic without limits; a URDF needs them"
             )
-        lower, upper = joint.limits
-        limit = {"lower": format_number(lower), "upper": format_number(upper)} | limit
-    etree.SubElement(element, "limit", limit)
+        limit = {"lower": joint.limits[0], "upper": joint.limits[1]} | limit
+    etree.SubElement(element, "limit", _texts(limit))
     if joint.damping or joint.friction:
-        values = {
-            "damping": format_number(joint.damping),
-            "friction": format_number(joint.friction),
-        }
-        etree.SubElement(element, "dynamics", values)
+        dynamics = {"damping": joint.damping, "friction": joint.friction}
+        etree.SubElement(element, "dynamics", _texts(dynamics))
     if (mimic := joint.mimic) is not None:
-        coupling = {"multiplier": format_number(mimic.multiplier)}
-        coupling["offset"] = format_number(mimic.offset)
+        coupling = _texts({"multiplier": mimic.multiplier, "offset": mimic.offset})
         etree.SubElement(element, "mimic", {"joint": mimic.joint} | coupling)
+
+
+def _texts(values: Mapping[str, float]) -> dict[str, str]:
+    return {name: format_number(value) for name, value in values.items()}
 
 
 def _join(values: Iterable[float]) -> str:

@@ -385,11 +385,7 @@ class Translation:
         apply = OPERATORS.get(type(node.op).__name__)
         if apply is None:
             raise self.refused(node)
-
-        def operate(scope: Scope) -> object:
-            return scope.result(apply(_data(left(scope)), _data(right(scope))))
-
-        return operate
+        return lambda scope: scope.result(apply(_data(left(scope)), _data(right(scope))))
 
     def _unaryop(self, node: ast.UnaryOp) -> Node:
         operand, apply = self.of(node.operand), _SIGNS[type(node.op)]
