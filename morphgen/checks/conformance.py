@@ -416,7 +416,7 @@ def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, l
         return 0.0, 0.0, []
     order = [list(reading.joints).index(robot.joints[k].name) for k in robot.movable_joints]
     coupling, _ = robot.mimic_map
-    samples = q[: len(reading.forces)]
+    samples = q[: len(reading.forces)]  # forces and inertia are read in the first ones only
     forces = np.array([gravity_load(robot, configuration) for configuration in samples])
     bounded = _with_bounds(robot)
     M = np.array([mass_matrix(robot, configuration) for configuration in samples])

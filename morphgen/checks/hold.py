@@ -355,6 +355,7 @@ def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
     addresses = {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)}
     joints = _joints(robot, addresses)
     driven = {model.joint(model.actuator_trnid[i, 0]).name: i for i in range(model.nu)}
+    # A robot that diverges must be seen.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     data = mujoco.MjData(model)
 

@@ -205,6 +205,7 @@ def _encloses(solid: _Triangles, others: _Triangles) -> bool:
         return False
     faces = np.arange(3 * len(solid)).reshape(-1, 3)
     winding = igl.fast_winding_number(solid.reshape(-1, 3), faces, corners)
+    # 1 inside a closed solid and 0 outside; meshes may be inside out.
     return bool((np.abs(winding) > 0.5).any())
 
 

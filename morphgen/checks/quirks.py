@@ -111,6 +111,7 @@ def _set_inertias(
         a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
         if is_wrong(a, b, c):
             for name in _INERTIA:
+                # The names of the diagonal are ixx, iyy and izz.
                 inertia.set(name, moment if name[1] == name[2] else "0")
 
 

@@ -56,7 +56,7 @@ def collision_matrix(
     collidable = [link.name for link in robot.links if link.collisions]
     pairs = sorted({sorted_pair(a, b) for a, b in combinations(collidable, 2)})
     checker = SelfCollisionChecker(loose, ())
-    q = np.zeros((samples + 1, loose.dof))
+    q = np.zeros((samples + 1, loose.dof))  # the first row is home
     q[0, columns] = robot.home
     q[1:, columns] = random_configurations(robot, samples, np.random.default_rng(seed))
     penetrations = checker.penetrations(q)

@@ -263,6 +263,7 @@ def _compile(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
     root = etree.Element("mujoco")
     etree.SubElement(root, "compiler", MJCF_COMPILER)
     etree.SubElement(root, "size", memory=_MUJOCO_MEMORY)
+    # By default MuJoCo tests no body that is welded to the world against its children.
     etree.SubElement(etree.SubElement(root, "option"), "flag", filterparent="disable")
     asset = etree.SubElement(root, "asset")
     bodies = [etree.SubElement(root, "worldbody")]

@@ -146,6 +146,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
     Unlike ``write_atomic``, concurrent processes may write the same file.
     """
+    # Only a rename within one file system is atomic.
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         partial = Path(folder) / path.name
         yield partial
@@ -189,7 +190,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        partial.chmod(0o755)
+        partial.chmod(0o755)  # mkdtemp makes a folder that only its owner may open
         yield partial
         if folder.exists():
             _swap(folder, partial)
@@ -206,6 +207,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
 
 def _swap(folder: Path, partial: Path) -> None:
     """Replace ``folder`` by ``partial``; if that fails, ``folder`` stays."""
+    # A folder cannot be renamed onto one that is not empty.
     backup = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     old = backup / folder.name
     try:

@@ -136,13 +136,13 @@ def shapes_scale(shapes: Sequence[Shape]) -> float:
 
 def shapes_key(shapes: Sequence[Shape]) -> str:
     """Return a hash of the content and poses of shapes at unit scale."""
-    factor = 1 / shapes_scale(shapes)
+    factor = 1 / shapes_scale(shapes)  # links at any uniform scale share the fit
     lines = []
     for shape in (scale_shape(shape, factor) for shape in shapes):
         pose = shape.T_link_shape
         numbers = map(format_number, (*pose.position, *pose.quaternion))
         lines.append(" ".join([_geometry_text(shape.geometry), *numbers]))
-    text = "\n".join(sorted(lines))
+    text = "\n".join(sorted(lines))  # the order of shapes does not matter
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

@@ -78,6 +78,7 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
     mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
     if len(mesh.faces) <= _MAX_SMOOTHED_FACES:
         mesh = trimesh.graph.smooth_shade(mesh, angle=_SHARP_ANGLE)
+    # A cached mesh is shared, so its colour is not set.
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     rgba = shape.rgba or GREY
     mesh.visual = TextureVisuals(
@@ -86,7 +87,7 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
             metallicFactor=0.0,
             roughnessFactor=0.7,
             alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
-            doubleSided=True,
+            doubleSided=True,  # open meshes are drawn from inside, too
         )
     )
     return mesh

@@ -60,9 +60,10 @@ def render(
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.7
     camera = mujoco.MjvCamera()
     camera.lookat[:] = target
+    # MuJoCo's azimuth of 90 looks along y, as the axes below do at a yaw of zero.
     camera.distance, camera.azimuth, camera.elevation = distance, 90 + _YAW, _PITCH
     options = mujoco.MjvOption()
-    options.geomgroup[3] = 0
+    options.geomgroup[3] = 0  # the collision shapes
     context = gl_context(*size)
     try:
         context.make_current()
@@ -79,8 +80,8 @@ def render(
         gpu.free()
     finally:
         context.free()
-    pixels[depth >= 1.0] = 255
-    return Image.fromarray(pixels[::-1])
+    pixels[depth >= 1.0] = 255  # where nothing is drawn, the picture is white
+    return Image.fromarray(pixels[::-1])  # OpenGL's rows begin at the bottom
 
 
 def framed_height(robot: Robot) -> float:

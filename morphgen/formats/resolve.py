@@ -195,6 +195,7 @@ def find_file(uri: str, base_file: Path, finder: PackageFinder) -> FoundFile:
         places = _package_places(*rest.lstrip("/").partition("/")[::2], base, finder)
     missing = []
     for place, boundary, name in places:
+        # A file's own name may hold a percent sign, so the name as written comes first.
         for text in dict.fromkeys([name, unquote(name)]):
             absolute = scheme in ("file", "") and Path(text).is_absolute()
             path = Path(os.path.normpath(text if absolute else place.folder / text.lstrip("/")))

@@ -154,6 +154,7 @@ def _write_joint(model: etree._Element, joint: Joint, names: dict[str, str]) -> 
         mimic = etree.SubElement(axis, "mimic", joint=names[joint.mimic.joint], axis="axis")
         etree.SubElement(mimic, "multiplier").text = format_number(joint.mimic.multiplier)
         etree.SubElement(mimic, "offset").text = format_number(joint.mimic.offset)
+        # SDFormat's line is about a reference position of the leader.
         etree.SubElement(mimic, "reference").text = "0"
     lower, upper = (joint.limits if kind != "continuous" else None) or (None, None)
     bounds = {"lower": lower, "upper": upper}

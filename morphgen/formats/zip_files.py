@@ -59,7 +59,7 @@ def write_zip(path: Path, files: Mapping[str, bytes | Path]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing_file(path) as partial, partial.open("wb") as target:
             write_entries(target, files)
-            target.close()
+            target.close()  # before the rename: Windows replaces no open file
 
 
 def write_entries(target: IO[bytes], files: Mapping[str, bytes | Path]) -> None:

@@ -150,7 +150,7 @@ def _inertias(robot: Robot) -> tuple[Array, Array]:
     least = np.zeros(robot.dof)
     for kind, floor in ((prismatic, MIN_SLIDING_MASS), (~prismatic, MIN_ROTATIONAL_INERTIA)):
         least[kind] = max(MIN_RELATIVE_INERTIA * inertia[kind].max(initial=0.0), floor)
-    of_followers = inertia - carried[rows]
+    of_followers = inertia - carried[rows]  # what a leader carries by its mimic joints
     total = np.maximum(np.maximum(inertia, least), of_followers / (1 - COUPLED_INERTIA))
     added = total - inertia
     ratio = follows.sum(axis=0)

@@ -112,6 +112,7 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
             )
         case Capsule(radius, length):
             mesh = trimesh.creation.capsule(radius=radius, height=length)
+            # trimesh has one end of the axis at the origin.
             mesh.apply_translation(-np.asarray(mesh.bounds).mean(axis=0))
         case Mesh():
             mesh = load_mesh(geometry)
@@ -222,7 +223,7 @@ def _mesh_moments(mesh: trimesh.Trimesh) -> Array:
 def _mesh_in_link(shape: Shape) -> trimesh.Trimesh:
     mesh = solid_mesh(shape.geometry).copy()
     mesh.apply_transform(shape.T_link_shape.matrix)
-    if mesh.volume < 0:
+    if mesh.volume < 0:  # the transform or the file turned it inside out
         mesh.invert()
     return mesh
 

@@ -203,6 +203,7 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
     lower, upper = joint_limits(robot).T
     q = random_configurations(robot, samples, rng)
     distance = _distance(robot, q, frame)
+    # Several, as the farthest may climb to a local maximum.
     best = np.argsort(-distance, kind="stable")[:8]
     q, distance = q[best], distance[best]
     rows = np.arange(len(q))

@@ -76,7 +76,7 @@ def rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
     z[..., 2] = 1
     cross, cosine = torch.linalg.cross(z, axes), axes[..., 2]
     K = skew(cross)
-    opposite = cosine < -1 + 1e-6
+    opposite = cosine < -1 + 1e-6  # there the formula divides by zero
     factor = 1 / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
     eye = torch.eye(3, device=axes.device)
     R = eye + K + K @ K * factor[..., None, None]
@@ -89,6 +89,7 @@ def angle_between(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
 
     The Frobenius norm of A - B is sqrt(8) sin(angle / 2), which is well-conditioned at 0.
     """
+    # Squares of small differences vanish in single precision.
     norm = (A - B).double().square().sum(dim=(1, 2)).sqrt().float()
     return 2 * torch.asin((norm / 8**0.5).clamp(max=1))
 

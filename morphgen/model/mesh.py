@@ -145,6 +145,7 @@ def _scaled(
             raise MeshError(f"{path}: no part {part}; valid: 0 to {len(groups) - 1}")
         groups = (groups[part],)
     vertices, faces = _concatenate([(group.vertices, group.faces) for group in groups])
+    # A mirror turns triangles inside out.
     vertices, faces = _clean(vertices * scale, faces[:, ::-1] if math.prod(scale) < 0 else faces)
     if not len(faces):
         raise MeshError(f"{path}: no triangle has an area at scale {scale}")

@@ -192,7 +192,7 @@ def _binary_stl(data: bytes, files: FolderResolver) -> Array:
                 f"its header counts {count} triangles, which take {end} bytes, and the file has "
                 f"{len(data)}: it is truncated or not STL"
             )
-        if end > len(data) or (start and not count):
+        if end > len(data) or (start and not count):  # what follows is no further solid
             break
         require_faces(sum(map(len, solids)) + count)
         solids.append(np.frombuffer(data, _STL_ROW, count, start + 84)["corners"])
@@ -393,6 +393,7 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[Piece]:
     if len(materials) > MAX_SETS or len(materials) * vertices > _MAX_WORK:
         raise ValueError(f"{len(materials)} materials for {vertices} vertices")
     libraries = re.findall(r"^[ \t]*mtllib[ \t]+(.*?)[ \t]*$", text, re.M)
+    # trimesh 5.2.0 reads one library only.
     text = re.sub(r"^[ \t]*mtllib.*$", "", text, flags=re.M)
     if libraries:
         files.written["materials"] = _materials(libraries, materials, files).encode()

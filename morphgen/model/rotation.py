@@ -23,6 +23,7 @@ def normalize(q: Quat) -> Quat:
     lead = next(value for value in (w, x, y, z) if abs(value) > 1e-15 * norm)
     if lead < 0:
         norm = -norm
+    # Adding zero turns -0.0 into 0.0, so that equal rotations have equal texts.
     return (w / norm + 0.0, x / norm + 0.0, y / norm + 0.0, z / norm + 0.0)
 
 

@@ -405,7 +405,7 @@ def _gltf_primitives(
             primitive["attributes"] = kept
             for key in ("targets", "extensions"):
                 primitive.pop(key, None)
-        mesh.clear()
+        mesh.clear()  # also of extensions, which trimesh would follow
         mesh["primitives"] = primitives
     total = 0
     for i, accessor in enumerate(accessors):
@@ -646,7 +646,7 @@ def _check_textures(root: etree._Element, files: FolderResolver) -> None:
             for param in effect.iter("{*}newparam")
         }
         name = texture.get("texture", "")
-        for _ in range(2):
+        for _ in range(2):  # a sampler names a surface, which names the picture
             name = params.get(name, name)
         file = images.get(name, "").strip()
         if name not in images:

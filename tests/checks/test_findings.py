@@ -18,12 +18,11 @@ from helpers.faulty_robots import (
 from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks import loaders as shapes
-from morphgen.model.findings import Finding
-from morphgen.model.robot import Inertial, Link, Mimic, Robot
+from morphgen.model.robot import Inertial, Link, Mimic
 from morphgen.model.tree import rename
 
 
-def found(robot: Robot, code: str) -> Finding:
+def found(robot, code):
     """Return the first finding with a code."""
     return next(finding for finding in check(robot) if finding.code == code)
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +36,7 @@ def gap_findings(robot):
     return [(finding.where, finding.why) for finding in check_links_apart(robot)]
 
 
-def mesh(folder: Path, name: str, made: trimesh.Trimesh) -> Mesh:
+def mesh(folder, name, made):
     made.export(folder / name)
     return Mesh(folder / name)
 

@@ -20,11 +20,11 @@ from morphgen.checks import loaders as shapes
 from morphgen.checks.inertia import DEFAULT_DENSITY
 from morphgen.checks.loaders import safe_names
 from morphgen.model.inertia import inertial_from_density
-from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Robot
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY
 from morphgen.model.tree import rename
 
 
-def keys(robot: Robot) -> set[tuple[str, str]]:
+def keys(robot):
     """Return code and location of every finding."""
     return {(finding.code, finding.where) for finding in check(robot)}
 

@@ -1,9 +1,5 @@
 """Resolving mesh and include references to files, without leaving the permitted folders."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from morphgen.errors import FormatError
@@ -21,13 +17,13 @@ from morphgen.grammar.library import default_library
 NOWHERE = PackageFinder()
 
 
-def touch(path: Path, text: str = "") -> Path:
+def touch(path, text=""):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path
 
 
-def failure(uri: str, base: Path, finder: PackageFinder = NOWHERE) -> str:
+def failure(uri, base, finder=NOWHERE):
     with pytest.raises(FormatError) as caught:
         resolve_uri(uri, base, finder)
     assert "\n" not in str(caught.value)
@@ -35,7 +31,7 @@ def failure(uri: str, base: Path, finder: PackageFinder = NOWHERE) -> str:
 
 
 @pytest.fixture
-def urdf(tmp_path: Path) -> Path:
+def urdf(tmp_path):
     return touch(tmp_path / "ws" / "arm_description" / "urdf" / "arm.urdf")
 
 
@@ -55,7 +51,7 @@ def urdf(tmp_path: Path) -> Path:
         ("arm_description/urdf/my mesh.stl", r"..\urdf\my mesh.stl"),
     ],
 )
-def test_files_are_found_by_package_and_spelling(file: str, uri: str, tmp_path: Path) -> None:
+def test_files_are_found_by_package_and_spelling(file, uri, tmp_path):
     folder = "arm" if "arm_support" in uri else "arm_description"
     urdf = touch(tmp_path / "ws" / folder / "urdf" / "arm.urdf")
     mesh = touch(tmp_path / "ws" / file.replace("arm_description", folder))
@@ -81,7 +77,7 @@ def test_files_are_found_by_package_and_spelling(file: str, uri: str, tmp_path: 
         ("package://arm_description/../secret.stl", "leaves"),
     ],
 )
-def test_other_references_are_refused(uri: str, reason: str, urdf: Path) -> None:
+def test_other_references_are_refused(uri, reason, urdf):
     touch(urdf.parents[2] / "secret.stl")
     touch(urdf.parent / "Base.STL")
     message = failure(uri, urdf, PackageFinder((urdf.parents[2] / "root",)))
@@ -89,7 +85,7 @@ def test_other_references_are_refused(uri: str, reason: str, urdf: Path) -> None
     assert message.startswith(f"{urdf}: ")
 
 
-def test_a_plain_folder_above_the_description_is_no_package(tmp_path: Path) -> None:
+def test_a_plain_folder_above_the_description_is_no_package(tmp_path):
     """A stranger's file in a download folder must not read from the user's home."""
     home = tmp_path / "alice"
     urdf = touch(home / "Downloads" / "robot" / "robot.urdf")
@@ -102,16 +98,14 @@ def test_a_plain_folder_above_the_description_is_no_package(tmp_path: Path) -> N
     assert resolve_uri("package://secret/part.stl", urdf, NOWHERE).is_file()
 
 
-def test_a_folder_given_for_a_package_takes_precedence(tmp_path: Path, urdf: Path) -> None:
+def test_a_folder_given_for_a_package_takes_precedence(tmp_path, urdf):
     touch(urdf.parent.parent / "a.stl")
     mine = touch(tmp_path / "mine" / "a.stl")
     finder = default_finder(packages={"arm_description": tmp_path / "mine"})
     assert resolve_uri("package://arm_description/a.stl", urdf, finder) == mine
 
 
-def test_relative_paths_start_at_the_folder_of_the_description(
-    urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_relative_paths_start_at_the_folder_of_the_description(urdf, tmp_path, monkeypatch):
     own_file = touch(urdf.parent / "a.stl")
     beside = touch(urdf.parent.parent / "meshes" / "b.stl")
     touch(tmp_path / "elsewhere" / "a.stl")
@@ -121,9 +115,7 @@ def test_relative_paths_start_at_the_folder_of_the_description(
     assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
 
 
-def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
-    tmp_path: Path, urdf: Path
-) -> None:
+def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(tmp_path, urdf):
     own_file = touch(urdf.parent.parent / "meshes" / "a.stl")
     packaged = touch(tmp_path / "opt" / "hand_description" / "a.stl")
     private = touch(tmp_path / "private" / "a.stl")
@@ -134,9 +126,7 @@ def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
     assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
 
 
-def test_ros_environment_is_searched_after_given_roots(
-    tmp_path: Path, urdf: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ros_environment_is_searched_after_given_roots(tmp_path, urdf, monkeypatch):
     classic = touch(tmp_path / "classic" / "one" / "a.stl")
     ament = touch(tmp_path / "prefix" / "share" / "two" / "a.stl")
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "classic"))
@@ -155,13 +145,11 @@ def test_ros_environment_is_searched_after_given_roots(
         "package://z1_description/meshes/visual/z1_Link00.dae",
     ],
 )
-def test_the_data_packages_are_found_from_anywhere(uri: str, urdf: Path) -> None:
+def test_the_data_packages_are_found_from_anywhere(uri, urdf):
     assert resolve_uri(uri, urdf, default_finder()).is_file()
 
 
-def test_distribution_files_are_found_and_missing_ones_are_errors(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_distribution_files_are_found_and_missing_ones_are_errors(monkeypatch):
     path = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
     assert path.is_absolute()
     assert path.is_file()
@@ -175,7 +163,7 @@ def test_distribution_files_are_found_and_missing_ones_are_errors(
         distribution_file("rtb-data", "rtbdata/x.urdf")
 
 
-def test_a_symbolic_link_cannot_leave_the_tree(tmp_path: Path, urdf: Path) -> None:
+def test_a_symbolic_link_cannot_leave_the_tree(tmp_path, urdf):
     private = touch(tmp_path / "private" / "a.stl")
     inside = touch(urdf.parent.parent / "meshes" / "b.stl")
     (urdf.parent / "out.stl").symlink_to(private)
@@ -187,7 +175,7 @@ def test_a_symbolic_link_cannot_leave_the_tree(tmp_path: Path, urdf: Path) -> No
     assert resolve_uri("out.stl", urdf, default_finder(root=private.parent)).name == "out.stl"
 
 
-def test_links_between_packages_are_followed(tmp_path: Path, urdf: Path) -> None:
+def test_links_between_packages_are_followed(tmp_path, urdf):
     """``colcon build --symlink-install`` makes such."""
     source = touch(tmp_path / "src" / "arm" / "meshes" / "a.stl")
     touch(tmp_path / "src" / "arm" / "package.xml", "<package><name>arm</name></package>")
@@ -195,7 +183,7 @@ def test_links_between_packages_are_followed(tmp_path: Path, urdf: Path) -> None
     assert resolve_uri("a.stl", urdf, NOWHERE) == urdf.parent / "a.stl"
 
 
-def test_a_symlinked_description_may_reference_files_beside_its_target(tmp_path: Path) -> None:
+def test_a_symlinked_description_may_reference_files_beside_its_target(tmp_path):
     """Download caches store every file as a link into a folder of blobs."""
     store, shown = tmp_path / "store" / "blobs", tmp_path / "shown" / "snapshot"
     shown.mkdir(parents=True)
@@ -205,7 +193,7 @@ def test_a_symlinked_description_may_reference_files_beside_its_target(tmp_path:
     assert resolve_uri("a.stl", shown / "robot.urdf", NOWHERE) == shown / "a.stl"
 
 
-def test_a_root_extends_the_permitted_tree(tmp_path: Path) -> None:
+def test_a_root_extends_the_permitted_tree(tmp_path):
     urdf = touch(tmp_path / "data" / "robots" / "x" / "x.urdf")
     mesh = touch(tmp_path / "data" / "meshes" / "a.stl")
     packaged = touch(tmp_path / "data" / "hand" / "b.stl")
@@ -222,7 +210,7 @@ def test_a_root_extends_the_permitted_tree(tmp_path: Path) -> None:
         default_finder(root=tmp_path / "nowhere")
 
 
-def refused_text(path: Path, base: Path, finder: PackageFinder = NOWHERE) -> bool:
+def refused_text(path, base, finder=NOWHERE):
     try:
         require_allowed_text(path, finder, base, base)
     except RefusedError:
@@ -230,7 +218,7 @@ def refused_text(path: Path, base: Path, finder: PackageFinder = NOWHERE) -> boo
     return False
 
 
-def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path: Path) -> None:
+def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path):
     download = touch(tmp_path / "home" / "downloads" / "x.xacro")
     nested = touch(tmp_path / "home" / "downloads" / "urdf" / "x.xacro")
     near = touch(tmp_path / "home" / "secret.yaml")
@@ -248,7 +236,7 @@ def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path: Path)
     assert not refused_text(described, download, default_finder([tmp_path / "home"]))
 
 
-def test_installed_files_are_distinguished_from_user_files(tmp_path: Path) -> None:
+def test_installed_files_are_distinguished_from_user_files(tmp_path):
     file = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
     assert is_installed(file)
     assert is_installed(default_library().manifest("plane").path)

@@ -11,7 +11,6 @@ from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.schema import structure_findings
 from morphgen.formats.xml import parse_xml
-from morphgen.model.findings import Finding
 
 SOUND = """<robot name="r">
 <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
@@ -105,16 +104,16 @@ SUSPICIOUS = [
 ]
 
 
-def findings(text: str) -> tuple[Finding, ...]:
+def findings(text):
     return structure_findings(parse_xml(text.encode(), "r.urdf"), "r.urdf")
 
 
-def load(text: str) -> yourdfpy.URDF:
+def load(text):
     data = io.BytesIO(etree.tostring(parse_xml(text.encode(), "r.urdf")))
     return yourdfpy.URDF.load(data, load_meshes=False)
 
 
-def changed(change: tuple[str, str] | None) -> str:
+def changed(change):
     if change is None:
         return '<robot name="r"/>'
     assert change[0] in SOUND

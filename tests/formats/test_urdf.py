@@ -1,7 +1,6 @@
 """Reading and writing URDF: round trips, and errors with line numbers."""
 
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ def no_mesh(mesh):
     raise AssertionError(f"no mesh expected: {mesh}")
 
 
-def written(robot: Robot, folder: Path) -> Path:
+def written(robot, folder):
     path = folder / "robot.urdf"
     path.write_text(urdf_text(robot, no_mesh))
     return path
@@ -40,7 +39,7 @@ def test_a_robot_round_trips_through_urdf(tmp_path):
     np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
 
 
-def text_file(folder: Path, text: str) -> Path:
+def text_file(folder, text):
     path = folder / "robot.urdf"
     path.write_text(text)
     return path

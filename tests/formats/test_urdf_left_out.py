@@ -26,7 +26,7 @@ TRIANGLE = b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
 STL = b"solid\nfacet\nouter loop\n" + TRIANGLE + b"endloop\nendfacet\nendsolid\n"
 
 
-def urdf(base: str = "", tip: str = "", more: str = "", origin: str = "", com: str = "") -> str:
+def urdf(base="", tip="", more="", origin="", com=""):
     return (
         f'<robot name="r" version="1.2"><link name="base">{INERTIAL.format("")}{base}</link>\n'
         f'<link name="tip">{INERTIAL.format(com)}{tip}</link>\n'
@@ -42,7 +42,7 @@ def reading(text: str, folder: Path, **options: bool) -> Robot:
     return read(path, **options)
 
 
-def codes(robot: Robot) -> list[str]:
+def codes(robot):
     return [finding.code for finding in robot.source_findings]
 
 
@@ -135,7 +135,7 @@ def test_extensions_are_counted_by_kind_without_a_line_for_each():
 MESH = '<visual><geometry><mesh filename="{}"/></geometry></visual>'
 
 
-def mesh_file(path: Path) -> Path:
+def mesh_file(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(STL)
     return path
@@ -204,7 +204,7 @@ def test_a_mesh_of_an_installed_package_is_a_finding_and_on_the_card(
         assert codes(robot) == ["mesh-beside"]
 
 
-def missing_meshes(folder: Path, uri: str) -> Path:
+def missing_meshes(folder, uri):
     mesh_file(folder / "here.stl")
     path = folder / "r.urdf"
     base = MESH.format(uri) * 2 + MESH.format("here.stl")
@@ -263,7 +263,7 @@ def test_the_mesh_folder_of_mujoco_does_not_leave_the_files_folders(tmp_path, fo
         reading(urdf(base=MESH.format("a.stl"), more=more), home)
 
 
-def free(kind: str, parent: str, child: str) -> str:
+def free(kind, parent, child):
     return (
         f'<joint name="{parent}_{child}" type="{kind}"><parent link="{parent}"/>'
         f'<child link="{child}"/><origin xyz="0 0 1"/></joint>'

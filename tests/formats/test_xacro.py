@@ -1,10 +1,7 @@
 """Expanding xacro files in process, without access to Python, the environment or other files."""
 
-from __future__ import annotations
-
 import math
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from xml.dom import minidom
 
@@ -21,12 +18,12 @@ NOWHERE = PackageFinder()
 HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 
 
-def expand_text(text: str, args: Mapping[str, str], origin: Path, finder: PackageFinder) -> bytes:
+def expand_text(text, args, origin, finder):
     """Expand a text as if it were a file, in this process."""
     return Expansion(args, origin, finder).run(text.encode())
 
 
-def robot(body: str) -> str:
+def robot(body):
     return f"{HEAD}{body}</robot>"
 
 
@@ -46,17 +43,17 @@ def failure(body: str, origin: Path, **args: str) -> str:
 
 
 @pytest.fixture
-def origin(tmp_path: Path) -> Path:
+def origin(tmp_path):
     return tmp_path / "part.xacro"
 
 
-def test_arguments_have_defaults_that_the_caller_can_override(origin: Path) -> None:
+def test_arguments_have_defaults_that_the_caller_can_override(origin):
     body = '<xacro:arg name="n" default="3"/><link name="l$(arg n)"/>'
     assert expanded(body, origin) == [{"name": "l3"}]
     assert expanded(body, origin, n="7") == [{"name": "l7"}]
 
 
-def test_macros_properties_conditions_and_python_work(origin: Path) -> None:
+def test_macros_properties_conditions_and_python_work(origin):
     body = """
       <xacro:property name="n" value="2"/>
       <xacro:macro name="chain" params="i">
@@ -68,33 +65,31 @@ def test_macros_properties_conditions_and_python_work(origin: Path) -> None:
     assert names == ["l0", "l1", "l2"]
 
 
-def test_an_undeclared_argument_is_an_error_that_suggests_the_nearest(origin: Path) -> None:
+def test_an_undeclared_argument_is_an_error_that_suggests_the_nearest(origin):
     body = '<xacro:arg name="length" default="1"/><link name="l"/>'
     message = failure(body, origin, lenght="2")
     assert "'lenght'" in message
     assert "did you mean 'length'" in message
 
 
-def test_an_argument_declared_in_a_skipped_branch_is_valid(origin: Path) -> None:
+def test_an_argument_declared_in_a_skipped_branch_is_valid(origin):
     body = '<xacro:if value="false"><xacro:arg name="a" default="1"/></xacro:if><link name="l"/>'
     assert expanded(body, origin, a="2") == [{"name": "l"}]
 
 
-def test_an_argument_without_default_is_required(origin: Path) -> None:
+def test_an_argument_without_default_is_required(origin):
     body = '<link name="$(arg prefix)link"/>'
     assert "'prefix'" in failure(body, origin)
     assert expanded(body, origin, prefix="left_") == [{"name": "left_link"}]
 
 
-def test_calls_share_no_state(origin: Path) -> None:
+def test_calls_share_no_state(origin):
     expanded('<xacro:property name="p" value="1"/><xacro:arg name="a" default="1"/>', origin)
     assert "'p'" in failure('<link name="${p}"/>', origin)
     failure('<link name="${1/0}"/>', origin)
 
 
-def test_includes_are_relative_to_the_file_that_includes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_includes_are_relative_to_the_file_that_includes(tmp_path, monkeypatch):
     (tmp_path / "sub").mkdir()
     (tmp_path / "top.xacro").write_text(robot('<xacro:include filename="sub/a.xacro"/>'))
     (tmp_path / "sub" / "a.xacro").write_text(robot('<xacro:include filename="b.xacro"/>'))
@@ -104,7 +99,7 @@ def test_includes_are_relative_to_the_file_that_includes(
     assert [link.get("name") for link in root] == [str(tmp_path / "sub")]
 
 
-def test_find_searches_around_the_file_and_in_roots(tmp_path: Path, origin: Path) -> None:
+def test_find_searches_around_the_file_and_in_roots(tmp_path, origin):
     (tmp_path / "near_description").mkdir()
     (tmp_path / "far" / "far_description").mkdir(parents=True)
     finder = PackageFinder((tmp_path / "far",))
@@ -117,35 +112,35 @@ def test_find_searches_around_the_file_and_in_roots(tmp_path: Path, origin: Path
     assert "'lost'" in failure('<link name="$(find lost)"/>', origin)
 
 
-def test_a_missing_include_names_both_files(origin: Path) -> None:
+def test_a_missing_include_names_both_files(origin):
     message = failure('<xacro:include filename="lost.xacro"/>', origin)
     assert str(origin) in message
     assert "lost.xacro" in message
 
 
-def test_an_optional_include_may_be_missing(origin: Path) -> None:
+def test_an_optional_include_may_be_missing(origin):
     body = '<xacro:include filename="lost.xacro" optional="true"/><link name="l"/>'
     assert expanded(body, origin) == [{"name": "l"}]
 
 
-def test_broken_xml_in_an_include_is_reported_with_its_line(tmp_path: Path, origin: Path) -> None:
+def test_broken_xml_in_an_include_is_reported_with_its_line(tmp_path, origin):
     (tmp_path / "broken.xacro").write_text("<robot>\n\n<link></robot>")
     message = failure('<xacro:include filename="broken.xacro"/>', origin)
     assert message.startswith(f"{tmp_path / 'broken.xacro'}:3:")
 
 
-def test_a_doctype_in_an_include_is_refused(tmp_path: Path, origin: Path) -> None:
+def test_a_doctype_in_an_include_is_refused(tmp_path, origin):
     (tmp_path / "bomb.xacro").write_text('<!DOCTYPE r [<!ENTITY a "b">]><r>&a;</r>')
     assert "DOCTYPE" in failure('<xacro:include filename="bomb.xacro"/>', origin)
 
 
-def test_a_file_that_includes_itself_is_an_error(origin: Path) -> None:
+def test_a_file_that_includes_itself_is_an_error(origin):
     body = '<xacro:include filename="part.xacro"/>'
     origin.write_text(robot(body))
     assert "endless" in failure(body, origin)
 
 
-def test_a_macro_that_calls_itself_without_end_is_an_error(origin: Path) -> None:
+def test_a_macro_that_calls_itself_without_end_is_an_error(origin):
     body = '<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>'
     assert "endless" in failure(body, origin)
 
@@ -168,45 +163,45 @@ def test_a_macro_that_calls_itself_without_end_is_an_error(origin: Path) -> None
         ("<link name=\"${load_yaml('lost.yaml')}\"/>", "lost.yaml"),
     ],
 )
-def test_errors_are_one_line_that_names_the_file(body: str, reason: str, origin: Path) -> None:
+def test_errors_are_one_line_that_names_the_file(body, reason, origin):
     assert reason in failure(body, origin)
 
 
-def test_the_environment_is_not_read(origin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_is_not_read(origin, monkeypatch):
     monkeypatch.setenv("EXTRA", "surprise")
     assert expanded('<link name="$(optenv EXTRA usual)"/>', origin) == [{"name": "usual"}]
 
 
-def test_yaml_can_be_loaded_with_units(tmp_path: Path, origin: Path) -> None:
+def test_yaml_can_be_loaded_with_units(tmp_path, origin):
     (tmp_path / "p.yaml").write_text("arm: {reach: !millimeters 500}\n")
     body = "<link name=\"${xacro.load_yaml('p.yaml').arm.reach}\"/>"
     assert expanded(body, origin) == [{"name": "0.5"}]
 
 
-def test_warnings_are_not_printed(origin: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_warnings_are_not_printed(origin, capfd):
     body = '<xacro:property name="pi" value="3"/><xacro:property name="a" value="1" odd="2"/>'
     expanded(body, origin)
     failure(body + "<xacro:nope/>", origin)
     assert capfd.readouterr() == ("", "")
 
 
-def test_special_characters_in_text_and_attributes_are_preserved(origin: Path) -> None:
+def test_special_characters_in_text_and_attributes_are_preserved(origin):
     text = robot('<!-- gone --><link name="a&lt;&quot;b\'&amp;é"/><gazebo>1 &lt; 2</gazebo>')
     root = parse_xml(expand_text(text, {}, origin, NOWHERE), "out")
     assert root[0].get("name") == "a<\"b'&é"
     assert root[1].text == "1 < 2"
 
 
-def test_changes_of_the_xacro_package_to_minidom_are_undone(origin: Path) -> None:
+def test_changes_of_the_xacro_package_to_minidom_are_undone(origin):
     expanded('<link name="l"/>', origin)
     text = '<a z="1" b="2"> <c/> </a>'
     assert minidom.parseString(text).documentElement.toxml() == text  # type: ignore[union-attr]
 
 
-def test_expansion_is_thread_safe(tmp_path: Path) -> None:
+def test_expansion_is_thread_safe(tmp_path):
     results: dict[int, list[list[dict[str, str]]]] = {}
 
-    def work(k: int) -> None:
+    def work(k):
         body = '<xacro:arg name="n" default="0"/><link name="$(arg n)${sin(0)}"/>'
         results[k] = [expanded(body, tmp_path / f"{k}.xacro", n=str(k)) for _ in range(30)]
 
@@ -229,7 +224,7 @@ def test_expansion_is_thread_safe(tmp_path: Path) -> None:
         ("kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.xacro", 10),
     ],
 )
-def test_robots_of_the_data_packages_expand(file: str, links: int) -> None:
+def test_robots_of_the_data_packages_expand(file, links):
     path = distribution_file("rtb-data", f"rtbdata/xacro/{file}")
     data = expand(path, {}, default_finder())
     assert len(parse_xml(data, file).findall("link")) == links
@@ -247,7 +242,7 @@ def test_robots_of_the_data_packages_expand(file: str, links: int) -> None:
         ("${e}", 9.0),
     ],
 )
-def test_a_numeric_expression_is_evaluated(expression: str, value: float) -> None:
+def test_a_numeric_expression_is_evaluated(expression, value):
     assert evaluate(expression, {"length": 0.3, "e": 9.0}) == pytest.approx(value)
 
 
@@ -264,7 +259,7 @@ def test_a_numeric_expression_is_evaluated(expression: str, value: float) -> Non
         ("${().__class__}", "__class__"),
     ],
 )
-def test_expressions_that_are_not_numbers_are_errors(expression: str, reason: str) -> None:
+def test_expressions_that_are_not_numbers_are_errors(expression, reason):
     with pytest.raises(FormatError) as caught:
         evaluate(expression, {"length": 0.3})
     assert reason in str(caught.value)
@@ -273,8 +268,8 @@ def test_expressions_that_are_not_numbers_are_errors(expression: str, reason: st
 
 
 def test_an_installed_file_that_includes_a_user_file_is_expanded_in_a_subprocess(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     installed = tmp_path / "installed"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "package.xml").write_text("<package><name>other</name></package>")
@@ -300,9 +295,7 @@ def test_an_installed_file_that_includes_a_user_file_is_expanded_in_a_subprocess
     assert len(asked) == 1
 
 
-def test_warnings_of_the_subprocess_are_logged(
-    origin: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_warnings_of_the_subprocess_are_logged(origin, caplog):
     origin.write_text(robot("<link name=\"l${xacro.warning('odd')}\"/>"))
     with caplog.at_level("INFO", "morphgen.formats.xacro.expand"):
         assert b'name="l"' in expand(origin, {}, NOWHERE)

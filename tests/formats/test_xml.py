@@ -1,16 +1,12 @@
 """Parsing XML safely: no external entities, no expansion bombs, errors with positions."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from morphgen.errors import FormatError
 from morphgen.formats.xml import parse_description, parse_xml
 
 
-def failure(data: bytes) -> str:
+def failure(data):
     with pytest.raises(FormatError) as caught:
         parse_xml(data, "robot.urdf")
     message = str(caught.value)
@@ -18,20 +14,20 @@ def failure(data: bytes) -> str:
     return message
 
 
-def test_the_root_element_keeps_the_order_of_attributes() -> None:
+def test_the_root_element_keeps_the_order_of_attributes():
     root = parse_xml(b'<robot name="a" version="1"><link name="l"/></robot>', "robot.urdf")
     assert root.tag == "robot"
     assert list(root.attrib) == ["name", "version"]
     assert [child.tag for child in root] == ["link"]
 
 
-def test_comments_and_processing_instructions_are_removed() -> None:
+def test_comments_and_processing_instructions_are_removed():
     root = parse_xml(b"<?p q?><robot><!-- a --><link/><?x y?>te<!-- b -->xt</robot>", "robot.urdf")
     assert [child.tag for child in root] == ["link"]
     assert root[0].tail == "text"
 
 
-def test_broken_xml_is_reported_with_line_and_column() -> None:
+def test_broken_xml_is_reported_with_line_and_column():
     message = failure(b"<robot>\n  <link>\n</robot>")
     assert message.startswith("robot.urdf:3:")
     assert "link" in message
@@ -39,7 +35,7 @@ def test_broken_xml_is_reported_with_line_and_column() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"   ", b"not xml", b"\x00\x01", b"<robot/><robot/>"])
-def test_text_that_is_not_one_xml_document_is_an_error(data: bytes) -> None:
+def test_text_that_is_not_one_xml_document_is_an_error(data):
     assert failure(data).startswith("robot.urdf:1:")
 
 
@@ -56,14 +52,14 @@ BOMB = "".join(f'<!ENTITY i{n} "{f"&i{n - 1};" * 20 if n else "lol"}">' for n in
         f'<!DOCTYPE r [{BOMB}]><r a="&i9;"/>',
     ],
 )
-def test_a_doctype_is_an_error_and_entities_are_not_read(text: str, tmp_path: Path) -> None:
+def test_a_doctype_is_an_error_and_entities_are_not_read(text, tmp_path):
     (tmp_path / "secret").write_text("treasure")
     message = failure(text.replace("SECRET", str(tmp_path / "secret")).encode())
     assert "treasure" not in message
     assert "DOCTYPE" in message or "&i9;" not in text or "entity" in message.lower()
 
 
-def test_the_declared_encoding_is_respected() -> None:
+def test_the_declared_encoding_is_respected():
     data = '<?xml version="1.0" encoding="ISO-8859-1"?><robot name="é"/>'.encode("latin-1")
     assert parse_xml(data, "robot.urdf").get("name") == "é"
     assert parse_xml('<robot name="é"/>'.encode("utf-16"), "robot.urdf").get("name") == "é"
@@ -80,9 +76,7 @@ def test_the_declared_encoding_is_respected() -> None:
         (b"\n", []),
     ],
 )
-def test_invalid_xml_declarations_are_repaired_with_a_warning(
-    start: bytes, codes: list[str]
-) -> None:
+def test_invalid_xml_declarations_are_repaired_with_a_warning(start, codes):
     root, findings = parse_description(start + b'<robot name="\xc3\xa9"><l/></robot>', "r.urdf")
     assert root.get("name") == "é"
     assert [finding.code for finding in findings] == codes
@@ -90,7 +84,7 @@ def test_invalid_xml_declarations_are_repaired_with_a_warning(
     assert root[0].sourceline == start.count(b"\n") + 1
 
 
-def test_undeclared_prefixes_are_repaired() -> None:
+def test_undeclared_prefixes_are_repaired():
     uses = b'<drake:a/><l gazebo:b="1" name="x"/>' * 200
     text = b"<!-- <no:t> > --><?p ?><robot>" + uses + b"<last:c/></robot>"
     root, findings = parse_description(text, "r.urdf")
@@ -99,7 +93,7 @@ def test_undeclared_prefixes_are_repaired() -> None:
     assert [finding.why.split("'")[1] for finding in findings] == ["drake", "gazebo", "last"]
 
 
-def test_other_errors_are_found_despite_undeclared_prefixes() -> None:
+def test_other_errors_are_found_despite_undeclared_prefixes():
     with pytest.raises(FormatError, match="tag mismatch"):
         parse_description(b"<robot><drake:a></robot>", "r.urdf")
     with pytest.raises(FormatError, match="DOCTYPE"):
@@ -108,9 +102,7 @@ def test_other_errors_are_found_despite_undeclared_prefixes() -> None:
         )
 
 
-def described(
-    body: bytes = b"", name: bytes = b"r", before: bytes = b"", after: bytes = b""
-) -> bytes:
+def described(body=b"", name=b"r", before=b"", after=b""):
     return before + b'<robot name="' + name + b'">\n' + body + b'<link name="l"/></robot>' + after
 
 
@@ -154,9 +146,7 @@ def described(
         (described(b"<!foo>"), "r", "'<!foo>' was left out"),
     ],
 )
-def test_what_loaders_read_although_it_is_not_xml_is_read_with_a_warning(
-    data: bytes, name: str, repair: str
-) -> None:
+def test_what_loaders_read_although_it_is_not_xml_is_read_with_a_warning(data, name, repair):
     failure(data)
     root, (finding,) = parse_description(data, "robot.urdf")
     assert root.get("name") == name
@@ -167,14 +157,14 @@ def test_what_loaders_read_although_it_is_not_xml_is_read_with_a_warning(
     assert finding.where.startswith("robot.urdf:")
 
 
-def test_a_declared_encoding_counts_in_a_document_that_is_repaired() -> None:
+def test_a_declared_encoding_counts_in_a_document_that_is_repaired():
     text = '<?xml version="1.0" encoding="{}"?><robot name="{}"/><!-- a -- b -->'
     for encoding, name in (("ISO-8859-1", "é"), ("gb2312", "机器人"), ("utf-16", "é")):
         root, _ = parse_description(text.format(encoding, name).encode(encoding), "r.urdf")
         assert root.get("name") == name
 
 
-def test_repairs_of_a_kind_are_one_finding_with_a_count() -> None:
+def test_repairs_of_a_kind_are_one_finding_with_a_count():
     data = described(b"\n<!-- a -- b -->" * 3 + b" x & y ")
     _, (comments, ampersand) = parse_description(data, "r.urdf")
     assert "(3 times)" in comments.why
@@ -196,7 +186,7 @@ def test_repairs_of_a_kind_are_one_finding_with_a_count() -> None:
         b"<!-- a -- b -->",
     ],
 )
-def test_what_has_two_meanings_stays_an_error(data: bytes) -> None:
+def test_what_has_two_meanings_stays_an_error(data):
     with pytest.raises(FormatError, match=r"^robot.urdf:\d+:\d+: "):
         parse_description(data, "robot.urdf")
 
@@ -204,9 +194,7 @@ def test_what_has_two_meanings_stays_an_error(data: bytes) -> None:
 @pytest.mark.parametrize("fault", [b"<!-- a -- b -->", b"x & y", b'<a b="<"/>', b""])
 @pytest.mark.parametrize("doctype", [b"<!DOCTYPE r>", b'<!doctype r [<!ENTITY e "x">]>'])
 @pytest.mark.parametrize("place", ["before", "body", "after"])
-def test_a_doctype_is_an_error_beside_other_faults(
-    fault: bytes, doctype: bytes, place: str
-) -> None:
+def test_a_doctype_is_an_error_beside_other_faults(fault, doctype, place):
     pieces = {"before": b"", "body": b"", "after": b"", place: doctype}
     body = pieces.pop("body") + fault
     with pytest.raises(FormatError):

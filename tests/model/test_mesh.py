@@ -1,7 +1,5 @@
 """Loading meshes: formats, units, colours, caching, convex hulls and errors."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -20,27 +18,27 @@ from morphgen.model.robot import Link, Robot
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
 
 
-def dae(path: Path, unit: str = "1", up: str = "Z_UP", shift: str = "0 0 0") -> Path:
+def dae(path, unit="1", up="Z_UP", shift="0 0 0"):
     path.write_text(DAE.format(unit=unit, up=up, shift=shift))
     return path
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> Path:
+def box(tmp_path):
     path = tmp_path / "box.stl"
     trimesh.creation.box((0.2, 0.4, 0.6)).export(path)
     return path
 
 
 @pytest.fixture
-def data() -> Path:
+def data():
     import importlib.metadata
 
     return Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
 
 
 @pytest.mark.parametrize("suffix", ["stl", "ascii.stl", "STL", "obj", "ply", "glb", "dae"])
-def test_a_box_is_equal_in_every_format(suffix: str, tmp_path: Path) -> None:
+def test_a_box_is_equal_in_every_format(suffix, tmp_path):
     path = tmp_path / f"box.{suffix}"
     box = trimesh.creation.box((0.2, 0.4, 0.6))
     path.write_bytes(_exported(box, suffix))
@@ -52,19 +50,19 @@ def test_a_box_is_equal_in_every_format(suffix: str, tmp_path: Path) -> None:
     assert mesh.volume == pytest.approx(0.048)
 
 
-def _exported(mesh: trimesh.Trimesh, suffix: str) -> bytes:
+def _exported(mesh, suffix):
     kind = "stl_ascii" if suffix == "ascii.stl" else suffix.lower()
     data = mesh.export(file_type=kind)
     return data.encode() if isinstance(data, str) else bytes(data)
 
 
-def test_the_scale_is_applied_and_a_mirror_keeps_the_volume_positive(box: Path) -> None:
+def test_the_scale_is_applied_and_a_mirror_keeps_the_volume_positive(box):
     mesh = load_mesh(Mesh(box, (2.0, 1.0, -1.0)))
     np.testing.assert_allclose(mesh.extents, (0.4, 0.4, 0.6), atol=1e-7)
     assert mesh.volume == pytest.approx(0.096)
 
 
-def test_a_mesh_is_read_once_until_its_file_changes(box: Path) -> None:
+def test_a_mesh_is_read_once_until_its_file_changes(box):
     first = load_mesh(Mesh(box))
     assert load_mesh(Mesh(box)) is first
     trimesh.creation.box((1, 1, 1)).export(box)
@@ -73,9 +71,7 @@ def test_a_mesh_is_read_once_until_its_file_changes(box: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "dae"])
-def test_a_broken_mesh_is_read_once(
-    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_broken_mesh_is_read_once(suffix, tmp_path, monkeypatch):
     path, reads = tmp_path / f"broken.{suffix}", []
     path.write_text("v 0 0 nan\nf 1 1 1\n")
     read = mesh_files.read_mesh_file
@@ -86,9 +82,7 @@ def test_a_broken_mesh_is_read_once(
     assert len(reads) == 1
 
 
-def test_relative_paths_follow_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_relative_paths_follow_the_working_directory(tmp_path, monkeypatch):
     for name, size in (("a", 1.0), ("b", 2.0)):
         (tmp_path / name).mkdir()
         trimesh.creation.box((size,) * 3).export(tmp_path / name / "m.stl")
@@ -97,23 +91,23 @@ def test_relative_paths_follow_the_working_directory(
         assert load_mesh(Mesh(Path("m.stl"))).extents[0] == pytest.approx(size)
 
 
-def test_collada_units_are_applied_once(tmp_path: Path) -> None:
+def test_collada_units_are_applied_once(tmp_path):
     mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.001")))
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [0.001, 0.002, 0.003]], atol=1e-12)
 
 
 @pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
-def test_the_up_axis_of_collada_is_ignored(up: str, tmp_path: Path) -> None:
+def test_the_up_axis_of_collada_is_ignored(up, tmp_path):
     mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", up=up)))
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [1, 2, 3]])
 
 
-def test_the_scene_graph_is_applied_in_the_files_units(tmp_path: Path) -> None:
+def test_the_scene_graph_is_applied_in_the_files_units(tmp_path):
     mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.1", shift="10 0 0")))
     np.testing.assert_allclose(mesh.bounds, [[1, 0, 0], [1.1, 0.2, 0.3]], atol=1e-12)
 
 
-def test_a_file_has_one_part_per_colour(tmp_path: Path) -> None:
+def test_a_file_has_one_part_per_colour(tmp_path):
     path = dae(tmp_path / "m.dae")
     assert mesh_parts(path) == (MeshPart(RED, 1), MeshPart(BLUE, 3))
     red, blue, whole = (load_mesh(Mesh(path, part=part)) for part in (0, 1, None))
@@ -122,9 +116,7 @@ def test_a_file_has_one_part_per_colour(tmp_path: Path) -> None:
     assert red.area + blue.area == pytest.approx(whole.area)
 
 
-def test_obj_materials_are_parts_and_a_file_without_colour_has_none(
-    tmp_path: Path, box: Path
-) -> None:
+def test_obj_materials_are_parts_and_a_file_without_colour_has_none(tmp_path, box):
     (tmp_path / "m.mtl").write_text("newmtl r\nKd 1 0 0\nnewmtl b\nKd 0 0 1\nnewmtl r2\nKd 1 0 0\n")
     (tmp_path / "m.obj").write_text(
         "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -135,12 +127,12 @@ def test_obj_materials_are_parts_and_a_file_without_colour_has_none(
     assert mesh_parts(box) == (MeshPart(None, 12),)
 
 
-def test_an_unknown_part_is_an_error(box: Path) -> None:
+def test_an_unknown_part_is_an_error(box):
     with pytest.raises(MeshError, match="no part 1; valid: 0 to 0"):
         load_mesh(Mesh(box, part=1))
 
 
-def test_triangles_without_area_are_dropped(tmp_path: Path) -> None:
+def test_triangles_without_area_are_dropped(tmp_path):
     path = tmp_path / "m.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\nf 1 1 2\n")
     assert load_mesh(Mesh(path)).faces.shape == (1, 3)
@@ -162,9 +154,7 @@ def test_triangles_without_area_are_dropped(tmp_path: Path) -> None:
         ("a.step", b"x", "valid: .dae"),
     ],
 )
-def test_an_unreadable_file_is_an_error_that_names_it(
-    name: str, content: bytes, reason: str, tmp_path: Path
-) -> None:
+def test_an_unreadable_file_is_an_error_that_names_it(name, content, reason, tmp_path):
     path = tmp_path / name
     path.write_bytes(content)
     for read in (lambda: load_mesh(Mesh(path)), lambda: mesh_parts(path)):
@@ -175,18 +165,18 @@ def test_an_unreadable_file_is_an_error_that_names_it(
         assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error_that_names_it(tmp_path):
     with pytest.raises(MeshError, match=r"lost\.stl: no such file"):
         load_mesh(Mesh(tmp_path / "lost.stl"))
 
 
 @pytest.mark.parametrize("scale", [(0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0)])
-def test_a_degenerate_scale_is_an_error(scale: tuple[float, float, float], box: Path) -> None:
+def test_a_degenerate_scale_is_an_error(scale, box):
     with pytest.raises(MeshError, match="scale"):
         load_mesh(Mesh(box, scale))
 
 
-def test_a_hull_encloses_its_mesh_and_is_computed_once(tmp_path: Path) -> None:
+def test_a_hull_encloses_its_mesh_and_is_computed_once(tmp_path):
     path = tmp_path / "ring.stl"
     trimesh.creation.annulus(0.1, 0.2, 0.3).export(path)
     shape = convex_hull(Mesh(path))
@@ -197,7 +187,7 @@ def test_a_hull_encloses_its_mesh_and_is_computed_once(tmp_path: Path) -> None:
     assert shape.volume > load_mesh(Mesh(path)).volume
 
 
-def test_a_flat_mesh_has_no_hull(tmp_path: Path) -> None:
+def test_a_flat_mesh_has_no_hull(tmp_path):
     path = tmp_path / "flat.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     with pytest.raises(MeshError, match="flat"):
@@ -205,7 +195,7 @@ def test_a_flat_mesh_has_no_hull(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])
-def test_y_up_visuals_of_the_kinova_match_its_stls(part: str, data: Path) -> None:
+def test_y_up_visuals_of_the_kinova_match_its_stls(part, data):
     meshes = data / "kinova_description" / "meshes"
     assert "Y_UP" in (meshes / f"{part}.dae").read_text()
     np.testing.assert_allclose(
@@ -215,16 +205,14 @@ def test_y_up_visuals_of_the_kinova_match_its_stls(part: str, data: Path) -> Non
     )
 
 
-def test_the_kr210_visual_in_inches_has_the_size_of_its_collision(data: Path) -> None:
+def test_the_kr210_visual_in_inches_has_the_size_of_its_collision(data):
     meshes = data / "kuka_description" / "kuka_kr210" / "meshes" / "kr210l150"
     visual = load_mesh(Mesh(meshes / "visual" / "link_2.dae"))
     collision = load_mesh(Mesh(meshes / "collision" / "link_2.stl"))
     np.testing.assert_allclose(sorted(visual.extents), sorted(collision.extents), atol=1e-3)
 
 
-def test_a_collada_geometry_whose_material_is_broken_is_read_without_colours(
-    tmp_path: Path,
-) -> None:
+def test_a_collada_geometry_whose_material_is_broken_is_read_without_colours(tmp_path):
     path = dae(tmp_path / "m.dae")
     path.write_text(path.read_text().replace('-fx"/>', '-missing"/>'))
     assert mesh_parts(path) == (MeshPart(None, 4),)

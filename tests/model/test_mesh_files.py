@@ -1,13 +1,10 @@
 """Mesh files: what is read of each format, what is left out, and what is refused and why."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
 import struct
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,7 @@ from helpers.faulty_robots import with_shape
 from morphgen.checks import check
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh
-from morphgen.model.mesh_files import MeshContent, read_mesh_file
+from morphgen.model.mesh_files import read_mesh_file
 from morphgen.model.scene_files import MAX_PIXELS, read_picture
 
 CORNERS = [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)]
@@ -27,7 +24,7 @@ FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 """A tetrahedron."""
 
 
-def read(folder: Path, name: str, content: str | bytes | dict[str, Any]) -> MeshContent:
+def read(folder, name, content):
     if isinstance(content, dict):
         content = json.dumps(content)
     data = content.encode() if isinstance(content, str) else content
@@ -35,16 +32,16 @@ def read(folder: Path, name: str, content: str | bytes | dict[str, Any]) -> Mesh
     return read_mesh_file(folder / name)
 
 
-def count(content: MeshContent) -> int:
+def count(content):
     return sum(len(faces) for _, (_, faces) in content.pieces)
 
 
-def volume(content: MeshContent) -> float:
+def volume(content):
     corners = np.concatenate([vertices[faces] for _, (vertices, faces) in content.pieces])
     return float(np.linalg.det(corners).sum() / 6)
 
 
-def binary_stl(faces: int = 4, stated: int | None = None) -> bytes:
+def binary_stl(faces=4, stated=None):
     rows = [
         struct.pack("<12fH", 0, 0, 0, *(x for corner in FACES[i % 4] for x in CORNERS[corner]), 0)
         for i in range(faces)
@@ -52,7 +49,7 @@ def binary_stl(faces: int = 4, stated: int | None = None) -> bytes:
     return bytes(80) + struct.pack("<I", faces if stated is None else stated) + b"".join(rows)
 
 
-def ascii_stl(faces: list[int], name: str = "a", end: bool = True) -> str:
+def ascii_stl(faces, name="a", end=True):
     lines = [f"solid {name}"]
     for i in faces:
         corners = "\n".join("vertex {} {} {}".format(*CORNERS[k]) for k in FACES[i])
@@ -97,7 +94,7 @@ def accessor(index: int, **changes: Any) -> dict[str, Any]:
     return document
 
 
-def picture(size: tuple[int, int] = (2, 2), colour: str = "lime") -> bytes:
+def picture(size=(2, 2), colour="lime"):
     stream = io.BytesIO()
     Image.new("RGB", size, colour).save(stream, "PNG")
     return stream.getvalue()
@@ -111,7 +108,7 @@ def dae(**changes: str) -> str:
     return text
 
 
-def dae_with(primitive: str) -> str:
+def dae_with(primitive):
     first, rest = dae().split("<triangles", 1)
     return first + primitive + rest.split("</triangles>")[-1]
 
@@ -151,7 +148,7 @@ SKIN = """<library_controllers><controller id="c"><skin source="#g">
         ("strips.dae", dae_with(f'<tristrips count="1">{INPUT}<p>0 2 1 3 0 2</p></tristrips>')),
     ],
 )  # fmt: skip
-def test_every_form_of_a_tetrahedron_is_read_whole(name: str, content: Any, tmp_path: Path) -> None:
+def test_every_form_of_a_tetrahedron_is_read_whole(name, content, tmp_path):
     mesh = read(tmp_path, name, content)
     assert count(mesh) == 4
     assert mesh.left_out == ()
@@ -170,16 +167,14 @@ def test_every_form_of_a_tetrahedron_is_read_whole(name: str, content: Any, tmp_
     ],
 )  # fmt: skip
 def test_polygons_of_a_ply_are_triangles_and_the_rest_is_counted(
-    rows: list[str], elements: list[str], triangles: int, notes: tuple[str, ...], tmp_path: Path
-) -> None:
+    rows, elements, triangles, notes, tmp_path
+):
     mesh = read(tmp_path, "m.ply", ply([*PLY_POINTS, *rows], PLY_VERTICES, *elements))
     assert (count(mesh), mesh.left_out) == (triangles, notes)
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
-def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(
-    order: str, tmp_path: Path
-) -> None:
+def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(order, tmp_path):
     code = "<" if order == "little" else ">"
     header = ply(
         [],
@@ -205,9 +200,7 @@ def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(
                 "morph targets, whose mesh is drawn at rest")),
     ],
 )  # fmt: skip
-def test_a_skin_or_morph_of_a_collada_file_is_read_at_rest(
-    instance: str, notes: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_skin_or_morph_of_a_collada_file_is_read_at_rest(instance, notes, tmp_path):
     text = dae(
         skin=("<library_visual_scenes>", SKIN),
         node=("</visual_scene>", f'<node><instance_controller url="#{instance}"/></node>'
@@ -262,7 +255,7 @@ NOTED = {
 
 
 @pytest.mark.parametrize("name", NOTED)
-def test_what_is_left_out_is_counted_and_is_a_finding(name: str, tmp_path: Path) -> None:
+def test_what_is_left_out_is_counted_and_is_a_finding(name, tmp_path):
     content, note = NOTED[name]
     mesh = read(tmp_path, name, content)
     assert count(mesh) == 4
@@ -286,7 +279,7 @@ BLUE, GREEN = (0.2, 0.4, 0.6, 1.0), (0.0, 1.0, 0.0, 1.0)
         ("Tr 1", 255), ("Tr 0", 255), ("d x", 255), ("d 7", 255),
     ],
 )  # fmt: skip
-def test_the_opacity_of_a_material_is_read(properties: str, alpha: int, tmp_path: Path) -> None:
+def test_the_opacity_of_a_material_is_read(properties, alpha, tmp_path):
     (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 0.2 0.4 0.6\n{properties}\nnewmtl b\nKd 0 1 0\n")
     mesh = read(tmp_path, "e_d_alpha.obj", "mtllib m.mtl\n" + OBJ)
     assert {rgba for rgba, _ in mesh.pieces} == {(*BLUE[:3], alpha / 255), GREEN}
@@ -295,7 +288,7 @@ def test_the_opacity_of_a_material_is_read(properties: str, alpha: int, tmp_path
 @pytest.mark.parametrize(
     "libraries", ["mtllib a.mtl\nmtllib b c.mtl\n", "mtllib a.mtl x.mtl\nmtllib b c.mtl\n"]
 )
-def test_all_material_files_are_read(libraries: str, tmp_path: Path) -> None:
+def test_all_material_files_are_read(libraries, tmp_path):
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.2 0.4 0.6")
     (tmp_path / "b c.mtl").write_text("newmtl b\nKd 0 1 0\n")
     mesh = read(tmp_path, "m.obj", libraries + OBJ)
@@ -316,9 +309,7 @@ def test_all_material_files_are_read(libraries: str, tmp_path: Path) -> None:
          "not a picture"),
     ],
 )  # fmt: skip
-def test_without_its_texture_a_material_has_its_own_colour(
-    name: str, content: bytes | None, reason: str, tmp_path: Path
-) -> None:
+def test_without_its_texture_a_material_has_its_own_colour(name, content, reason, tmp_path):
     (tmp_path / "f").mkdir()
     if content is not None:
         (tmp_path / "f" / name).write_bytes(content)
@@ -344,7 +335,7 @@ def test_without_its_texture_a_material_has_its_own_colour(
         assert reason in notes[0]
 
 
-def test_a_texture_of_65_megapixels_is_refused_without_a_warning(tmp_path: Path) -> None:
+def test_a_texture_of_65_megapixels_is_refused_without_a_warning(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(picture((13000, 13000)))
     with warnings.catch_warnings():
@@ -353,7 +344,7 @@ def test_a_texture_of_65_megapixels_is_refused_without_a_warning(tmp_path: Path)
             read_picture(path)
 
 
-def many_nodes() -> dict[str, Any]:
+def many_nodes():
     return gltf(nodes=[{"mesh": 0}] * 6000, scenes=[{"nodes": [*range(6000)]}])
 
 
@@ -458,7 +449,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_refused_file_is_named_with_the_true_reason(name: str, tmp_path: Path) -> None:
+def test_a_refused_file_is_named_with_the_true_reason(name, tmp_path):
     content, reason = REFUSED[name]
     with pytest.raises(MeshError, match=reason) as caught:
         read(tmp_path, name, content)

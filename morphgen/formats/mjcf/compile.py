@@ -60,8 +60,8 @@ def compile_document(
         except _REFUSALS as error:
             raise document.error(f"not MJCF that MuJoCo reads: {error}") from error
         _require_bounded(spec, document)
-        spec.compiler.fusestatic = False
-        spec.compiler.discardvisual = False
+        spec.compiler.fusestatic = False  # links on fixed joints stay bodies
+        spec.compiler.discardvisual = False  # a robot has its visual shapes
         # The length ranges of muscles, which a robot does not have, take long simulations.
         spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE
         faces_left = MAX_FACES
@@ -87,6 +87,7 @@ def compile_document(
             model = spec.compile()
         except _REFUSALS as error:
             raise document.error(f"MuJoCo cannot compile it: {error}") from error
+    # MuJoCo compiles NaN and numbers whose products overflow.
     for array in _ARRAYS:
         values = getattr(model, array)
         if not (np.abs(values) <= MAX_NUMBER).all():

@@ -124,7 +124,7 @@ def read_document(path: Path, finder: PackageFinder, *, with_options: bool = Fal
     """
     includes = _Includes(path, finder)
     root, findings = includes.read(path, 0)
-    etree.cleanup_namespaces(root)
+    etree.cleanup_namespaces(root)  # declarations that no name uses are harmless
     _require_few_elements(root, path)
     if not with_options:
         for element in [*root.iterchildren("option")]:
@@ -132,6 +132,7 @@ def read_document(path: Path, finder: PackageFinder, *, with_options: bool = Fal
     for field in root.iterfind("asset/hfield"):
         field.set("name", field.get("name") or PurePosixPath(field.get("file", "")).stem)
         _drop(field, "file", "content_type", "elevation")
+        # Without a file MuJoCo needs sizes; the smallest ones take no memory.
         field.set("nrow", "2")
         field.set("ncol", "2")
     for element in root.iter("material", "light"):
@@ -306,7 +307,7 @@ def _copies(replicate: etree._Element, path: Path) -> int:
             raise FormatError(
                 f"{path}: <replicate> has count {text!r}; expected a whole number of at least 1"
             )
-        copies *= int(text[:12])
+        copies *= int(text[:12])  # int() refuses texts of more than 4,300 digits
     return copies
 
 

@@ -65,7 +65,7 @@ class Meshes:
                 continue
             triangles = convex_hull(mesh) if collision else load_mesh(mesh)
             vertices = np.asarray(triangles.vertices, dtype=np.float64)
-            missing = max(0, 4 - len(vertices))
+            missing = max(0, 4 - len(vertices))  # MuJoCo refuses meshes of fewer than four vertices
             spec.add_mesh(
                 name=name,
                 uservert=np.concatenate([vertices, vertices[:1].repeat(missing, 0)]).ravel(),
@@ -267,6 +267,7 @@ def _write_inertial(body: etree._Element, link: Link) -> None:
     xx, xy, xz, yy, yz, zz = link.inertial.inertia
     mass = join([link.inertial.mass], zero=0)
     inertial = etree.SubElement(body, "inertial", pos=join(link.inertial.com), mass=mass)
+    # Inertia of fingers is far below the zero of lengths.
     off_diagonal = join([xy, xz, yz], zero=1e-18)
     diagonal = join([xx, yy, zz], zero=1e-18)
     if off_diagonal == "0 0 0":
@@ -329,6 +330,7 @@ def _write_home(root: etree._Element, robot: Robot, world: etree._Element) -> No
     positions = {robot.joints[k].name: q for k, q in zip(robot.movable_joints, values, strict=True)}
     key = etree.SubElement(etree.SubElement(root, "keyframe"), "key", name="home")
     if positions:
+        # MuJoCo's qpos is in the order of the document, depth first, and not in the robot's.
         key.set("qpos", join(positions[joint.get("name", "")] for joint in world.iter("joint")))
     if robot.home:
         key.set("ctrl", join(robot.home))

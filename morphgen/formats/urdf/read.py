@@ -297,6 +297,7 @@ def _topological(joints: list[Joint], links: Mapping[str, Link]) -> list[Joint]:
     for joint in joints:
         children.setdefault(joint.parent, []).append(joint)
     ordered: list[Joint] = []
+    # Popped in the order of the file.
     stack = list(reversed(children.get(_root_name(links, joints), [])))
     while stack:
         joint = stack.pop()
@@ -401,6 +402,7 @@ def _inertial(element: etree._Element | None) -> Inertial | None:
     if T.quaternion == IDENTITY.quaternion:
         return inertial
     R = T.matrix[:3, :3]
+    # The file gives it in the axes of the origin, a robot in those of the link.
     return Inertial.from_matrix(mass, T.position, np.asarray(R @ inertial.matrix @ R.T))
 
 
@@ -425,6 +427,7 @@ def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | 
         case "cylinder":
             geometry = Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
         case _:
+            # One factor is for all three axes.
             x, *rest = _numbers(element.get("scale", "")) or [1.0]
             y, z = rest[:2] or (x, x)
             return Mesh(meshes[element.get("filename", "")], (x, y, z))

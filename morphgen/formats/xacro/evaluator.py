@@ -70,7 +70,7 @@ def size_of(value: object) -> int:
 def checked(value: object) -> object:
     """Return a value unchanged if it is small enough."""
     if isinstance(value, int):
-        if value.bit_length() > MAX_BITS:
+        if value.bit_length() > MAX_BITS:  # not of its text, whose conversion takes quadratic time
             raise RefusedError(f"a whole number has more than {MAX_BITS} bits")
     elif isinstance(value, str | list | tuple | dict):
         size_of(value)
@@ -243,7 +243,7 @@ _CALLS: Mapping[str, Callable[..., object]] = {
     "int": int,
     "len": len,
     "list": list,
-    "max": lambda *items: max(*items),
+    "max": lambda *items: max(*items),  # without key=, which would call a function uncounted
     "min": lambda *items: min(*items),
     "range": _range,
     "reversed": _as_list(reversed),

@@ -107,6 +107,7 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
 
     for unit in units:
         Loader.add_constructor(unit.value.tag, unit.constructor)
+    # Sets and bytes are no data of an expression, and size_of does not count them.
     for tag in ("set", "binary"):
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", _refuse_tag)
     try:
@@ -318,6 +319,7 @@ def _load_package() -> CodeType:
     sys.modules[_NAME] = module
     writer = minidom.Element.writexml
     private.loader.exec_module(module)
+    # The import of xacro 2.1.1 replaces minidom's writer for the whole process.
     minidom.Element.writexml = writer  # type: ignore[method-assign]
     sys.modules[f"{_NAME}.color"].print = _record  # type: ignore[attr-defined]
     body = spec.loader.get_code("xacro")
@@ -441,6 +443,7 @@ def limit_process(cpu: int, memory: int) -> None:
     except ImportError:  # Windows: the parent's WALL_LIMIT remains
         return
     limits = (
+        # The second limit kills a process that survives the signal of the first.
         (resource.RLIMIT_CPU, cpu, cpu + 1),
         (resource.RLIMIT_AS, memory, memory),
         (resource.RLIMIT_FSIZE, 0, 0),
@@ -586,7 +589,7 @@ class Expansion:
         try:
             data = self._read(filename, including)
         except OSError as error:
-            files.pop()
+            files.pop()  # xacro has pushed the file, and pops it after a successful parse only
             missing = OSError(f"cannot include {filename}: {error.strerror}")
             raise self.engine.XacroException(exc=missing) from error
         return self._parse(data, filename)
