@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-import morphgen
 from helpers.robots import arm, rod
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf.write import FLAT_THICKNESS, mjcf_text, to_spec
-from morphgen.model.dynamics import MIN_ROTATIONAL_INERTIA, actuation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
@@ -140,27 +138,6 @@ def test_mimic_joints_follow_through_chains():
     assert model.eq_data[:, :3] == pytest.approx(np.array([[0.2, -0.5, 0], [0.5, -1.0, 0]]))
 
 
-def test_massless_moving_links_compile_and_add_no_mass():
-    links = (Link("root"), Link("x"), Link("y"), rod("tip"), Link("leaf"))
-    joints = (
-        Joint("x", "prismatic", "root", "x", axis=(1, 0, 0), limits=(-1.0, 1.0)),
-        Joint("y", "prismatic", "x", "y", axis=(0, 1, 0), limits=(-1.0, 1.0)),
-        Joint("tip", "revolute", "y", "tip", axis=(0, 1, 0), limits=(-1.0, 1.0)),
-        Joint("leaf", "revolute", "tip", "leaf", axis=(0, 1, 0), limits=(-1.0, 1.0)),
-    )
-    robot = Robot("gantry", links, joints, home=(0.0,) * 4)
-    model = compiled(robot)
-    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
-    added = [gain.armature for gain in actuation(robot)]
-    assert added[3] == pytest.approx(MIN_ROTATIONAL_INERTIA)
-    assert model.dof_armature == pytest.approx(added)
-    data = mujoco.MjData(model)
-    for _ in range(100):
-        mujoco.mj_step(model, data)
-    assert np.isfinite(data.qpos).all()
-    assert data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
-
-
 def test_a_root_named_world_is_the_world_body():
     robot = hinged(rod("rod"))
     joint = replace(robot.joints[0], parent="world")
@@ -245,17 +222,3 @@ def test_a_mesh_with_more_faces_than_mujoco_reads_from_stl(tmp_path):
     assert len(sphere.faces) > 200_000
     path = export(sphere, tmp_path / "sphere.stl")
     assert to_spec(meshed(path, collision=False)).compile().nmeshface == len(sphere.faces)
-
-
-@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3"])
-def test_actuators_hold_home_for_three_seconds(request_, tmp_path):
-    folder = morphgen.write(morphgen.compose(request_), tmp_path, picture=False)
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
-    mujoco.mj_forward(model, data)
-    assert data.ncon == 0
-    start = data.site("tool").xpos.copy()
-    for _ in range(int(3.0 / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-    assert np.linalg.norm(data.site("tool").xpos - start) < 1e-3

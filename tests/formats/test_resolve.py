@@ -137,18 +137,6 @@ def test_ros_environment_is_searched_after_given_roots(tmp_path, urdf, monkeypat
     assert resolve_uri("package://one/a.stl", urdf, default_finder([tmp_path / "mine"])) == mine
 
 
-@pytest.mark.parametrize(
-    "uri",
-    [
-        "package://ur_description/meshes/ur5/collision/base.stl",
-        "package://example-robot-data/robots/z1_description/meshes/visual/z1_Link00.dae",
-        "package://z1_description/meshes/visual/z1_Link00.dae",
-    ],
-)
-def test_the_data_packages_are_found_from_anywhere(uri, urdf):
-    assert resolve_uri(uri, urdf, default_finder()).is_file()
-
-
 def test_distribution_files_are_found_and_missing_ones_are_errors(monkeypatch):
     path = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
     assert path.is_absolute()

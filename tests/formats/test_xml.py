@@ -14,13 +14,6 @@ def failure(data):
     return message
 
 
-def test_the_root_element_keeps_the_order_of_attributes():
-    root = parse_xml(b'<robot name="a" version="1"><link name="l"/></robot>', "robot.urdf")
-    assert root.tag == "robot"
-    assert list(root.attrib) == ["name", "version"]
-    assert [child.tag for child in root] == ["link"]
-
-
 def test_comments_and_processing_instructions_are_removed():
     root = parse_xml(b"<?p q?><robot><!-- a --><link/><?x y?>te<!-- b -->xt</robot>", "robot.urdf")
     assert [child.tag for child in root] == ["link"]

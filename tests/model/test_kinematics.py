@@ -73,14 +73,6 @@ def test_reach_of_an_arm_does_not_depend_on_its_mount(mount):
     assert reach(mounted) > 1.1
 
 
-def test_random_configurations_are_within_the_limits():
-    robot = arm()
-    q = random_configurations(robot, 1000, np.random.default_rng(0))
-    limits = joint_limits(robot)
-    assert (q >= limits[:, 0]).all()
-    assert (q <= limits[:, 1]).all()
-
-
 def test_unwrapped_configurations_are_nearest_to_the_reference():
     body = compose("arm=ur5 ee=plane")
     rng = np.random.default_rng(0)

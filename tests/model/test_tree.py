@@ -1,4 +1,4 @@
-"""Scaling links with the joints, frames and shapes on them."""
+"""Validation of ``Robot``, and edits of its tree: cut, renamed and scaled."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +11,8 @@ from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import inertial_from_density
 from morphgen.model.kinematics import forward_kinematics, frame_pose
-from morphgen.model.robot import Link
-from morphgen.model.tree import scale_links
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.tree import rename, scale_links, subtree
 
 STRAIGHT = np.zeros(4)
 
@@ -111,3 +111,41 @@ def test_equal_factors_need_no_faces():
     factors = dict.fromkeys((link.name for link in arm().links), 1.3)
     assert scale_links(arm(), factors, FACES).joints == scale_links(arm(), factors).joints
     assert scale_links(arm(), {}, FACES).joints == arm().joints
+
+
+AB, FIXED = (Link("a"), Link("b")), Joint("j", "fixed", "a", "b")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Robot("r", ()), "robot 'r' has no links"),
+        (lambda: Robot("r", (AB[0],) * 2, (FIXED,)), "two links are named 'a'"),
+        (lambda: Robot("r", AB), "2 links need 1 joints, not 0"),
+        (lambda: Robot("r", AB, (Joint("j", "fixed", "b", "a"),)), "topological order"),
+        (lambda: replace(arm(), home=(0.0,)), "home has 1 values for 4 joints"),
+        (lambda: replace(arm(), frames=(Frame("tool", "uper"),)), "did you mean 'upper'"),
+        (lambda: arm().link("uper"), "no link 'uper'; did you mean 'upper'"),
+        (lambda: arm().frame("tol"), "no frame 'tol'; did you mean 'tool'"),
+        (lambda: Robot("r", AB, (replace(FIXED, mimic=Mimic("no")),)), "mimics 'no', an unknown"),
+        (lambda: Robot("r", AB, (replace(FIXED, mimic=Mimic("j")),)), "j -> j"),
+        (lambda: subtree(arm(), "lower", without=["left"]), "mimics 'left', which is not in"),
+    ],
+)
+def test_contradictions_are_errors(make, message):
+    with pytest.raises(RobotError, match=message):
+        make()
+
+
+def test_subtree_keeps_home_frames_and_mimics():
+    part = subtree(arm(), "lower")
+    assert [link.name for link in part.links] == ["lower", "slider", "left", "right"]
+    assert part.home == (0.01, 0.02)
+    assert part.frame("tool").link == "slider"
+
+
+def test_renaming_updates_every_reference():
+    robot = rename(arm(), {"slider": "s"}, {"left": "l"})
+    assert robot.frame("tool").link == "s"
+    assert robot.joints[-1].mimic == Mimic("l", -1.0, 0.0)
+    assert robot.joints[-1].parent == "s"
