@@ -59,25 +59,18 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
         gap = _gap(visuals[ancestor], visuals[i], T_ancestor_link)
         millimetres = f"{1000 * gap:.3g}"
         if float(millimetres) > 1000 * MAX_GAP:  # as it is printed: 5 mm are not more than 5 mm
-            yield Finding(
-                "links-apart",
-                "warning",
-                f"links {robot.links[ancestor].name}, {link.name}",
-                f"at home their visual shapes are {millimetres} mm apart",
-                "correct the origin of the joint between them or of a mesh, or a mesh's scale",
-            )
+            where = f"links {robot.links[ancestor].name}, {link.name}"
+            why = f"at home their visual shapes are {millimetres} mm apart"
+            fix = "correct the origin of the joint between them or of a mesh, or a mesh's scale"
+            yield Finding("links-apart", "warning", where, why, fix)
 
 
 def check_self_collision(robot: Robot) -> Iterator[Finding]:
     """Find pairs of links that penetrate each other at home."""
     for (a, b), depth in sorted(home_penetrations(robot).items()):
-        yield Finding(
-            "self-collision",
-            "warning",
-            f"links {a}, {b}",
-            f"at home they penetrate each other by {1000 * depth:.3g} mm",
-            "move home, or ignore the pair if the overlap is by design",
-        )
+        why = f"at home they penetrate each other by {1000 * depth:.3g} mm"
+        fix = "move home, or ignore the pair if the overlap is by design"
+        yield Finding("self-collision", "warning", f"links {a}, {b}", why, fix)
 
 
 def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:

@@ -43,15 +43,12 @@ def _axis_faults(joint: Joint) -> Iterator[_Fault]:
     if not is_axis_valid(joint):
         yield "axis-invalid", "error", f"{axis} has no direction", "write a unit vector", ""
     elif not is_axis_unit(joint):
-        prismatic = joint.kind == "prismatic"
-        yield (
-            "axis-not-unit",
-            "error" if prismatic else "warning",
-            f"{axis} is {math.hypot(*joint.axis):.4g} long"
-            + ("; PyBullet moves it that many times as far" if prismatic else ""),
-            "scale the axis to unit length, as the repair does",
-            f"the axis {joint.axis} was scaled to unit length",
-        )
+        severity: Severity = "error" if joint.kind == "prismatic" else "warning"
+        effect = "; PyBullet moves it that many times as far" if severity == "error" else ""
+        why = f"{axis} is {math.hypot(*joint.axis):.4g} long{effect}"
+        fix = "scale the axis to unit length, as the repair does"
+        repair = f"the axis {joint.axis} was scaled to unit length"
+        yield "axis-not-unit", severity, why, fix, repair
 
 
 def _limit_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
@@ -59,45 +56,31 @@ def _limit_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
     limits = joint.limits
     if joint.kind == "continuous":
         if limits is not None:
-            yield (
-                "limits-on-continuous",
-                "warning",
-                f"it is continuous but has limits {limits}, which PyBullet reports and MuJoCo "
-                "drops",
-                "make it revolute if the limits are real; the repair drops them",
-                f"its limits {limits} were dropped: it is continuous",
-            )
+            effect = "which PyBullet reports and MuJoCo drops"
+            why = f"it is continuous but has limits {limits}, {effect}"
+            fix = "make it revolute if the limits are real; the repair drops them"
+            repair = f"its limits {limits} were dropped: it is continuous"
+            yield "limits-on-continuous", "warning", why, fix, repair
         return
     if limits is None or not all(map(math.isfinite, limits)):
         given = "without limits" if limits is None else f"with limits {limits}"
-        yield (
-            "limits-missing",
-            "error",
-            f"it is {joint.kind} {given}: PyBullet refuses the file, MuJoCo lets it move without "
-            "end",
-            "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
-            "",
-        )
+        effect = "PyBullet refuses the file, MuJoCo lets it move without end"
+        fix = "write limits" + (", or make it continuous" if joint.kind == "revolute" else "")
+        yield "limits-missing", "error", f"it is {joint.kind} {given}: {effect}", fix, ""
         return
     lower, upper = sorted(limits)
     span, unit = upper - lower, "m" if joint.kind == "prismatic" else "rad"
     widest = PRISMATIC_SPAN if joint.kind == "prismatic" else REVOLUTE_SPAN
     if has_inverted_limits(joint):
-        yield (
-            "limits-inverted",
-            "error",
-            f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits",
-            "swap the limits, as the repair does",
-            f"its limits were swapped to {lower:g} to {upper:g}",
-        )
+        why = f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits"
+        fix = "swap the limits, as the repair does"
+        repair = f"its limits were swapped to {lower:g} to {upper:g}"
+        yield "limits-inverted", "error", why, fix, repair
     if span == 0:
-        yield (
-            "limits-empty",
-            "error",
-            f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it",
-            "write the real limits, or make the joint fixed, as the repair does at zero",
-            "it was made fixed: both limits are 0" if is_locked(robot, joint) else "",
-        )
+        why = f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it"
+        fix = "write the real limits, or make the joint fixed, as the repair does at zero"
+        repair = "it was made fixed: both limits are 0" if is_locked(robot, joint) else ""
+        yield "limits-empty", "error", why, fix, repair
     if span > widest:
         why = f"its limits span {span:g} {unit}, more than {widest:.4g} {unit}"
         yield "limits-wide", "warning", why, f"check the unit of the limits ({unit})", ""
@@ -113,13 +96,10 @@ def _drive_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
         ("velocity", joint.velocity, DEFAULT_VELOCITY, units[1], ""),
     ):
         if is_driven and not is_positive(value):
-            yield (
-                f"{name}-missing",
-                "warning",
-                (f"it has no {name}" if value is None else f"its {name} is {value:g}") + effect,
-                f"write its largest {name}; the repair takes {default:g} {unit}",
-                f"its {name} was set to {default:g} {unit}",
-            )
+            why = (f"it has no {name}" if value is None else f"its {name} is {value:g}") + effect
+            fix = f"write its largest {name}; the repair takes {default:g} {unit}"
+            repair = f"its {name} was set to {default:g} {unit}"
+            yield f"{name}-missing", "warning", why, fix, repair
     for name, value in (("damping", joint.damping), ("friction", joint.friction)):
         if not value >= 0 or math.isinf(value):
             fix = "write a finite number of at least 0"
@@ -130,13 +110,10 @@ def _home_faults(joint: Joint, position: float) -> Iterator[_Fault]:
     """Find a home position outside the limits."""
     lower, upper = position_range(joint)
     if not (math.isfinite(position) and lower <= position <= upper):
-        yield (
-            "home-outside-limits",
-            "error",
-            f"home is {position:g}, its limits are {lower:g} to {upper:g}",
-            "move home between the limits, as the repair does",
-            f"its home was moved from {position:g} to the nearest limit",
-        )
+        why = f"home is {position:g}, its limits are {lower:g} to {upper:g}"
+        fix = "move home between the limits, as the repair does"
+        repair = f"its home was moved from {position:g} to the nearest limit"
+        yield "home-outside-limits", "error", why, fix, repair
 
 
 def _mimic_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
@@ -149,13 +126,9 @@ def _mimic_faults(robot: Robot, joint: Joint) -> Iterator[_Fault]:
         yield "mimic-on-fixed", "warning", f"it is fixed but mimics {mimic.joint}", fix, ""
         return
     if not robot.joints[robot.joint_index[mimic.joint]].is_movable:
-        yield (
-            "mimic-leader-fixed",
-            "error",
-            f"it mimics {mimic.joint}, which is fixed: loaders disagree whether it moves",
-            "make it fixed, let it move by itself or name another leader",
-            "",
-        )
+        why = f"it mimics {mimic.joint}, which is fixed: loaders disagree whether it moves"
+        fix = "make it fixed, let it move by itself or name another leader"
+        yield "mimic-leader-fixed", "error", why, fix, ""
     if not (math.isfinite(mimic.multiplier) and math.isfinite(mimic.offset)):
         why = f"its position is {mimic.multiplier} q + {mimic.offset}, which is not finite"
         yield "mimic-invalid", "error", why, "write a finite multiplier and offset", ""
@@ -178,14 +151,10 @@ def check_mimic_range(robot: Robot) -> Iterator[Finding]:
         low, high = sorted(gain * q + float(offset[row]) for q in position_range(leader))
         slack = MIMIC_RANGE_TOLERANCE * (upper - lower)
         if low < lower - slack or high > upper + slack:
-            yield Finding(
-                "mimic-range",
-                "warning",
-                f"joint {follower.name}",
-                f"joint {leader.name} drives it from {low:.4g} to {high:.4g}; its limits are "
-                f"{lower:.4g} to {upper:.4g}",
-                "widen its limits, or narrow its leader's",
-            )
+            driven = f"joint {leader.name} drives it from {low:.4g} to {high:.4g}"
+            why = f"{driven}; its limits are {lower:.4g} to {upper:.4g}"
+            fix = "widen its limits, or narrow its leader's"
+            yield Finding("mimic-range", "warning", f"joint {follower.name}", why, fix)
 
 
 def is_axis_valid(joint: Joint) -> bool:

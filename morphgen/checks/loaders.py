@@ -110,9 +110,8 @@ def unit_density_inertial(link: Link) -> Inertial | None:
 
 def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Finding]:
     if not mesh.path.is_file():
-        yield Finding(
-            "mesh-unresolved", "error", where, f"{mesh.path}: no such file", "correct the mesh path"
-        )
+        why, fix = f"{mesh.path}: no such file", "correct the mesh path"
+        yield Finding("mesh-unresolved", "error", where, why, fix)
         return
     name = mesh.path.name
     if not is_scale_valid(mesh):

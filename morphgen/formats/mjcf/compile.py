@@ -96,7 +96,10 @@ def compile_document(
                 f"{array} of the compiled model has the value {worst:g}; expected numbers up to "
                 f"{MAX_NUMBER:g}"
             )
-    return spec, model, tuple(_warning(text, document) for text in dict.fromkeys(warnings))
+    where, fix = f"{document.path.name}: document", "change the MJCF as MuJoCo says"
+    texts = (f"MuJoCo warns: {' '.join(text.split())}" for text in dict.fromkeys(warnings))
+    findings = tuple(Finding("mujoco-warning", "warning", where, text, fix) for text in texts)
+    return spec, model, findings
 
 
 def _require_bounded(spec: mujoco.MjSpec, document: MjcfDocument) -> None:
@@ -124,16 +127,6 @@ def _require_bounded(spec: mujoco.MjSpec, document: MjcfDocument) -> None:
             raise document.error(
                 f"asset {asset.name!r} has the file {asset.file!r} by a default; name it in <asset>"
             )
-
-
-def _warning(text: str, document: MjcfDocument) -> Finding:
-    return Finding(
-        "mujoco-warning",
-        "warning",
-        f"{document.path.name}: document",
-        f"MuJoCo warns: {' '.join(text.split())}",
-        "change the MJCF as MuJoCo says",
-    )
 
 
 ELLIPSOID_SUBDIVISIONS = 2

@@ -206,10 +206,8 @@ def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> 
         try:
             found[uri] = _find_mesh(uri, root, path, finder)
         except FormatError as error:
-            where = f"{path}:{element.sourceline}"
-            missing[uri] = Finding(
-                "mesh-unresolved", "error", where, str(error), f"correct the mesh path, {SKIP_HINT}"
-            )
+            where, fix = f"{path}:{element.sourceline}", f"correct the mesh path, {SKIP_HINT}"
+            missing[uri] = Finding("mesh-unresolved", "error", where, str(error), fix)
     if missing and not finder.skip_missing:
         raise UnsoundError(str(path), list(missing.values()))
     skipped = 0
@@ -224,10 +222,8 @@ def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> 
         names = ", ".join(repr(shortened(uri)) for uri in [*missing][:5])
         repair = f"{skipped} shapes were left out, because {len(missing)} meshes are missing"
         first = next(iter(missing.values()))
-        fix = "give the meshes, and import the file again"
-        findings.append(
-            Finding("mesh-skipped", "warning", first.where, first.why, fix, f"{repair}: {names}")
-        )
+        fix, repair = "give the meshes, and import the file again", f"{repair}: {names}"
+        findings.append(Finding("mesh-skipped", "warning", first.where, first.why, fix, repair))
     files = {uri: file.path for uri, file in found.items()}
     require_bounded_files(files.values(), str(path))
     return _Meshes(files, packages, findings)
