@@ -324,11 +324,14 @@ def _ply_pieces(
     require_faces(len(triangles))
     if not len(triangles):
         raise ValueError(f"holds {len(vertices)} vertices and no triangle")
-    colours = {
-        "vertex_colors": _ply_colours(vertex, len(vertices)),
-        "face_colors": _ply_colours(face, len(triangles)),
-    }
-    return _pieces(trimesh.Trimesh(vertices, triangles, process=False, **colours))
+    mesh = trimesh.Trimesh(
+        vertices,
+        triangles,
+        face_colors=_ply_colours(face, len(triangles)),
+        vertex_colors=_ply_colours(vertex, len(vertices)),
+        process=False,
+    )
+    return _pieces(mesh)
 
 
 def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:
