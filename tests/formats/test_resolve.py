@@ -44,6 +44,7 @@ def urdf(tmp_path):
         ("arm_description/a.stl", "package://other_name/a.stl"),  # by its package.xml
         ("hand_description/a.stl", "package://hand_description/a.stl"),  # beside
         ("arm_description/a.stl", "package://arm_support/a.stl"),  # a copy without ROS's suffix
+        ("root/a.stl", "package://root/a.stl"),
         ("root/one/a.stl", "package://one/a.stl"),
         ("root/repository/src/a.stl", "package://two/a.stl"),  # two levels down
         ("arm_description/urdf/my mesh.stl", "my%20mesh.stl"),
