@@ -25,25 +25,24 @@ from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation, is_host
-from morphgen.tasks.task import EnvSpec, TaskState
-from morphgen.tasks.task_groups import BatchResult, TaskGroups
+from morphgen.tasks.task import EnvSpec, StepResult, TaskState
+from morphgen.tasks.task_groups import TaskGroups
 
 _FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """Result of a control step; where an episode ended, the next one has begun.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step(StepResult):
+    """Result of a control step for n environments; where an episode ended, the next has begun.
 
-    The caller owns all tensors: the batch does not use them again.
+    Terms are zero where the task has no such term, and the angle is nan where it wants no
+    orientation. The caller owns all tensors: the batch does not use them again.
     """
 
     observation: Observation
     """Observation after the action, or at the start of the next episode where one ended."""
     reward: torch.Tensor
     """Sum of the reward terms, shape (n,)."""
-    terminated: torch.Tensor
-    """Whether the task ended the episode, shape (n,), bool."""
     truncated: torch.Tensor
     """Whether the time limit or a diverged simulation ended the episode, shape (n,), bool."""
     diverged: torch.Tensor
@@ -51,21 +50,10 @@ class Step:
     truncated."""
     final_observation: Observation
     """Observation after the action, also where an episode ended: to bootstrap the value there."""
-    success: torch.Tensor
-    """Whether the task is fulfilled now, shape (n,), bool; never where a simulation diverged."""
-    distance: torch.Tensor
-    """Distance from success, such as between tool and goal, shape (n,) [m]."""
-    score: torch.Tensor
-    """Score of the step, shape (n,); see ``Task.episode_score``."""
-    terms: dict[str, torch.Tensor]
-    """Reward terms by name, each of shape (n,); zero where the task has no such term."""
     q: torch.Tensor
     """Joint positions after the action, also where an episode ended, shape (n, J) [rad or m]."""
     block_pose: torch.Tensor
     """Poses of the blocks after the action, also where an episode ended, shape (n, 7)."""
-    angle: torch.Tensor | None = None
-    """Angle from success, such as between tool and goal, shape (n,) [rad]; nan where the task wants
-    no orientation, None if no task wants one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +287,7 @@ class TaskBatch:
         """
         state = self._undone(before, diverged)
         self.episode_step += 1
-        result = self._evaluate(state, diverged)
+        result, reward = self._evaluate(state, diverged)
         timed_out = self.episode_step >= self.max_episode_steps
         truncated = (timed_out | diverged) & ~result.terminated
         final_observation = self._observe(state)
@@ -311,19 +299,14 @@ class TaskBatch:
             self._begin(ended)
             observation = self.observe()
         return Step(
+            **vars(result),
             observation=observation,
-            reward=result.reward,
-            terminated=result.terminated,
+            reward=reward,
             truncated=truncated,
             diverged=diverged.clone(),
             final_observation=final_observation,
-            success=result.success,
-            distance=result.distance,
-            score=result.score,
-            terms=result.terms,
             q=q,
             block_pose=block_pose,
-            angle=result.angle,
         )
 
     def _undone(self, before: BeforePhysics, diverged: torch.Tensor) -> PhysicsState:
@@ -382,8 +365,10 @@ class TaskBatch:
         """Free the simulation."""
         self.simulation.close()
 
-    def _evaluate(self, state: PhysicsState, diverged: torch.Tensor) -> BatchResult:
-        """Let the tasks evaluate the step that was simulated."""
+    def _evaluate(
+        self, state: PhysicsState, diverged: torch.Tensor
+    ) -> tuple[StepResult, torch.Tensor]:
+        """Let the tasks evaluate the step that was simulated; return also the rewards, (n,)."""
         q, qd = state.q, state.qd
         task_state = TaskState(
             tool=self._observation.tool_positions(q),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -70,14 +70,6 @@ def _require_shape(task: str, what: str, value: object, shape: tuple[int, ...]) 
         raise TaskError(f"task {task!r}: {what}: {type(value).__name__}; expected a tensor")
     if tuple(value.shape) != shape:
         raise TaskError(f"task {task!r}: {what} has shape {tuple(value.shape)}; expected {shape}")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BatchResult(StepResult):
-    """Results of a step for all environments of a batch."""
-
-    reward: torch.Tensor
-    """Sum of the reward terms, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,30 +150,17 @@ class TaskGroups:
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Begin episodes; the arguments and the result are those of ``TaskEnvs.begin``, n rows."""
-        if len(self._groups) == 1:
-            (group,) = self._groups.values()
-            return self._start(group, mask, random, layout)
-        n, device = len(mask), mask.device
-        q = torch.zeros(n, self._num_joints, device=device)
-        block_pose = torch.zeros(n, 7, device=device)
+        starts = []
         for group in self._groups.values():
-            rows = group.rows
-            task_layout = None if layout is None else layout[rows]
-            q[rows], block_pose[rows] = self._start(
-                group, mask[rows], random.select(rows), task_layout
+            start = group.envs.begin(
+                self._rows_of(group, mask),
+                random if self._is_one else random.select(group.rows),
+                None if layout is None else self._rows_of(group, layout),
             )
+            _require_start(group.task.name, start, len(group.rows), self._num_joints)
+            starts.append(start)
+        q, block_pose = map(self._merged, zip(*starts, strict=True))
         return q, block_pose
-
-    def _start(
-        self,
-        group: _Group,
-        mask: torch.Tensor,
-        random: EpisodeRandom,
-        layout: torch.Tensor | None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        start = group.envs.begin(mask, random, layout)
-        _require_start(group.task.name, start, len(group.rows), self._num_joints)
-        return start
 
     @property
     def reset_options(self) -> dict[str, tuple[int, ...]]:
@@ -199,36 +178,41 @@ class TaskGroups:
         """Begin an episode as options ask for; see ``TaskEnvs.place``."""
         return self._group_of(env).envs.place(int(self._row[env]), options, space, q, block_pose)
 
-    def evaluate(self, state: TaskState) -> BatchResult:
-        """Evaluate a step of all environments."""
-        results = []
+    def evaluate(self, state: TaskState) -> tuple[StepResult, torch.Tensor]:
+        """Evaluate a step of all environments; return also the rewards, shape (n,)."""
+        results: list[StepResult] = []
         for group in self._groups.values():
-            result = group.envs.evaluate(self._group_state(group, state))
+            values = {
+                name: None if value is None else self._rows_of(group, value)
+                for name, value in vars(state).items()
+            }
+            result = group.envs.evaluate(TaskState(**values))
             _require_result(group.task.name, result, len(group.rows))
-            results.append((group.rows, result))
-        rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for _, result in results]
-        if len(results) == 1:
-            return BatchResult(**vars(results[0][1]), reward=rewards[0])
-        rows = [rows for rows, _ in results]
-        parts = [result for _, result in results]
-        names = dict.fromkeys(name for part in parts for name in part.terms)
-        values: dict[str, Any] = {
-            name: self._scatter(rows, [getattr(part, name) for part in parts])
+            results.append(result)
+        rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for result in results]
+        merged: dict[str, Any] = {
+            name: self._merged([getattr(result, name) for result in results])
             for name in ("success", "terminated", "distance", "score")
         }
-        values["terms"] = {
-            name: self._scatter(
-                rows, [part.terms.get(name, torch.zeros_like(part.distance)) for part in parts]
+        merged["terms"] = {
+            name: self._merged(
+                [
+                    result.terms[name] if name in result.terms else torch.zeros_like(reward)
+                    for result, reward in zip(results, rewards, strict=True)
+                ]
             )
-            for name in names
+            for name in dict.fromkeys(name for result in results for name in result.terms)
         }
-        if any(part.angle is not None for part in parts):
-            nothing = [torch.full_like(part.distance, torch.nan) for part in parts]
-            angles = [part.angle for part in parts]
-            values["angle"] = self._scatter(
-                rows, [a if b is None else b for a, b in zip(nothing, angles, strict=True)]
+        if any(result.angle is not None for result in results):
+            merged["angle"] = self._merged(
+                [
+                    torch.full_like(result.distance, torch.nan)
+                    if result.angle is None
+                    else result.angle
+                    for result in results
+                ]
             )
-        return BatchResult(**values, reward=self._scatter(rows, rewards))
+        return StepResult(**merged), self._merged(rewards)
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the observation fields of all tasks, shape (n, size) each, as copies."""
@@ -238,11 +222,10 @@ class TaskGroups:
             for field in self.observation_fields
         }
         for group in self._groups.values():
-            alone = len(self._groups) == 1
-            task_values = group.envs.observe(block_pose if alone else block_pose[group.rows])
+            task_values = group.envs.observe(self._rows_of(group, block_pose))
             _require_fields(group.task, task_values, len(group.rows))
             for name, value in task_values.items():
-                if alone:
+                if self._is_one:
                     values[name] = value.clone()
                 else:
                     values[name][group.rows] = value
@@ -299,20 +282,20 @@ class TaskGroups:
             }
             group.envs.load_state_dict(group_state)
 
-    def _group_state(self, group: _Group, state: TaskState) -> TaskState:
-        """Return the rows of a step's state that belong to a group."""
-        if len(self._groups) == 1:
-            return state
-        values: dict[str, Any] = {field.name: getattr(state, field.name) for field in fields(state)}
-        for name, value in values.items():
-            values[name] = None if value is None else value[group.rows]
-        return TaskState(**values)
+    @property
+    def _is_one(self) -> bool:
+        """Whether all environments are at one task, so that its tensors are those of the batch."""
+        return len(self._groups) == 1
 
-    def _scatter(
-        self, rows: Sequence[torch.Tensor], values: Sequence[torch.Tensor]
-    ) -> torch.Tensor:
-        """Put values of the groups into the rows of the batch, shape (n,)."""
-        batch_values = values[0].new_empty(len(self._row))
-        for group_rows, value in zip(rows, values, strict=True):
-            batch_values[group_rows] = value
-        return batch_values
+    def _rows_of(self, group: _Group, values: torch.Tensor) -> torch.Tensor:
+        """Return the rows of a tensor of the batch that belong to a group."""
+        return values if self._is_one else values[group.rows]
+
+    def _merged(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return a tensor of the batch from those of all groups."""
+        if self._is_one:
+            return values[0]
+        merged = values[0].new_empty(len(self._row), *values[0].shape[1:])
+        for group, rows in zip(self._groups.values(), values, strict=True):
+            merged[group.rows] = rows
+        return merged

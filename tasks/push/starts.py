@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from morphgen.benchmark.similarity import tool_reach
 from morphgen.errors import TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
-from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,
     frame_positions,
@@ -23,10 +22,9 @@ from morphgen.model.kinematics import (
     solve_position_ik,
 )
 from morphgen.model.robot import TOOL, Robot
-from morphgen.tasks.free_space import FreeSpace, outside_limits
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.scenes.obstacles import draw_obstacles, layout_faults, no_obstacles
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import Block
 from morphgen.typing import Array
 
 FULL_REACH = 0.4
@@ -399,59 +397,7 @@ class PushStartSet:
         return self.blocks
 
 
-def sample_starts(
-    robot: Robot,
-    config: PushConfig,
-    *,
-    obstacles: bool,
-    ground: float,
-    seeds: np.random.SeedSequence,
-    identity: Mapping[str, Any],
-) -> PushStartSet:
-    """Sample a robot's push set; see ``Task.sample``.
-
-    Blocks stand on the ground in the ``push_region``, turned at random. A pose is feasible if the
-    base is not on the straight path along y across the line, and if there are free
-    configurations with the tool behind the block and with the tool on the line, both at the height
-    of the block. Start configurations are uniform within the joint limits; those that collide, also
-    with the block, are drawn again. Obstacles do not matter: each of their layouts leaves some of
-    the starts feasible.
-    """
-    region_seeds, test_seeds, block_seeds, start_seeds, obstacle_seeds = seeds.spawn(5)
-    region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
-    edge = region.edge
-    block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
-    space = FreeSpace(Scene(robot, block=block, ground=ground))
-    test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
-    starts, tried = _feasible(robot, config.num_goals, region, test, ground, block_seeds)
-    blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
-    x, y, z, qw, qx, qy, qz = blocks[0].tolist()
-    q = _starts(space, blocks, start_seeds)
-    among = no_obstacles(len(q))
-    if obstacles:
-        among = draw_obstacles(
-            space.scene,
-            config,
-            obstacle_seeds,
-            lambda space: _feasible_starts(space, region.line, q, blocks, behind, across),
-        )
-    return PushStartSet(
-        q=q,
-        blocks=blocks,
-        block=replace(block, pose=Pose((x, y, z), (qw, qx, qy, qz))),
-        line=region.line,
-        scale=region.scale,
-        ground=ground,
-        tried=tried,
-        accepted=len(starts),
-        behind=behind,
-        across=across,
-        **among,
-        **identity,
-    )
-
-
-def _feasible(
+def draw_feasible(
     robot: Robot,
     needed: int,
     region: Region,
@@ -493,7 +439,7 @@ def _feasible(
 
 
 def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
-    """Require a pose (7,) of the block from which the robot can push it, as ``sample_starts``."""
+    """Require a pose (7,) of the block from which the robot can push it, as ``Push.sample``."""
     assert space.scene.block is not None
     edge, ground = space.scene.block.size[0], space.scene.ground or 0.0
     x, y, z, _, qx, qy, _ = block.tolist()
@@ -514,18 +460,21 @@ def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
             raise TaskError(f"{what}: no configuration was found that gets the tool {place}")
 
 
-def _feasible_starts(
-    space: FreeSpace, line: float, q: Array, blocks: Array, behind: Array, across: Array
-) -> NDArray[np.bool_]:
-    """Return which starts the obstacles leave feasible, by their certificates, shape (n,)."""
-    feasible = path_is_clear(space, line, blocks)
-    for configurations, poses in ((q, blocks), (behind, blocks), (across, None)):
+def feasible_starts(pushes: PushStartSet, space: FreeSpace) -> NDArray[np.bool_]:
+    """Return which starts the obstacles leave feasible, by their certificates, shape (S,)."""
+    blocks = pushes.blocks
+    feasible = path_is_clear(space, pushes.line, blocks)
+    for configurations, poses in (
+        (pushes.q, blocks),
+        (pushes.behind, blocks),
+        (pushes.across, None),
+    ):
         rows = np.flatnonzero(feasible)
         feasible[rows] = space.free(configurations[rows], None if poses is None else poses[rows])
     return feasible
 
 
-def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> Array:
+def draw_starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> Array:
     """Return a free configuration for each block, shape (n, dof); they do not depend on n."""
     starts = []
     for block, child in zip(blocks, seeds.spawn(len(blocks)), strict=True):
@@ -543,48 +492,7 @@ def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> A
     return np.array(starts)
 
 
-def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
-    """Test that every block can be pushed across the line, by the configurations of the set.
-
-    Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
-    Faults, a line each, are blocks that do not stand on the ground, are past the line or in the
-    base; configurations out of limits or in collision; certificates whose tool is not behind the
-    block, or not on the line; a set of another robot; and ``layout_faults``.
-    """
-    n = len(pushes.blocks)
-    configurations = {
-        "start": pushes.q,
-        "proof behind": pushes.behind,
-        "proof across": pushes.across,
-    }
-    if any(q.shape != (n, robot.dof) for q in configurations.values()) or pushes.blocks.shape != (
-        n,
-        7,
-    ):
-        shapes = ", ".join(str(q.shape) for q in (*configurations.values(), pushes.blocks))
-        return [f"arrays {shapes} are not starts of robot {robot.name!r} with {robot.dof} joints"]
-    if not all(np.isfinite(q).all() for q in (*configurations.values(), pushes.blocks)):
-        return ["not all numbers are finite"]
-    faults = layout_faults(
-        pushes,
-        robot,
-        scene,
-        lambda space: _feasible_starts(
-            space, pushes.line, pushes.q, pushes.blocks, pushes.behind, pushes.across
-        ),
-        block=pushes.block,
-    )
-    for name, q in configurations.items():
-        faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
-    space = FreeSpace(replace(scene, robot=robot, block=pushes.block, obstacles=()))
-    faults += _misplaced_blocks(pushes, space)
-    for name, q in configurations.items():
-        free = space.free(q, None if q is pushes.across else pushes.blocks)
-        faults += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
-    return [*faults, *_misplaced_tools(pushes, robot)]
-
-
-def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
+def misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
     """Yield a fault for each start whose block is not where a push may begin."""
     edge = pushes.block.size[2]
     above = pushes.blocks[:, 2] - edge / 2 - pushes.ground
@@ -596,7 +504,7 @@ def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
         yield f"start {i}: the block is in the base"
 
 
-def _misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:
+def misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:
     """Yield a fault for each certificate whose tool is not behind its block or at the line."""
     tool = MujocoKinematics(robot)
     behind, across = (tool.frame_pose(q)[:, :3, 3] for q in (pushes.behind, pushes.across))

@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
+from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import PushStartSet, certify_starts, sample_starts
-from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.push.starts import (
+    FeasibilityTest,
+    PushStartSet,
+    draw_feasible,
+    draw_starts,
+    feasible_starts,
+    misplaced_blocks,
+    misplaced_tools,
+    push_region,
+)
+from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
+from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import LINE, OBJECT, EnvSpec, Marker, Task
 
 if TYPE_CHECKING:
@@ -60,14 +73,74 @@ class Push(Task[PushConfig, PushStartSet]):
         seeds: np.random.SeedSequence,
         identity: Mapping[str, Any],
     ) -> PushStartSet:
-        """Sample poses of the block that can be pushed; see ``sample_starts``."""
-        return sample_starts(
-            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+        """Sample poses of the block that can be pushed; see ``Task.sample``.
+
+        Blocks stand on the ground in the ``push_region``, turned at random. A pose is feasible if
+        the base is not on the straight path along y across the line, and if there are free
+        configurations with the tool behind the block and with the tool on the line, both at the
+        height of the block. Start configurations are uniform within the joint limits; those that
+        collide, also with the block, are drawn again. Obstacles do not matter: each of their
+        layouts leaves some of the starts feasible.
+        """
+        region_seeds, test_seeds, block_seeds, start_seeds, obstacle_seeds = seeds.spawn(5)
+        region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
+        edge = region.edge
+        block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
+        space = FreeSpace(Scene(robot, block=block, ground=ground))
+        test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
+        starts, tried = draw_feasible(robot, config.num_goals, region, test, ground, block_seeds)
+        blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
+        x, y, z, qw, qx, qy, qz = blocks[0].tolist()
+        q = draw_starts(space, blocks, start_seeds)
+        pushes = PushStartSet(
+            q=q,
+            blocks=blocks,
+            block=replace(block, pose=Pose((x, y, z), (qw, qx, qy, qz))),
+            line=region.line,
+            scale=region.scale,
+            ground=ground,
+            tried=tried,
+            accepted=len(starts),
+            behind=behind,
+            across=across,
+            **no_obstacles(len(q)),
+            **identity,
         )
+        if not obstacles:
+            return pushes
+        return with_obstacles(pushes, space.scene, config, obstacle_seeds, feasible_starts)
 
     def certify(self, goals: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
-        """Test every start with its certificate; see ``certify_starts``."""
-        return certify_starts(goals, robot, scene)
+        """Test that every block can be pushed across the line, by the configurations of the set.
+
+        Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
+        Faults, a line each, are blocks that do not stand on the ground, are past the line or in
+        the base; configurations out of limits or in collision; certificates whose tool is not
+        behind the block, or not on the line; a set of another robot; and ``layout_faults``.
+        """
+        n = len(goals.blocks)
+        configurations = {
+            "start": goals.q,
+            "proof behind": goals.behind,
+            "proof across": goals.across,
+        }
+        arrays = [*configurations.values(), goals.blocks]
+        if [array.shape for array in arrays] != [*[(n, robot.dof)] * 3, (n, 7)]:
+            shapes = ", ".join(str(array.shape) for array in arrays)
+            return [
+                f"arrays {shapes} are not starts of robot {robot.name!r} with {robot.dof} joints"
+            ]
+        if not all(np.isfinite(array).all() for array in arrays):
+            return ["not all numbers are finite"]
+        faults = layout_faults(goals, robot, scene, feasible_starts, block=goals.block)
+        for name, q in configurations.items():
+            faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
+        space = FreeSpace(replace(scene, robot=robot, block=goals.block, obstacles=()))
+        faults += misplaced_blocks(goals, space)
+        for name, q in configurations.items():
+            free = space.free(q, None if q is goals.across else goals.blocks)
+            faults += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
+        return [*faults, *misplaced_tools(goals, robot)]
 
     def scene(self, robot: Robot, goals: PushStartSet, ground: float) -> Scene:
         """Return the scene with the block."""

@@ -25,7 +25,7 @@ from morphgen.tasks.free_space import (
     outside_limits,
 )
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.scenes.obstacles import draw_obstacles, layout_faults, no_obstacles
+from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GOAL, EnvSpec, Marker, Task
 from morphgen.typing import Array
@@ -73,6 +73,14 @@ def _pose_rows(T: Array) -> Array:
     """Return poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
     poses = [Pose.from_matrix(matrix) for matrix in T]
     return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)
+
+
+def _free_goals(goals: ReachGoalSet, space: FreeSpace) -> NDArray[np.bool_]:
+    """Return where a goal is free; those that are not finite are faults already."""
+    free = np.ones(len(goals.q), dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+    free[rows] = space.free(goals.q[rows])
+    return free
 
 
 MAX_DISTANCE = 3.0
@@ -134,10 +142,11 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
                 f"moves {moved:.2g} m, and a goal is reached within {config.near:g} m; place the "
                 f"frame {TOOL!r} at the working point"
             )
-        among = no_obstacles(len(q))
-        if obstacles:
-            among = draw_obstacles(space.scene, config, obstacle_seeds, lambda space: space.free(q))
-        return ReachGoalSet(q=q, poses=poses, tried=tried, accepted=len(q), **among, **identity)
+        bare = no_obstacles(len(q))
+        goals = ReachGoalSet(q=q, poses=poses, tried=tried, accepted=len(q), **bare, **identity)
+        if not obstacles:
+            return goals
+        return with_obstacles(goals, space.scene, config, obstacle_seeds, _free_goals)
 
     def certify(self, goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
         """Test that every goal is reachable.
@@ -153,15 +162,8 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
             ]
         faults = [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
         rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
-
-        def free_goals(space: FreeSpace) -> NDArray[np.bool_]:
-            """Return where a goal is free; those outside of all limits are faults already."""
-            free = np.ones(len(goals.q), dtype=np.bool_)
-            free[rows] = space.free(goals.q[rows])
-            return free
-
-        faults += layout_faults(goals, robot, scene, free_goals)
-        free = free_goals(FreeSpace(replace(scene, robot=robot, obstacles=())))
+        faults += layout_faults(goals, robot, scene, _free_goals)
+        free = _free_goals(goals, FreeSpace(replace(scene, robot=robot, obstacles=())))
         blocked = np.flatnonzero(~free).tolist()
         faults += [f"goal {i}: its configuration is in collision" for i in blocked]
         planes = cspace_components(robot)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,11 @@ from morphgen.typing import Array
 
 LayoutSide = Literal["train", "eval"]
 """Layouts that episodes draw from: those of training, or those of evaluation."""
+G = TypeVar("G", bound=GoalSet)
 Usable = Callable[[FreeSpace], NDArray[np.bool_]]
 """Function that returns which goals a scene leaves possible, shape (G,)."""
+UsableOf = Callable[[G, FreeSpace], NDArray[np.bool_]]
+"""Function that returns which goals of a set a scene leaves possible, shape (G,)."""
 
 KEPT = 0.5
 """Fraction of otherwise free configurations that a layout must leave free."""
@@ -48,22 +52,27 @@ _AWAY = Pose((0.0, 0.0, -1e4))
 
 
 def no_obstacles(num_goals: int) -> dict[str, Any]:
-    """Return the fields of a goal set without obstacles that ``draw_obstacles`` fills."""
+    """Return the fields of a goal set without obstacles that ``with_obstacles`` fills."""
     usable = np.zeros((0, num_goals), dtype=np.bool_)
     return {"obstacles": (), "layouts": np.zeros((0, 0, 7)), "usable": usable}
 
 
-def draw_obstacles(
-    scene: Scene, config: TaskConfig, seeds: np.random.SeedSequence, usable: Usable
-) -> dict[str, Any]:
-    """Return the fields ``obstacles``, ``layouts`` and ``usable`` of a robot's goal set."""
+def with_obstacles(
+    goals: G,
+    scene: Scene,
+    config: TaskConfig,
+    seeds: np.random.SeedSequence,
+    usable: UsableOf[G],
+) -> G:
+    """Return a robot's goal set with obstacles, whose layouts leave some of the goals possible."""
     size_seeds, layout_seeds = seeds.spawn(2)
     rng = np.random.default_rng(size_seeds)
     boxes = draw_boxes(scene.robot, config.obstacles, config.obstacle_size, rng)
     space = FreeSpace(replace(scene, obstacles=boxes))
     counts = (config.train_layouts, config.eval_layouts)
-    layouts, possible = draw_layouts(space, counts, layout_seeds, usable)
-    return {"obstacles": place_boxes(boxes, layouts[0]), "layouts": layouts, "usable": possible}
+    layouts, possible = draw_layouts(space, counts, layout_seeds, partial(usable, goals))
+    placed = place_boxes(boxes, layouts[0])
+    return replace(goals, obstacles=placed, layouts=layouts, usable=possible)
 
 
 def draw_boxes(
@@ -196,7 +205,7 @@ def layouts_of(config: TaskConfig, side: LayoutSide) -> range:
 
 
 def layout_faults(
-    goals: GoalSet, robot: Robot, scene: Scene, usable: Usable, *, block: Block | None = None
+    goals: G, robot: Robot, scene: Scene, usable: UsableOf[G], *, block: Block | None = None
 ) -> list[str]:
     """Return the faults of a set's layouts, a line each.
 
@@ -221,7 +230,7 @@ def layout_faults(
         space.place_obstacles(poses_of(layout))
         if space.obstacle_hits([robot.home]).any():
             faults.append(f"layout {k}: the robot at home is in collision")
-        blocked = goals.usable[k] & ~usable(space)
+        blocked = goals.usable[k] & ~usable(goals, space)
         faults += [f"layout {k}: goal {i} is blocked" for i in np.flatnonzero(blocked).tolist()]
         if goals.usable[k].sum() < fewest_goals(len(goals.q)):
             faults.append(f"layout {k}: it leaves {goals.usable[k].sum()} goals, too few")

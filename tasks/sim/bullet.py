@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import pickle
 import tempfile
 import weakref
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,17 +17,14 @@ from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.bullet_batch import (
-    STEP,
     BulletBatch,
     ExportedRobot,
     Float32,
     Share,
-    SharedBuffers,
     Worker,
-    end,
-    gather,
-    send,
-    start,
+    allocate,
+    attempt,
+    buffers_in,
 )
 from morphgen.tasks.sim.motor_law import TensorView, all_finite, mask_of
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
@@ -64,8 +62,9 @@ class BulletSimulation:
         self.device = torch.device("cpu")
         dofs = np.array([scene.robot.dof for scene in scenes], np.int64)
         num_joints = int(dofs.max())
-        shared = SharedBuffers.zeros(len(scenes), num_joints)
-        buffers, self._targets = shared.split()
+        memory = allocate(len(scenes), num_joints)
+        buffers = buffers_in(memory, len(scenes))
+        self._targets = buffers.targets
         self.q, self.qd = torch.from_numpy(buffers.q), torch.from_numpy(buffers.qd)
         self.block_pose = torch.from_numpy(buffers.block_pose)
         self.block_velocity = torch.from_numpy(buffers.block_velocity)
@@ -86,16 +85,17 @@ class BulletSimulation:
                     contacts or Contacts(),
                     [exported[env] for env in envs],
                     envs,
+                    len(scenes),
                 )
                 for envs in divide(scenes, processes)
             )
             for number, share in enumerate(others, start=1):
-                self._workers.append(start(number, share, shared))
+                self._workers.append(Worker(number, share, memory))
             self._local_batches.append(BulletBatch(first, buffers))
             self._envs = np.array(first.envs)
-            _, failures = gather(self._workers)
-            if failures:
-                raise failures[0]
+            for worker in self._workers:
+                if isinstance(failure := worker.receive(), Exception):
+                    raise failure
         except BaseException:
             self.close()
             raise
@@ -119,24 +119,19 @@ class BulletSimulation:
             if not np.isfinite(obstacles).all():
                 raise ValueError(f"reset of {len(indices)} environments: obstacles are not finite")
 
-        def state(rows: NDArray[np.bool_]) -> BulletState:
+        def state(envs: NDArray[np.int64]) -> BulletState:
+            rows = np.isin(indices, envs)
             moved = None if obstacles is None else obstacles[rows]
             return indices[rows], positions[rows], poses[rows], moved
 
-        messages = []
-        for worker in self._workers:
-            rows = np.isin(indices, worker.envs)
-            if rows.any():
-                messages.append((worker, pickle.dumps(state(rows))))
-        local_state = state(np.isin(indices, self._envs))
-        self._run(messages, lambda batch: batch.reset(*local_state))
+        workers = [worker for worker in self._workers if np.isin(indices, worker.envs).any()]
+        self._call("reset", workers, state)
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
-        messages = [(worker, STEP) for worker in self._workers]
-        faults = self._run(messages, lambda batch: batch.step(self._targets))
+        faults = self._call("step", self._workers)
         if faults or self._faults:
             self._faults = faults
             self._diverged = torch.from_numpy(mask_of(faults, len(self.scenes)))
@@ -158,31 +153,32 @@ class BulletSimulation:
         if not self._free.alive:
             raise SimulationError("the simulation is closed")
 
-    def _run(
+    def _call(
         self,
-        messages: Sequence[tuple[Worker, bytes]],
-        work_here: Callable[[BulletBatch], dict[int, str] | None],
+        method: str,
+        workers: Sequence[Worker],
+        args_of: Callable[[NDArray[np.int64]], tuple[Any, ...]] = lambda envs: (),
     ) -> dict[int, str]:
-        """Do the work in workers and here; return the reason for each environment that diverged.
+        """Call a method of the batches of workers and of this process.
 
-        An interruption closes the simulation: it leaves answers in the pipes that nobody reads.
+        ``args_of`` returns the arguments for a batch of some environments. Return the reason for
+        each environment that diverged. An interruption closes the simulation: it leaves answers in
+        the pipes that nobody reads.
         """
-        failures: list[Exception] = []
-        reasons: dict[int, str] = {}
         try:
-            for worker, message in messages:
-                send(worker, message)
-            try:
-                reasons |= work_here(self._local_batches[0]) or {}
-            except (SimulationError, ValueError) as error:
-                failures.append(error)
-            of_workers, failed = gather([worker for worker, _ in messages])
+            for worker in workers:
+                worker.send(method, *args_of(worker.envs))
+            work_here = partial(getattr(self._local_batches[0], method), *args_of(self._envs))
+            answers = [attempt(work_here), *(worker.receive() for worker in workers)]
         except BaseException:
             self.close()
             raise
-        for failure in (*failures, *failed):
-            raise failure
-        return dict(sorted((reasons | of_workers).items()))
+        reasons: dict[int, str] = {}
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
+            reasons |= answer or {}
+        return dict(sorted(reasons.items()))
 
     def _checked_targets(self, targets: torch.Tensor) -> Float32:
         """Return valid targets of ``step`` as a contiguous array; padding may be anything."""
@@ -244,7 +240,8 @@ def _free(
     local_batches: list[BulletBatch],
     folder: tempfile.TemporaryDirectory[str],
 ) -> None:
-    end(workers)
+    for worker in workers:
+        worker.end()
     for batch in local_batches:
         batch.close()
     folder.cleanup()

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import pickle
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +33,8 @@ from morphgen.typing import Array
 
 if TYPE_CHECKING:
     import ctypes
+
+    SharedMemory = ctypes.Array[ctypes.c_float]
 
 try:
     with quiet():
@@ -329,14 +330,27 @@ ExportedRobot = tuple[Path, Robot]
 """URDF of a robot whose rigid links are merged, and that robot."""
 
 
-@dataclass(frozen=True, eq=False)
-class StateBuffers:
-    """State of a simulation, a row for each environment; see ``Simulation``."""
+class Buffers(NamedTuple):
+    """States and targets, a row for each environment of a simulation; see ``Simulation``."""
 
     q: Float32
     qd: Float32
     block_pose: Float32
     block_velocity: Float32
+    targets: Float32
+
+
+def allocate(num_envs: int, num_joints: int) -> SharedMemory:
+    """Return memory of all processes for the buffers of n environments, filled with zeros."""
+    return _CONTEXT.RawArray("f", num_envs * (3 * num_joints + 7 + 6))
+
+
+def buffers_in(memory: SharedMemory, num_envs: int) -> Buffers:
+    """Return the buffers in shared memory."""
+    num_joints = (len(memory) // num_envs - 13) // 3
+    ends = num_envs * np.cumsum([num_joints, num_joints, 7, 6])
+    parts = np.split(np.ctypeslib.as_array(memory), ends)
+    return Buffers(*(part.reshape(num_envs, -1) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -350,6 +364,8 @@ class Share:
     """Robot of each scene, as ``export_robots`` wrote it."""
     envs: Sequence[int]
     """Index of each scene's environment, which is its row in all buffers."""
+    num_envs: int
+    """Number of environments of all processes."""
 
 
 _FINAL_RESPONSE = 1 - (1 - VELOCITY_GAIN) ** SUBSTEPS
@@ -361,7 +377,7 @@ _MEAN_RESPONSE = 1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1
 class BulletBatch:
     """Scenes that step one after the other and write their states into buffers."""
 
-    def __init__(self, share: Share, buffers: StateBuffers) -> None:
+    def __init__(self, share: Share, buffers: Buffers) -> None:
         """Load every scene, its robot at zero."""
         scenes = share.scenes
         self._share, self._scenes = share, scenes
@@ -395,6 +411,7 @@ class BulletBatch:
         """
         width = self._buffers.q.shape[1]
         self._flat_q, self._flat_qd = self._buffers.q.reshape(-1), self._buffers.qd.reshape(-1)
+        self._targets = self._buffers.targets.reshape(-1)
         source: list[int] = []
         gain: list[float] = []
         offset: list[float] = []
@@ -458,15 +475,15 @@ class BulletBatch:
                 buffers.block_velocity[env] = 0
             self._num_steps_at_reset[i] = self._num_steps
 
-    def step(self, targets: Float32) -> dict[int, str]:
-        """Advance the environments by one control step; the targets (n, J) are contiguous, finite.
+    def step(self) -> dict[int, str]:
+        """Advance the environments by one control step towards the targets in the buffers.
 
         Return the reason for each environment that diverged: not finite, or ``MAX_VELOCITY``.
         """
         if self._diverged:
             reason = next(iter(self._diverged.values()))
             raise SimulationError(f"{reason}; expected a reset before the next step")
-        desired = targets.reshape(-1)[self._source] * self._gain + self._offset
+        desired = self._targets[self._source] * self._gain + self._offset
         ends, last = self._undisturbed(desired)
         mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
         commanded = self._measured + (mean - self._measured) / _MEAN_RESPONSE
@@ -540,140 +557,84 @@ class BulletBatch:
             loaded.close()
 
 
-STEP = b"step"
-"""Message that makes a worker step; any other message is pickled."""
-_DONE = b"done"
 _EXIT_CODE_WAIT = 0.5
 """Time for a worker whose pipe has ended to exit [s]."""
 _CONTEXT = multiprocessing.get_context("spawn")
+R = TypeVar("R")
 
 
-@dataclass(frozen=True, eq=False)
+def attempt(work: Callable[[], R]) -> R | Exception:
+    """Return the result of some work, or the error that the caller of a simulation shall see."""
+    try:
+        return work()
+    except (SimulationError, ValueError) as error:
+        return error
+
+
 class Worker:
-    """A worker process and its pipe."""
+    """A process that simulates a share of the environments, and answers each call in its pipe."""
 
-    process: SpawnProcess
-    pipe: Connection
-    envs: NDArray[np.int64]
+    def __init__(self, number: int, share: Share, memory: SharedMemory) -> None:
+        """Start the process, whose first answer says that it has loaded its share."""
+        self.envs = np.array(share.envs)
+        self._pipe, worker_end = _CONTEXT.Pipe()
+        self.process = _CONTEXT.Process(
+            target=_serve, args=(worker_end, share, memory), name=str(number), daemon=True
+        )
+        with sigint_blocked():
+            self.process.start()
+        worker_end.close()  # so that the worker's death ends the pipe
 
     def __str__(self) -> str:
         return f"worker {self.process.name} of {len(self.envs)} environments"
 
-
-@dataclass(frozen=True, eq=False)
-class SharedBuffers:
-    """States and targets of n environments with J joints, in memory of all processes."""
-
-    memory: ctypes.Array[ctypes.c_float]
-    n: int
-    joints: int
-
-    @classmethod
-    def zeros(cls, n: int, joints: int) -> SharedBuffers:
-        """Allocate the memory, filled with zeros."""
-        return cls(_CONTEXT.RawArray("f", n * (3 * joints + 7 + 6)), n, joints)
-
-    def split(self) -> tuple[StateBuffers, Float32]:
-        """Return views of the states, and of the targets (n, J)."""
-        n, joints = self.n, self.joints
-        flat = np.ctypeslib.as_array(self.memory)
-        ends = np.cumsum([n * joints, n * joints, n * 7, n * 6])
-        q, qd, pose, velocity, targets = (part.reshape(n, -1) for part in np.split(flat, ends))
-        return StateBuffers(q, qd, pose, velocity), targets
-
-
-def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
-    """Start a worker, which loads its share and then answers."""
-    parent_end, worker_end = _CONTEXT.Pipe()
-    process = _CONTEXT.Process(
-        target=_serve, args=(worker_end, shared), name=str(number), daemon=True
-    )
-    worker = Worker(process, parent_end, np.array(share.envs))
-    try:
-        with sigint_blocked():
-            process.start()
-        worker_end.close()
-        send(worker, pickle.dumps(share))
-    except BaseException:
-        end([worker])
-        raise
-    return worker
-
-
-def send(worker: Worker, message: bytes) -> None:
-    """Send a message to a worker."""
-    try:
-        worker.pipe.send_bytes(message)
-    except OSError as error:
-        raise _death(worker) from error
-
-
-def gather(workers: Sequence[Worker]) -> tuple[dict[int, str], list[Exception]]:
-    """Wait for all workers; return why environments diverged, and exceptions of the workers."""
-    reasons: dict[int, str] = {}
-    failures: list[Exception] = []
-    for worker in workers:
+    def send(self, method: str, *args: object) -> None:
+        """Call a method of the worker's ``BulletBatch``; ``receive`` returns the answer."""
         try:
-            answer = worker.pipe.recv_bytes()
+            self._pipe.send((method, args))
+        except OSError as error:
+            raise self._death() from error
+
+    def receive(self) -> dict[int, str] | Exception | None:
+        """Wait for the answer to a call."""
+        try:
+            answer: dict[int, str] | Exception | None = self._pipe.recv()
         except (EOFError, OSError) as error:
-            raise _death(worker) from error
-        if answer == _DONE:
-            continue
-        content: dict[int, str] | Exception = pickle.loads(answer)
-        if isinstance(content, Exception):
-            failures.append(content)
-        else:
-            reasons |= content
-    return reasons, failures
+            raise self._death() from error
+        return answer
+
+    def end(self) -> None:
+        """Kill the process, which holds nothing that needs an orderly shutdown."""
+        self._pipe.close()
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+
+    def _death(self) -> SimulationError:
+        """Return the error that reports that the process is dead, with its exit code."""
+        self.process.join(_EXIT_CODE_WAIT)
+        return SimulationError(
+            f"{self} died (exit code {self.process.exitcode}); the simulation is closed"
+        )
 
 
-def end(workers: Sequence[Worker]) -> None:
-    """Kill workers; they hold nothing that needs an orderly shutdown."""
-    for worker in workers:
-        worker.pipe.close()
-        if worker.process.pid is not None:
-            worker.process.kill()
-    for worker in workers:
-        if worker.process.pid is not None:
-            worker.process.join()
-            worker.process.close()
-
-
-def _death(worker: Worker) -> SimulationError:
-    """Return the error that reports a dead worker, with its exit code."""
-    worker.process.join(_EXIT_CODE_WAIT)
-    return SimulationError(
-        f"{worker} died (exit code {worker.process.exitcode}); the simulation is closed"
-    )
-
-
-def _serve(pipe: Connection, shared: SharedBuffers) -> None:
-    """Serve messages until the pipe ends; the parent handles Ctrl-C and closes the pipe."""
+def _serve(pipe: Connection, share: Share, memory: SharedMemory) -> None:
+    """Answer calls until the pipe ends; the parent handles Ctrl-C and closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    buffers, targets = shared.split()
     batch: BulletBatch | None = None
     try:
+        answer: object = attempt(lambda: BulletBatch(share, buffers_in(memory, share.num_envs)))
+        if isinstance(answer, BulletBatch):
+            batch, answer = answer, None
         while True:
-            message = pipe.recv_bytes()
-            reasons: dict[int, str] = {}
-            try:
-                if batch is None:
-                    batch = BulletBatch(pickle.loads(message), buffers)
-                elif message == STEP:
-                    reasons = batch.step(targets)
-                else:
-                    batch.reset(*pickle.loads(message))
-            except (SimulationError, ValueError) as error:
-                answer = pickle.dumps(error)
-            except BaseException as error:
-                unexpected = SimulationError(f"a worker failed: {type(error).__name__}: {error}")
-                pipe.send_bytes(pickle.dumps(unexpected))
-                raise
-            else:
-                answer = pickle.dumps(reasons) if reasons else _DONE
-            pipe.send_bytes(answer)
+            pipe.send(answer)
+            method, args = pipe.recv()
+            answer = attempt(partial(getattr(batch, method), *args))
     except (EOFError, ConnectionError):
-        return
+        return  # the parent has closed the pipe, or has died
+    except BaseException as error:
+        pipe.send(SimulationError(f"a worker failed: {type(error).__name__}: {error}"))
+        raise
     finally:
         if batch is not None:
             batch.close()

@@ -17,8 +17,7 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.tasks.actions import BINS, JointTargets, decode_actions
-from morphgen.tasks.gym.env import TaskEnv
+from morphgen.tasks.actions import JointTargets, decode_actions
 from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
@@ -32,13 +31,6 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import TaskState
 
 CPU = torch.device("cpu")
-
-
-def test_bins_are_symmetric_and_hold_zero():
-    assert len(BINS) == 11
-    assert tuple(sorted(BINS)) == BINS
-    assert [-b for b in reversed(BINS)] == list(BINS)
-    assert BINS[5] == 0
 
 
 def test_continuous_actions_are_clipped_and_discrete_actions_index_bins():
@@ -309,27 +301,8 @@ def test_in_a_batch_with_another_task_only_reach_has_angles(made):
     )
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"goal": "poses"}, r"unknown goal of reach 'poses'.*pose"),
-        ({"near_angle": 0.0}, r"near_angle 0: expected more than 0"),
-        ({"near_angle": np.inf}, r"near_angle inf: expected finite numbers"),
-        ({"near_angle": 4.0}, r"near_angle 4: expected more than 0, up to pi"),
-    ],
-)
-def test_invalid_constants_are_named(values, words):
-    with pytest.raises(TaskError, match=words):
-        ReachConfig(**values)
-
-
-def test_gymnasium_reports_the_angle(tmp_path):
+def test_vectors_report_the_angle(tmp_path):
     options = {"sim": "mujoco", "cache": tmp_path}
-    env = TaskEnv("reach", robot("arm3-stick"), config=POSE, **options)
-    env.reset(seed=0)
-    info = env.step(env.action_space.sample())[-1]
-    assert 0 < info["angle"] <= math.pi
-    env.close()
     vector = task_vector(2, task="reach", robot=robot("arm3-stick"), configs=(POSE,), **options)
     vector.reset(seed=0)
     infos = vector.step(np.zeros(vector.action_space.shape))[-1]

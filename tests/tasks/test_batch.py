@@ -93,34 +93,6 @@ def test_reward_is_the_sum_of_its_terms(build_batch):
         assert step.reward.isfinite().all()
 
 
-@pytest.mark.parametrize("others", [(), (1,), (1, 2), (0, 0, 0, 0, 0, 0, 0)])
-def test_rewards_are_bit_identical_in_any_batch(build_batch, others):
-    alone, batched = (
-        build_batch(1 + len(more), robots=(0, *more), seed=7) for more in ((), others)
-    )
-    actions = torch.rand(
-        30, 1, alone.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
-    )
-    alone.reset()
-    batched.reset()
-    for action in 2 * actions - 1:
-        a, b = alone.step(action), batched.step(action.expand(1 + len(others), -1))
-        for name, term in a.terms.items():
-            assert torch.equal(term, b.terms[name][:1]), name
-
-
-def test_point_cloud_observations_do_not_change_episodes(build_batch):
-    with_points, without = (
-        build_batch(obstacles=True, seed=2, observe=ObservationConfig(points=points))
-        for points in (5, 0)
-    )
-    for _ in range(3):
-        with_points.reset()
-        without.reset()
-        assert torch.equal(with_points.field("goal"), without.field("goal"))
-        assert torch.equal(with_points.targets, without.targets)
-
-
 def test_batches_smaller_than_the_robot_list_are_rejected():
     with pytest.raises(TaskError, match="2 environments for 3 robots"):
         make_batch("reach", list(WORDS), 2)

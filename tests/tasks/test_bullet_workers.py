@@ -164,26 +164,20 @@ def test_killed_worker_is_reported_and_everything_is_freed(scratch):
     simulation.close()
 
 
-def test_close_removes_processes_and_files(scratch):
+@pytest.mark.parametrize("closes", [True, False], ids=["closed", "garbage-collected"])
+def test_nothing_is_left_of_a_simulation(scratch, closes):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
-    running = pids(simulation)
-    kept = simulation.q
-    simulation.close()
-    simulation.close()
-    assert not any(map(is_running, running))
-    assert leftovers(scratch, os.getpid()) == []
-    assert not kept.any()
-    with pytest.raises(SimulationError, match="closed"):
-        reset_envs(simulation, *starts(simulation))
-
-
-def test_garbage_collected_simulation_ends_its_workers(scratch):
-    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
-    running = pids(simulation)
+    running, kept = pids(simulation), simulation.q
+    if closes:
+        simulation.close()
+        simulation.close()
+        with pytest.raises(SimulationError, match="closed"):
+            reset_envs(simulation, *starts(simulation))
     del simulation
     gc.collect()
     assert not any(map(is_running, running))
     assert leftovers(scratch, os.getpid()) == []
+    assert not kept.any()  # tensors outlive the processes
 
 
 SCRIPT = """

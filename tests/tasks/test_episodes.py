@@ -161,6 +161,7 @@ def test_episodes_do_not_depend_on_the_other_environments(specs):
         whole.simulation.diverges[0] = True
         a, b = whole.step(actions), part.step(actions[3:6])
         assert torch.equal(a.q[3:6], b.q)
+        assert torch.equal(a.reward[3:6], b.reward)
         assert torch.equal(a.truncated[3:6], b.truncated)
         for name, values in b.observation.items():
             assert torch.equal(a.observation[name][3:6], values), name

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from helpers.goal_sets import draw_goals
-from helpers.scenes import ball, push_scene, reach_scene, real_arm_scene, robot
+from helpers.scenes import ball, push_scene, reach_scene, real_arm_scene
 from morphgen.checks.self_collision import PENETRATION
 from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf.write import to_spec
@@ -134,14 +134,6 @@ def test_obstacle_hits_are_named_and_obstacles_may_overlap():
     assert space.free([[0.5]]).all()
 
 
-def test_configurations_have_the_shape_of_the_robot():
-    with pytest.raises(ValueError, match=r"needs \(n, 1\)"):
-        FreeSpace(Scene(aside())).free([0.0])
-    with pytest.raises(ValueError, match=r"needs \(n, 1\)"):
-        FreeSpace(Scene(aside(), obstacles=(SLAB,))).free([[0.0, 0.0]])
-    assert FreeSpace(Scene(aside())).free(np.zeros((0, 1))).tolist() == []
-
-
 @pytest.mark.filterwarnings("ignore:Attach conflict")
 @pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
 def test_results_agree_with_mujoco_plane_contacts(scene):
@@ -197,17 +189,9 @@ def test_samples_are_free_uniform_and_a_prefix_of_larger_samples():
     few, fewer = space.sample(30, np.random.default_rng(0))
     assert (few == q[:30]).all()
     assert fewer < tried
-
-
-def test_sample_returns_the_number_of_tested_configurations(monkeypatch):
-    monkeypatch.setattr(module, "_CHUNK", 7)
-    space = FreeSpace(Scene(aside()))
-    q, tried = space.sample(50, np.random.default_rng(0))
-    all_drawn = random_configurations(aside(), tried, np.random.default_rng(0))
-    free_mask = space.free(all_drawn)
-    assert free_mask.sum() == 50
-    assert free_mask[-1]
-    assert (all_drawn[free_mask] == q).all()
+    drawn = random_configurations(aside(), tried, np.random.default_rng(0))
+    assert space.free(drawn).sum() == 400
+    assert (drawn[tried - 1] == q[-1]).all()
 
 
 def test_robot_without_free_configuration_is_named_with_its_collisions(monkeypatch):
@@ -230,78 +214,62 @@ def pushed(robot=None, **changes):
     return FreeSpace(Scene(robot or aside(), block=block, **changes))
 
 
-def test_block_is_an_obstacle_at_the_given_pose():
-    """The 0.1 m ball is 0.5 m beside the plate and its centre 0.5 m above the ground."""
-    space = pushed()
-    above = 0.5 + 0.1 + 0.1
-    heights = (above + SHALLOW, above - SHALLOW, above - DEEP, 5.0)
-    blocks = [block_at(0.5, z) for z in heights]
-    assert space.free(np.zeros((4, 1)), blocks).tolist() == [True, True, False, True]
-    assert space.free(np.zeros((4, 1))).all()
-    assert space.free([[0.3], [0.0]], [block_at(0.5, above)] * 2).tolist() == [False, True]
+ABOVE = 0.5 + 0.1 + 0.1
+"""Height of a block that touches the ball of 0.1 m, 0.5 m beside the plate and above the ground."""
+DIAGONAL = 0.1 * np.sqrt(2)
+TILTED, ASIDE = 0.5 + 0.1 + DIAGONAL - DEEP, 0.5 - 0.1 - DIAGONAL + DEEP
+WALL = Block((0.2, 0.2, 0.2), Pose((1.6, 0.0, 0.1)))
 
 
-def test_block_may_have_any_orientation():
-    diagonal = 0.1 * np.sqrt(2)
-    space = pushed()
-
-    def free(**turn):
-        return space.free([[0.0]], [block_at(0.5, 0.5 + 0.1 + diagonal - DEEP, **turn)])[0]
-
-    assert free(yaw=np.pi / 4)
-    assert not free(pitch=np.pi / 4)
-    aside_of = [block_at(0.5 - 0.1 - diagonal + DEEP, 0.5, yaw=yaw) for yaw in (0.0, np.pi / 4)]
-    assert space.free([[0.0]] * 2, aside_of).tolist() == [True, False]
-
-
-def test_block_may_rest_on_the_ground_but_not_in_static_objects():
-    blocks = [block_at(2.0, 0.1), block_at(2.0, 0.0), block_at(0.0, 0.1), block_at(1.5, 0.1)]
-    wall = Block((0.2, 0.2, 0.2), Pose((1.6, 0.0, 0.1)))
-    space = pushed(obstacles=(wall,))
-    expected = [True, True, False, False]
-    assert space.free(np.zeros((4, 1)), blocks).tolist() == expected
-    assert space.block_is_clear(blocks).tolist() == expected
-
-
-def test_block_clearance_ignores_moving_links():
-    space = pushed()
-    in_ball, in_plate = block_at(0.5, 0.5), block_at(0.1, 0.1)
-    assert not space.free([[0.0]], [in_ball])[0]
-    assert space.block_is_clear([in_ball, in_plate]).tolist() == [True, False]
+@pytest.mark.parametrize(
+    ("block", "q", "is_free"),
+    [
+        (block_at(0.5, ABOVE + SHALLOW), 0.0, True),
+        (block_at(0.5, ABOVE - SHALLOW), 0.0, True),
+        (block_at(0.5, ABOVE - DEEP), 0.0, False),
+        (block_at(0.5, ABOVE), 0.3, False),
+        (block_at(0.5, TILTED, yaw=np.pi / 4), 0.0, True),
+        (block_at(0.5, TILTED, pitch=np.pi / 4), 0.0, False),
+        (block_at(ASIDE, 0.5), 0.0, True),
+        (block_at(ASIDE, 0.5, yaw=np.pi / 4), 0.0, False),
+        (block_at(2.0, 0.1), 0.0, True),
+        (block_at(2.0, 0.0), 0.0, True),  # it may stand on the ground, or in it
+        (block_at(0.0, 0.1), 0.0, False),  # in the plate
+        (block_at(1.5, 0.1), 0.0, False),  # in the wall
+    ],
+)
+def test_a_block_is_an_obstacle_where_it_is(block, q, is_free):
+    space = pushed(obstacles=(WALL,))
+    assert space.free([[q]], [block]).tolist() == [is_free]
+    assert space.free([[q]])[0]
 
 
-def test_tool_point_inside_the_block_is_in_collision():
+def test_block_clearance_ignores_moving_links_and_the_tool_point_does_not():
+    clear = pushed().block_is_clear([block_at(0.5, 0.5), block_at(0.1, 0.1)])
+    assert clear.tolist() == [True, False]
     fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
     space = pushed(replace(aside(), frames=(fingertip,)))
-    assert space.free([[0.0]] * 2, [block_at(0.5, z) for z in (0.85, 0.95)]).tolist() == [
-        False,
-        True,
-    ]
+    blocks = [block_at(0.5, 0.85), block_at(0.5, 0.95)]
+    assert space.free([[0.0]] * 2, blocks).tolist() == [False, True]
 
 
-def test_block_poses_with_a_wrong_shape_or_scene_are_rejected():
-    with pytest.raises(ValueError, match=r"blocks have shape \(7,\); 1 configurations need"):
-        pushed().free([[0.0]], block_at(0.5, 0.5))
-    with pytest.raises(ValueError, match=r"a scene with a block"):
-        FreeSpace(Scene(aside())).free([[0.0]], [block_at(0.5, 0.5)])
-    with pytest.raises(ValueError, match=r"shape \(2, 7\)"):
-        pushed().free([[0.0]], [block_at(0.5, 0.5)] * 2)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_non_finite_input_is_rejected(value):
-    scene = push_scene()
-    space, home = FreeSpace(scene), np.array([scene.robot.home])
-    block = np.array([[0.0, 0.0, 0.075, 1.0, 0.0, 0.0, 0.0]])
-    lost, gone = home.copy(), block.copy()
-    lost[0, 1] = gone[0, 0] = value
-    for q, blocks in ((lost, None), (lost, block), (home, gone)):
-        with pytest.raises(ValueError, match="not finite"):
-            space.free(q, blocks)
-    with pytest.raises(ValueError, match="not finite"):
-        space.block_is_clear(gone)
-    with pytest.raises(ValueError, match="not finite"):
-        space.obstacle_hits(lost)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: pushed().free([0.0]), r"needs \(n, 1\)"),
+        (lambda: pushed(obstacles=(SLAB,)).free([[0.0, 0.0]]), r"needs \(n, 1\)"),
+        (lambda: pushed().free([[0.0]], block_at(0.5, 0.5)), r"shape \(7,\); 1 configurations"),
+        (lambda: pushed().free([[0.0]], [block_at(0.5, 0.5)] * 2), r"shape \(2, 7\)"),
+        (lambda: FreeSpace(Scene(aside())).free([[0.0]], [block_at(0.5, 0.5)]), "with a block"),
+        (lambda: pushed().free([[np.nan]]), "q of lift is not finite"),
+        (lambda: pushed().free([[0.0]], [block_at(np.inf, 0.5)]), "pose of the block is not fin"),
+        (lambda: pushed().block_is_clear([block_at(np.nan, 0.5)]), "pose of the block is not fin"),
+        (lambda: pushed().obstacle_hits([[np.inf]]), "q of lift is not finite"),
+    ],
+)
+def test_invalid_input_is_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def test_block_clearance_far_away_equals_the_full_test():
@@ -379,11 +347,6 @@ def test_ranges_of_full_turns_are_not_split():
     assert in_other_component(found, np.array([math.pi, 0.9])).all()
 
 
-@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
-def test_library_robots_have_one_component(words):
-    assert cspace_components(robot(words)) == ()
-
-
 def test_goals_are_in_the_larger_component(tmp_path):
     body = walled(ACROSS)
     both, _ = FreeSpace(Scene(body)).sample(40, np.random.default_rng(0))
@@ -441,23 +404,16 @@ class Layouts:
 
 
 def test_the_first_end_with_a_free_path_is_found():
-    first_free = StraightPaths(Layouts(), torch.tensor([0, 1]))
+    layouts = Layouts()
+    first_free = StraightPaths(layouts, torch.tensor([0, 1]))
     assert first_free(0, START, np.array([BEHIND, BESIDE])) == 1
     assert first_free(0, START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
     assert first_free(0, START, BEHIND[None]) is None
     assert first_free(0, START, np.zeros((0, 2))) is None
     assert first_free(1, START, np.array([BEHIND, BESIDE])) == 0
-
-
-def test_obstacles_count_where_they_are_now():
-    layouts = Layouts()
-    first_free = StraightPaths(layouts, torch.tensor([0]))
-    assert first_free(0, START, BEHIND[None]) is None
-    layouts.wall = replace(layouts.wall, pose=Pose((0.0, 2.0, 0.2)))
-    assert first_free(0, START, BEHIND[None]) == 0
-
-
-def test_padding_of_configurations_is_ignored():
-    first_free = StraightPaths(Layouts(), torch.tensor([0]))
     padded = np.array([[*BEHIND, 0.0], [*BESIDE, 0.0]])
     assert first_free(0, np.array([*START, 9.0]), padded) == 1
+    layouts.wall = replace(
+        layouts.wall, pose=Pose((0.0, 2.0, 0.2))
+    )  # obstacles count where they are
+    assert first_free(0, START, BEHIND[None]) == 0

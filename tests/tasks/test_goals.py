@@ -224,6 +224,9 @@ def test_fixed_tool_is_rejected(body, cache):
         ({"obstacle_size": (0.0, 0.1)}, "expected 0 < lowest <= highest"),
         ({"obstacle_size": (0.2, 0.1)}, "expected 0 < lowest <= highest"),
         ({"obstacle_size": (0.1, np.inf)}, "expected finite numbers"),
+        ({"goal": "poses"}, "unknown goal of reach 'poses'"),
+        ({"near_angle": 0.0}, "near_angle 0: expected more than 0, up to pi"),
+        ({"near_angle": 4.0}, "near_angle 4: expected more than 0, up to pi"),
     ],
 )
 def test_invalid_constants_are_rejected(changes, text):

@@ -2,18 +2,13 @@
 
 import subprocess
 import sys
-import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import FlattenObservation
-from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 import morphgen
-from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.env import TaskEnv
@@ -46,45 +41,6 @@ def make(cache):
         env.unwrapped.close()
 
 
-def run(env, steps):
-    """Return observations and rewards of random actions over several episodes."""
-    env.action_space.seed(0)
-    rows = []
-    for _ in range(steps):
-        seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        rows.append(np.concatenate([*(v.ravel() for v in seen.values()), [reward]]))
-        if terminated or truncated:
-            seen, _ = env.reset()
-            rows.append(np.concatenate([*(v.ravel() for v in seen.values()), [0]]))
-    return np.concatenate([row.ravel() for row in rows])
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        pytest.param("morphgen/Reach-v0", {"sim": "pybullet"}, marks=needs_pybullet),
-        (
-            "morphgen/Push-v0",
-            {
-                "robot": "prims",
-                "observe": ObservationConfig(velocity=True, previous_action=True, points=9),
-            },
-        ),
-    ],
-)
-def test_both_checkers_pass(make, name, options):
-    """The checkers warn only that tokens are not a vector; flattened, they do not warn."""
-    env = make(name, render_mode="rgb_array", size=(64, 48), **options)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_env(env.unwrapped)
-        check_for_sb3(env.unwrapped)
-    assert all("unconventional shape" in str(each.message) for each in caught)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_for_sb3(FlattenObservation(env))
-
-
 @pytest.mark.parametrize(
     "imports",
     [
@@ -110,14 +66,6 @@ def test_importing_tasks_loads_no_heavy_packages():
         "assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules), 'loaded'\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-
-
-def test_reach_observation_keys_and_shapes(make):
-    env = make("morphgen/Reach-v0")
-    links = len(env.unwrapped.env_spec.robot.links)
-    shapes = {name: space.shape for name, space in env.observation_space.items()}
-    assert shapes == {"tokens": (links, 48), "goal": (7,)}
-    assert env.action_space.shape == (len(env.unwrapped.action_joints),)
 
 
 def test_push_observation_has_block_line_and_obstacles(make):
@@ -148,19 +96,6 @@ def test_action_moves_its_own_joint(make):
         robot = env.env_spec.robot
         assert [robot.joints[robot.independent_joints[j]].name for j in moved] == [name]
         assert seen["previous_action"].tolist() == action.tolist()
-
-
-@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
-def test_seed_determines_the_episodes(make, sim):
-    env, other = make("morphgen/Reach-v0", sim=sim), make("morphgen/Reach-v0", sim=sim)
-    env.reset(seed=5)
-    first = run(env, 3 * STEPS)
-    env.reset(seed=6)
-    assert not np.array_equal(run(env, 3 * STEPS), first)
-    env.reset(seed=5)
-    assert np.array_equal(run(env, 3 * STEPS), first)
-    other.reset(seed=5)
-    assert np.array_equal(run(other, 3 * STEPS), first)
 
 
 def test_unseeded_resets_continue_the_random_sequence(make):
@@ -265,9 +200,6 @@ def test_invalid_actions_are_rejected(make, action, message):
         ("reach", {"robot": "ur5-plain"}, CompositionError, "did you mean 'plane'"),
         ("reach", {"sim": "bullet"}, TaskError, "did you mean 'pybullet'"),
         ("reach", {"kind": "discreet"}, TaskError, "did you mean 'discrete'"),
-        ("reach", {"render_mode": "rgb"}, TaskError, "did you mean 'rgb_array'"),
-        ("reach", {"config": PUSH}, TaskError, "PushConfig is not the config of reach"),
-        ("push", {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
     ],
 )
 def test_invalid_options_are_rejected(task, options, error, message, cache):

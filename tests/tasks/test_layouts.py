@@ -39,7 +39,6 @@ def in_pybullet(scenes):
 
 SIMULATIONS = {
     "mujoco": lambda scenes: MujocoSimulation(scenes),
-    "mujoco, 2 threads": lambda scenes: MujocoSimulation(scenes, threads=2),
     "pybullet": in_pybullet,
 }
 
@@ -135,12 +134,6 @@ def _distance(points, box):
     return np.abs(local.max(axis=1))
 
 
-def test_hidden_state_hides_moved_obstacles(build_batch):
-    observe = ObservationConfig(points=10, state=False)
-    batch = build_batch("reach", observe=observe)
-    assert not batch.reset()["obstacles"].any()
-
-
 @pytest.mark.parametrize("name", SIMULATIONS)
 def test_a_simulated_robot_meets_obstacles_where_they_were_moved(name):
     """A cube with edges of 0.11 m on slides moves towards a wall."""
@@ -217,12 +210,6 @@ def test_scripted_push_has_a_planner_for_each_layout(build_batch):
         batch.reset()
         controller.act(batch)
     assert set(controller._planners) == {(0, 4), (0, 5)}
-
-
-def test_a_set_of_one_goal_may_have_obstacles(specs, tmp_path):
-    config = replace(PUSH, num_goals=1)
-    spec = draw_spec(specs["push"].robot, config, obstacles=True, cache=tmp_path)
-    assert spec.goals.usable.all()
 
 
 @pytest.mark.parametrize("side", ["train", "eval"])

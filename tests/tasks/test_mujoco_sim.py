@@ -107,34 +107,24 @@ def test_root_link_may_be_named_world():
     assert same_bits(outputs(sims[0]), outputs(sims[1]))
 
 
-def test_results_are_bit_identical_for_any_batch_and_thread_count():
-    alone = [MujocoSimulation([scene]) for scene in mixed_scenes()]
-    batches = [MujocoSimulation(mixed_scenes() * 17, threads=threads) for threads in (1, 2, 3)]
-    for sim in (*alone, *batches):
-        drive(sim, 50)
+def test_results_are_bit_identical_for_any_thread_count():
+    alone, *batches = (MujocoSimulation(mixed_scenes() * 5, threads=k) for k in (1, 2, 3))
+    for sim in (alone, *batches):
+        drive(sim, 30)
     for batch in batches:
-        for i in range(51):
-            assert same_bits(outputs(batch, i), outputs(alone[i % 3]))
+        assert all(same_bits(outputs(batch, i), outputs(alone, i)) for i in range(15))
         batch.close()
 
 
-def test_diverged_environment_is_reported_and_can_be_reset(tmp_path, monkeypatch):
+def test_divergence_leaves_no_log_and_names_the_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sim = MujocoSimulation(mixed_scenes(), threads=2)
-    home = sim.q.clone(), sim.block_pose.clone()
-    sim.step(home[0])
-    sim._data[1].qvel[0] = math.nan
-    name = sim.scenes[1].robot.name
-    assert sim.step(home[0]).tolist() == [False, True, False]
-    assert re.match(rf"environment 1 \(robot '{name}', 2 steps", sim.faults()[1])
-    assert sim.q[[0, 2]].isfinite().all()
-    put_back(sim, [1], home)
-    assert not sim.step(home[0]).any()
-    assert sim.faults() == {}
+    home = sim.q.clone()
+    sim.step(home)
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
-    assert sim.step(home[0]).tolist() == [True, False, True]
-    assert list(sim.faults()) == [0, 2]
-    assert re.match(r"environment 0 .*beyond 10000", sim.faults()[0])
+    assert sim.step(home).tolist() == [True, False, True]
+    name = sim.scenes[0].robot.name
+    assert re.match(rf"environment 0 \(robot '{name}', 2 steps.*beyond 10000", sim.faults()[0])
     assert list(Path(tmp_path).iterdir()) == []
 
 
@@ -229,13 +219,6 @@ def test_joints_with_nearly_one_axis_have_inertia_against_each_other(index):
     assert np.diag(inertia) == pytest.approx(np.diag(of_robot), rel=0.021)
 
 
-def test_the_inertia_of_a_real_arm_stays():
-    body = robot("arm=ur5 ee=plane")
-    of_robot = movable_mass_matrix(body, body.home) + np.diag(armature(body))
-    inertia = compiled_inertia(body)
-    np.testing.assert_allclose(inertia, of_robot, rtol=1e-4, atol=1e-4)
-
-
 def block_scene(block, **rest):
     return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), block=block, **rest)
 
@@ -270,21 +253,6 @@ def test_spin_is_in_the_world_frame():
         spins.append(sim.block_velocity[0, 3:].tolist())
     assert abs(spins[0][0]) > 0.5
     assert spins[1] == pytest.approx(spins[0], abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("contacts", "lowest"), [(Contacts(), -0.02), (Contacts(scene=False), -10.0)]
-)
-def test_ground_contacts_are_optional(contacts, lowest):
-    sim = MujocoSimulation([Scene(robot("prims"), Pose((0, 0, -0.5)))], contacts)
-    q = sim.q.clone()
-    depth = sim.scenes[0].robot.joint_index["gantry_z"]
-    column = sim.scenes[0].robot.independent_joints.index(depth)
-    for _ in range(60):
-        q[0, column] = max(q[0, column] - 0.02, 0.2)
-        sim.step(q)
-    reached = sim.q[0, column].item()
-    assert (reached < 0.21) == (lowest < -1)
 
 
 def test_self_contacts_are_optional_and_respect_ignored_pairs():

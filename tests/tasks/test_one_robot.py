@@ -62,7 +62,7 @@ def batches(named, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shapes_and_key_are_the_same(batches, name):
+def test_shapes_goals_and_scores_are_the_same(batches, name):
     reference, other = (batches[each].specs[0].robot for each in ("words", name))
     assert [link.collisions for link in other.links] == [
         link.collisions for link in reference.links
@@ -72,10 +72,6 @@ def test_shapes_and_key_are_the_same(batches, name):
     assert other.ignore_pairs == reference.ignore_pairs
     assert robot_hash(other, visuals=False) == robot_hash(reference, visuals=False)
     assert (batches[name].robot_tables.tokens == batches["words"].robot_tables.tokens).all()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_goals_and_scores_are_the_same(batches, name):
     reference, other = (batches[each].specs[0].goals for each in ("words", name))
     assert (other.key, other.tried) == (reference.key, reference.tried)
     assert other.obstacles == reference.obstacles

@@ -106,14 +106,6 @@ def test_short_robots_have_a_scaled_down_push_region(cache):
     assert push_set.line == pytest.approx(0.2 * push_set.scale)
 
 
-def test_ground_may_be_below_the_base(cache):
-    words = "arm=panda ee=panda_hand"
-    push_set = sample_starts(words, cache, ground=-0.05)
-    assert push_set.ground == -0.05
-    assert push_set.blocks[:, 2] == pytest.approx(push_set.block.size[0] / 2 - 0.05)
-    assert push_set.key != sample_starts(words, cache).key
-
-
 def test_block_matches_the_config(cache):
     config = replace(CONFIG, block_mass=0.3, friction=0.6, line=0.1, start=-0.1, start_depth=0.0)
     push_set = sample_starts("prims", cache, config=config)

@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from contextlib import closing
 from importlib import import_module
 
 import gymnasium as gym
@@ -55,19 +54,13 @@ def test_spaces_contain_observations_and_actions(batch_from_specs, kind):
         assert envs.single_action_space.shape == (links,)
     seen, infos = envs.reset(seed=0)
     assert infos == {}
+    assert "obstacles" in seen
     for _ in range(15):
         assert seen in envs.observation_space
         assert {name: v.shape for name, v in seen.items()} == {
             name: (4, *space.shape) for name, space in envs.single_observation_space.items()
         }
         seen, *_ = envs.step(envs.action_space.sample())
-
-
-def test_empty_observation_entries_are_omitted(cache):
-    batch = make_batch("reach", ROBOTS[:1], 2, sim="mujoco", configs=(REACH,), cache=cache)
-    with closing(TaskVector(batch)) as envs:
-        assert "obstacles" in batch.observe()
-        assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
 
 
 def test_autoreset_returns_the_final_observation(batch_from_specs):

@@ -12,7 +12,6 @@ from morphgen.errors import SimulationError, TaskError
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import sorted_pair
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.registry import evaluation_simulator
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_model import worlds
@@ -281,10 +280,6 @@ def test_kernels_of_another_gpu_do_not_count_as_compiled(tmp_path, monkeypatch):
     (tmp_path / "module" / "module.sm90.cubin").touch()
     assert warp_sim.kernels_stored(90)
     assert not warp_sim.kernels_stored(80)
-
-
-def test_policies_of_the_simulator_are_judged_in_mujoco():
-    assert evaluation_simulator("warp") == "mujoco"
 
 
 @pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "push"])

@@ -1,24 +1,21 @@
 """Make the goal sets that come with the package: those of the splits that are shipped with it.
 
-    python -m morphgen.tasks.goals.package_sets           # sample all sets, replace the files
-    python -m morphgen.tasks.goals.package_sets --sizes   # how large the files are
+    python benchmarks/package_goal_sets.py           # sample all sets, replace the files
+    python benchmarks/package_goal_sets.py --sizes   # how large the files are
 
 Run it after a change of robots, fits, tasks or their constants. Sets that are still the same keep
 their files. Splits that have a robot at a task in common share the set.
 """
-
-from __future__ import annotations
 
 import argparse
 import hashlib
 import json
 import lzma
 import sys
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from morphgen.benchmark.split import Member
+from morphgen.benchmark.split import Member, sided_members
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import write_atomic
@@ -43,10 +40,8 @@ def shipped_members() -> dict[Identity, Member]:
     return {identity(member): member for name in split_names() for member in _members(name)}
 
 
-def _members(name: str) -> Iterator[Member]:
-    split = read_split(name)
-    yield from split.train
-    yield from split.test
+def _members(name: str) -> list[Member]:
+    return [member for _, member in sided_members(read_split(name))]
 
 
 def write_sets(folder: Path = FOLDER, jobs: int = 1) -> None:
@@ -109,7 +104,7 @@ def sizes_text() -> str:
 
 def main() -> None:
     """Write the sets and print their sizes, or print the sizes alone."""
-    parser = argparse.ArgumentParser(prog="python -m morphgen.tasks.goals.package_sets")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", action="store_true", help="print the sizes of the sets only")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     args = parser.parse_args()
