@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco_warp
 import torch
 import warp as wp
 from tabulate import tabulate
@@ -38,6 +39,8 @@ from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.registry import COLLISION_GEOMETRIES, CollisionGeometry
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
+from morphgen.tasks.sim.base import SUBSTEPS
+from morphgen.tasks.sim.warp_kernels import Joints
 from morphgen.tasks.sim.warp_sim import Group, WarpSimulation
 
 SPLITS = (
@@ -97,12 +100,31 @@ def _rows(args: argparse.Namespace) -> Iterator[Row]:
         yield _copies(args.split, (args.envs or (1024,))[0], args.device)
 
 
+@wp.kernel
+def targets_as_controls(
+    joints: Joints, targets: wp.array2d[float], control: wp.array2d[float]
+) -> None:
+    """Copy the targets of the independent joints to the actuators. Threads: (worlds, J)."""
+    world, joint = wp.tid()
+    control[world, joint] = targets[joints.env[world], joint]
+
+
 class RawGroup(Group):
     """The library alone: physics steps towards joint targets."""
 
     def step(self) -> None:
-        """Launch the kernels of a control step, without control law and without reading."""
-        self.step_library()
+        """Launch the library's kernels of a control step, without control law and reading.
+
+        Targets are the controls of the actuators, without the forces of inverse dynamics.
+        """
+        wp.launch(
+            targets_as_controls,
+            self.data.ctrl.shape,
+            [self._joints, self._buffers["targets"]],
+            [self.data.ctrl],
+        )
+        for _ in range(SUBSTEPS):
+            mujoco_warp.step(self.model, self.data)
 
 
 class RawSimulation(WarpSimulation):

@@ -23,8 +23,8 @@ from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.runs.checkpoint import policy_interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.device import require_device
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.registry import require_device
 from morphgen.tasks.scenes.make import BatchOptions
 from morphgen.tasks.task import TaskConfig
 

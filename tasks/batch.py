@@ -11,14 +11,15 @@ import torch
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
-from morphgen.tasks.batch_observation import (
+from morphgen.tasks.observation import (
     BatchObservation,
     EpisodeLayouts,
+    Observation,
+    ObservationConfig,
     PhysicsState,
     StraightPaths,
     copied,
 )
-from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
 from morphgen.tasks.reset_options import EpisodePlacer
 from morphgen.tasks.rows import limit_violation, row_sums

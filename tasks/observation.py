@@ -1,18 +1,28 @@
-"""Observations: optional entries, and tokens of links and boxes."""
+"""Observations of a batch: optional entries, tokens, layouts of obstacles, points and paths."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from morphgen.benchmark.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
+from morphgen.model.kinematics_torch import FramePositions, matrix_from_quaternion
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.kinematic_channels import KinematicChannels
+from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
+from morphgen.tasks.scenes.obstacles import LayoutSide, layouts_of, place_boxes
 from morphgen.tasks.scenes.robot_tables import RobotTables
-from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.task import OBJECT, EnvSpec
+from morphgen.tasks.task_groups import TaskGroups
+from morphgen.typing import Array
 
 Observation = dict[str, torch.Tensor]
 """``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``obstacles`` (n, O, 13) and
@@ -194,3 +204,310 @@ def tree_entries(
         "joint_parents": parents,
         "joint_relations": distance + (MAX_TREE_DISTANCE + 1) * kind,
     }
+
+
+class EpisodeLayouts:
+    """Draws the layout of every episode, and holds the current poses of all obstacles.
+
+    Attributes:
+        poses: Current poses of the obstacles in the world, shape (n, O, 7); zeros where an
+            environment has fewer than O. Updated in place.
+        entries: Observation of the obstacles, ``obstacles`` and ``obstacle_mask``; all padding if
+            the state is not observed. Updated in place.
+        current: Layout of each environment, an index of ``GoalSet.layouts``, shape (n,), int64; -1
+            without obstacles. Updated in place.
+    """
+
+    def __init__(
+        self,
+        specs: Sequence[EnvSpec],
+        env_robot_index: torch.Tensor,
+        side: LayoutSide,
+        observe: ObservationConfig,
+    ) -> None:
+        """Begin with the first layout of every environment."""
+        device = env_robot_index.device
+        self._specs = [specs[i] for i in env_robot_index.tolist()]
+        self._index = env_robot_index
+        scenes = [spec.scene for spec in self._specs]
+        choices = [layouts_of(spec.config, side) for spec in specs]
+        first, count = torch.tensor([(each.start, len(each)) for each in choices]).T.to(device)
+        self._first, self._count = first[env_robot_index], count[env_robot_index]
+        has_obstacles = torch.tensor([bool(scene.obstacles) for scene in scenes], device=device)
+        self._has_obstacles = has_obstacles
+        self.current = torch.where(has_obstacles, self._first, -1)
+        self.entries = obstacle_tokens(scenes, observe.obstacles, device)
+        self._is_observed = observe.state
+        if not observe.state:
+            self.entries = {name: torch.zeros_like(v) for name, v in self.entries.items()}
+        num_obstacles = max(len(scene.obstacles) for scene in scenes)
+        self._layout_poses = _layout_poses(specs, num_obstacles).to(device)
+        self.poses = torch.zeros(len(scenes), num_obstacles, 7, device=device)
+        self._place()
+
+    @property
+    def any(self) -> bool:
+        """Whether an environment has obstacles."""
+        return self.poses.shape[1] > 0
+
+    def draw(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
+        """Draw the layouts of new episodes."""
+        if self.any:
+            layout = self._first + random.integers(Stream.LAYOUT, self._count)
+            self.current.copy_(torch.where(mask & self._has_obstacles, layout, self.current))
+            self._place()
+
+    def obstacles(self, env: int) -> tuple[Block, ...]:
+        """Return the obstacles of an environment at their current poses."""
+        spec, layout = self._specs[env], int(self.current[env])
+        if layout < 0:
+            return ()
+        return place_boxes(spec.scene.obstacles, spec.goals.layouts[layout])
+
+    def scene(self, env: int) -> Scene:
+        """Return the scene of an environment with its obstacles at their current poses."""
+        scene: Scene = self._specs[env].scene
+        return replace(scene, obstacles=self.obstacles(env))
+
+    def _place(self) -> None:
+        """Put the obstacles where the current layouts have them."""
+        self.poses.copy_(self._layout_poses[self._index, self.current.clamp(min=0)])
+        if self._is_observed:
+            self.entries["obstacles"][:, : self.poses.shape[1], :7] = self.poses
+
+
+def _layout_poses(specs: Sequence[EnvSpec], num_obstacles: int) -> torch.Tensor:
+    """Return the poses of the obstacles of S specifications in all L layouts, (S, L, O, 7).
+
+    There are zeros where a specification has fewer obstacles or layouts.
+    """
+    layouts = {
+        i: torch.from_numpy(spec.goals.layouts[:, :num_obstacles])
+        for i, spec in enumerate(specs)
+        if spec.scene.obstacles
+    }
+    num_layouts = max(map(len, layouts.values()), default=1)
+    table = torch.zeros(len(specs), num_layouts, num_obstacles, 7)
+    for i, poses in layouts.items():
+        table[i, : len(poses), : poses.shape[1]] = poses
+    return table
+
+
+NOISE = 0.005
+"""Standard deviation of a point's position along each axis, as of a depth camera [m]."""
+_NUMBERS = 8
+"""Random numbers of a point: its face, its position in the box, and two pairs for noise."""
+
+
+class PointClouds:
+    """P points on the surfaces of every environment's block and obstacles.
+
+    Each episode draws its points and their noise at its beginning, uniformly over all surfaces.
+
+    Attributes:
+        mask: Existing points, shape (n, P), bool.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
+        """Prepare; ``begin`` draws the points."""
+        n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
+        self._num_points = num_points
+        self._local = torch.zeros(n, num_points, 3, device=device)
+        self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
+        # Box 0 is the block, and the others are the obstacles; missing ones have no size.
+        sizes = torch.zeros(n, 1 + num_obstacles, 3)
+        for i, scene in enumerate(scenes):
+            if scene.block is not None:
+                sizes[i, 0] = torch.tensor(scene.block.size)
+            for k, box in enumerate(scene.obstacles, start=1):
+                sizes[i, k] = torch.tensor(box.size)
+        self._sizes = sizes.to(device)
+        x, y, z = sizes.double().unbind(2)
+        # Areas of the faces across x, y and z of all boxes, added up, as fractions of their sum.
+        areas = torch.stack([y * z, x * z, x * y], dim=2).flatten(1).cumsum(dim=1)
+        has_boxes = areas[:, -1:] > 0
+        self._area = torch.where(has_boxes, areas / areas[:, -1:], 1.0).float().to(device)
+        self.mask = has_boxes.repeat(1, num_points).to(device)
+
+    def begin(
+        self, mask: torch.Tensor, random: EpisodeRandom, obstacle_poses: torch.Tensor
+    ) -> None:
+        """Draw the points of new episodes among obstacles at poses in the world, (n, O, 7)."""
+        n, P = self._on_block.shape
+        numbers = random.uniform(Stream.POINTS, P * _NUMBERS).view(n, P, _NUMBERS)
+        face = torch.searchsorted(self._area, numbers[..., 0].contiguous(), right=True)
+        box, axis = face // 3, face % 3
+        position = numbers[..., 1:4] - 0.5
+        is_across = torch.arange(3, device=axis.device) == axis[..., None]
+        position = torch.where(is_across, torch.where(position < 0, -0.5, 0.5), position)
+        rows = torch.arange(n, device=axis.device)[:, None]
+        local = position * self._sizes[rows, box] + NOISE * _normal(numbers[..., 4:])[..., :3]
+        on_block = box == 0
+        if obstacle_poses.shape[1]:
+            pose = obstacle_poses[rows, (box - 1).clamp(min=0)]
+            R = matrix_from_quaternion(pose[..., 3:])
+            world = (R * local[..., None, :]).sum(dim=-1) + pose[..., :3]
+            local = torch.where(on_block[..., None], local, world)
+        self._local.copy_(torch.where((mask[:, None] & self.mask)[..., None], local, self._local))
+        self._on_block.copy_(torch.where(mask[:, None], on_block & self.mask, self._on_block))
+
+    def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
+        """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes."""
+        R = matrix_from_quaternion(block_pose[:, 3:])
+        moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
+        return torch.where(self._on_block[..., None], moved, self._local)
+
+
+def _normal(uniform: torch.Tensor) -> torch.Tensor:
+    """Return normal numbers from uniform ones in [0, 1) (Box and Muller 1958), shape (..., 2 m)."""
+    first, second = uniform.chunk(2, dim=-1)
+    radius = torch.sqrt(-2 * torch.log1p(-first))
+    angle = 2 * math.pi * second
+    return torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
+
+
+SAME = 0.02
+"""Largest difference of joints between configurations that count as the same [rad or m]."""
+COMPARED = 12
+"""Number of different configurations whose paths are tested."""
+
+
+class StraightPaths:
+    """Finds the first configuration that a robot reaches on a straight path without a collision.
+
+    Links, the ground and the obstacles of the running episode count; see ``FreeSpace``.
+    """
+
+    def __init__(self, layouts: EpisodeLayouts, env_robot_index: torch.Tensor) -> None:
+        """Prepare tests in all environments; a robot's scene is compiled when it is first used."""
+        self._layouts, self._robots = layouts, env_robot_index.tolist()
+        self._spaces: dict[int, FreeSpace] = {}
+
+    def __call__(self, env: int, start: Array, ends: Array) -> int | None:
+        """Return the index of the first of some ends (k, J) with a free path from (J,), or None."""
+        space = self.space(env)
+        dof = space.scene.robot.dof
+        tested: list[Array] = []
+        for i, end in enumerate(ends[:, :dof]):
+            if any(np.abs(end - other).max() < SAME for other in tested):
+                continue
+            if space.free_fraction(start[:dof], end) == 1:
+                return i
+            tested.append(end)
+            if len(tested) == COMPARED:
+                break
+        return None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which compiles the scenes again."""
+        return vars(self) | {"_spaces": {}}
+
+    def space(self, env: int) -> FreeSpace:
+        """Return the scene of an environment, with its obstacles at their current poses."""
+        robot = self._robots[env]
+        if robot not in self._spaces:
+            self._spaces[robot] = FreeSpace(self._layouts.scene(env))
+        elif obstacles := self._layouts.obstacles(env):
+            self._spaces[robot].place_obstacles([obstacle.pose for obstacle in obstacles])
+        return self._spaces[robot]
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicsState:
+    """State of the robots and blocks of n environments; see ``Simulation``."""
+
+    q: torch.Tensor
+    qd: torch.Tensor
+    block_pose: torch.Tensor
+
+
+class BatchObservation:
+    """Computes the observations of a batch.
+
+    Attributes:
+        tool_positions: Function that returns the positions of the tools (n, 3) [m] at joint
+            positions (n, J).
+    """
+
+    def __init__(
+        self,
+        robot_tables: RobotTables,
+        specs: Sequence[EnvSpec],
+        env_robot_index: torch.Tensor,
+        groups: TaskGroups,
+        layouts: EpisodeLayouts,
+        action_mask: torch.Tensor,
+        config: ObservationConfig,
+        paths: StraightPaths,
+    ) -> None:
+        """Gather the tables of all environments."""
+        self._tables, self._index, self._config = robot_tables, env_robot_index, config
+        self._groups, self._layouts = groups, layouts
+        index, device = env_robot_index, env_robot_index.device
+        self._tokens = LinkTokens(robot_tables, index)
+        self.tool_positions = FramePositions(robot_tables.tool_chain, index)
+        scenes = [specs[i].scene for i in index.tolist()]
+        self._constant_entries = {
+            "links": robot_tables.link_mask[index],
+            "actions": action_mask,
+            **groups.masks,
+            **layouts.entries,
+        }
+        if config.tree:
+            self._constant_entries |= tree_entries(
+                robot_tables, index, action_mask, config.tree_joints
+            )
+        self._kinematics: KinematicChannels | None = None
+        if names := config.kinematic_channels:
+            has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
+            self._kinematics = KinematicChannels(
+                robot_tables, index, names, has_block=has_block, first_free=paths
+            )
+        self._points: PointClouds | None = None
+        if config.points:
+            self._points = PointClouds(scenes, config.points, device)
+            self._constant_entries["point_mask"] = self._points.mask
+
+    def begin(self, mask: torch.Tensor, random: EpisodeRandom) -> None:
+        """Begin episodes, whose layouts are drawn."""
+        if self._points is not None:
+            self._points.begin(mask, random, self._layouts.poses)
+        if self._kinematics is not None:
+            self._kinematics.begin(mask)
+
+    def __call__(
+        self, state: PhysicsState, targets: torch.Tensor, previous_action: torch.Tensor
+    ) -> Observation:
+        """Return the observation in a state, in tensors that the caller owns."""
+        return {
+            "tokens": self._tokens(state.q),
+            **self._groups.fields(state.block_pose),
+            **copied(self._constant_entries),
+            **self.requested(state, targets, previous_action),
+        }
+
+    def requested(
+        self, state: PhysicsState, targets: torch.Tensor, previous_action: torch.Tensor
+    ) -> Observation:
+        """Return the entries that the configuration asks for; the arguments are those of a call."""
+        q, block_pose, config = state.q, state.block_pose, self._config
+        observation: Observation = {}
+        if not config.state:
+            observation["object"] = torch.zeros(len(q), OBJECT.size, device=q.device)
+        if config.velocity:
+            observation["velocity"] = joint_to_link(self._tables, self._index, state.qd)
+        if config.previous_action:
+            observation["previous_action"] = previous_action.clone()
+        if config.tool:
+            observation["tool"] = self.tool_positions(q)
+        if self._kinematics is not None:
+            goals = self._groups.tool_targets(block_pose)
+            observation |= self._kinematics(q, targets, goals, block_pose)
+        if self._points is not None:
+            observation["points"] = self._points(block_pose)
+        return observation
+
+
+def copied(observation: Observation) -> Observation:
+    """Return an observation in new tensors."""
+    return {name: values.clone() for name, values in observation.items()}

@@ -10,8 +10,8 @@ import torch
 
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import joint_limits
-from morphgen.tasks.batch_observation import StraightPaths
 from morphgen.tasks.free_space import outside_limits
+from morphgen.tasks.observation import StraightPaths
 from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import TaskGroups
 from morphgen.typing import Array

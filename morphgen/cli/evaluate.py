@@ -214,7 +214,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.runs.robot_source import other_side
     from morphgen.rl.runs.training import checkpoint_files
     from morphgen.rl.scores.submission import Training
-    from morphgen.tasks.device import require_device
+    from morphgen.tasks.registry import require_device
 
     require_device(args.device)
     path = checkpoint_path(args.checkpoint)

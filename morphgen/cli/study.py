@@ -131,7 +131,7 @@ def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) 
     """Require that training and fine-tuning of a cell can begin, before any of them does."""
     from morphgen.rl.runs.training import is_done, require_runnable, subruns_of
     from morphgen.rl.scores.study import finetuning_run
-    from morphgen.tasks.device import require_device
+    from morphgen.tasks.registry import require_device
 
     parts = subruns_of(cell.folder, config)
     for part in parts:

@@ -329,7 +329,7 @@ def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
     with status(args, "loading"):
         from morphgen.rl.runs.robot_source import other_side
-        from morphgen.tasks.device import batch_device, require_simulator_device
+        from morphgen.tasks.registry import batch_device, require_simulator_device
 
     sim = args.sim or DEFAULT_SIMULATOR
     require_simulator_device(sim, batch_device(sim, args.device))

@@ -50,8 +50,7 @@ from morphgen.rl.runs.robot_source import (
     write_drawn,
 )
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.device import batch_device, require_device
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import TASKS, batch_device, require_device
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import batch_from_specs
 

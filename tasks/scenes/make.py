@@ -28,7 +28,6 @@ from morphgen.model.robot import Robot
 from morphgen.progress import own_progress, show_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.random_numbers import require_seed
@@ -38,6 +37,7 @@ from morphgen.tasks.registry import (
     SIMULATORS,
     CollisionGeometry,
     installed_simulators,
+    require_simulator_device,
 )
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.scenes.obstacles import LayoutSide

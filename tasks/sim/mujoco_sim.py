@@ -145,10 +145,6 @@ class MujocoState:
             for env in np.flatnonzero(full | diverged).tolist()
         }
 
-    def release(self) -> None:
-        """Release the environments' data."""
-        self._positions = self._velocities = self._warnings = GatheredArrays(())
-
 
 BY_ERROR = CONTROL_STEP[1, 0] / CONTROL_PERIOD
 BY_VELOCITY = (CONTROL_STEP[1, 1] - 1) / CONTROL_PERIOD
@@ -228,11 +224,6 @@ class PositionControl:
         np.multiply(leader_forces.reshape(self._shape), self._compliance, out=out)
         out += q + error - PASSIVE * 2 / BANDWIDTH * qd - mean_acceleration / (GAIN * BANDWIDTH**2)
         np.multiply(self._damping.flat, velocities, out=self._applied)
-
-    def release(self) -> None:
-        """Release the environments' data."""
-        self._products = []
-        self._data_forces = GatheredArrays(())
 
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
@@ -374,8 +365,8 @@ class MujocoSimulation:
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
-        self._state.release()
-        self._control.release()
+        if self._work:
+            del self._state, self._control  # they have views of the data
         self._work, self._data, self._worlds = [], [], []
 
     def movable_q(self, env: int) -> Array:

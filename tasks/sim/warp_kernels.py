@@ -129,15 +129,6 @@ def controls(
 
 
 @wp.kernel
-def targets_as_controls(
-    joints: Joints, targets: wp.array2d[float], control: wp.array2d[float]
-) -> None:
-    """Copy the targets of the independent joints to the actuators. Threads: (worlds, J)."""
-    world, joint = wp.tid()
-    control[world, joint] = targets[joints.env[world], joint]
-
-
-@wp.kernel
 def read_state(
     joints: Joints,
     things: Things,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,20 +51,6 @@ class Structure:
     """Rows of the fields of the model that differ, R rows each."""
 
 
-@dataclass
-class _Group:
-    """A structure while its environments are collected."""
-
-    first: World
-    """Compiled scene with which the others are compared."""
-    size: int = 0
-    """Number of different compiled scenes."""
-    batched: dict[str, None] = field(default_factory=dict)
-    """Names of the fields in which they differ."""
-    envs: list[int] = field(default_factory=list)
-    """Environments."""
-
-
 def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
     """Group environments by the structure of their models.
 
@@ -73,30 +59,29 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
     and meshes. Masses, poses, sizes, limits and gains may differ.
     """
     models: dict[int, Model] = {}
-    groups: list[_Group] = []
-    group_of_world: dict[int, _Group] = {}
+    envs_of: dict[int, list[int]] = {}  # environments of each compiled scene
+    groups: list[tuple[list[World], dict[str, None]]] = []
     for env, world in enumerate(compiled):
-        if id(world) not in group_of_world:
+        if id(world) not in models:
             models[id(world)] = model = _warp_model(world, scenes[env])
-            for group in groups:
-                names = _differences(models[id(group.first)], model)
-                if all(map(_is_batched, names)) and _same_indices(group.first, world):
-                    group.batched.update(dict.fromkeys(names))
+            for members, batched in groups:
+                names = _differences(models[id(members[0])], model)
+                if all(map(_is_batched, names)) and _same_indices(members[0], world):
+                    members.append(world)
+                    batched.update(dict.fromkeys(names))
                     break
             else:
-                group = _Group(world)
-                groups.append(group)
-            group.size += 1
-            group_of_world[id(world)] = group
-        group_of_world[id(world)].envs.append(env)
+                groups.append(([world], {}))
+        envs_of.setdefault(id(world), []).append(env)
     found = []
-    for group in groups:
-        rows = _cyclic_rows([compiled[env] for env in group.envs], group.size)
-        batched = {
+    for members, batched in groups:
+        envs = sorted(env for world in members for env in envs_of[id(world)])
+        rows = _cyclic_rows([compiled[env] for env in envs], len(members))
+        numbers = {
             name: np.concatenate([getattr(models[id(world)], name).numpy() for world in rows])
-            for name in group.batched
+            for name in batched
         }
-        found.append(Structure(rows, np.array(group.envs, dtype=np.int64), batched))
+        found.append(Structure(rows, np.array(envs, dtype=np.int64), numbers))
     return found
 
 
@@ -248,20 +233,6 @@ class Group:
             mujoco_warp.step(self.model, self.data)
         self.read()
         self._find_diverged()
-
-    def step_library(self) -> None:
-        """Launch the library's kernels of a control step alone, for ``benchmarks/gpu_speed.py``.
-
-        Targets are the controls of the actuators, without the forces of inverse dynamics.
-        """
-        wp.launch(
-            kernels.targets_as_controls,
-            self.data.ctrl.shape,
-            [self._joints, self._buffers["targets"]],
-            [self.data.ctrl],
-        )
-        for _ in range(SUBSTEPS):
-            mujoco_warp.step(self.model, self.data)
 
     def _launch_control(self) -> None:
         """Compute the controls of the actuators from the targets."""

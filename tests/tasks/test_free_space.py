@@ -18,8 +18,8 @@ from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space as module
-from morphgen.tasks.batch_observation import SAME, StraightPaths
 from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
+from morphgen.tasks.observation import SAME, StraightPaths
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.sim.base import Block, Scene

@@ -17,10 +17,14 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.device import batch_device
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.registry import SIMULATORS, evaluation_simulator, installed_simulators
+from morphgen.tasks.registry import (
+    SIMULATORS,
+    batch_device,
+    evaluation_simulator,
+    installed_simulators,
+)
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts, Scene
 from morphgen.tasks.sim.kinematic import NO_CONTACTS, KinematicSimulation

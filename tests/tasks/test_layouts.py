@@ -14,10 +14,9 @@ from morphgen.model.geometry import Pose
 from morphgen.progress import show_progress
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.scripted_push import ScriptedPush
-from morphgen.tasks.batch_observation import NOISE
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.gym.env import TaskEnv
-from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.render.renderer import render_state

@@ -88,9 +88,15 @@ def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
     assert among.goals.key == single[0].goals.key == single[1].goals.key
     assert (among.goals.q == single[0].goals.q).all()
     assert (among.goals.poses == single[1].goals.poses).all()
+    body = robot(TRAIN[1])
+    alone = sample_robot_goals(body, "reach", RECIPE, obstacles=False, cache=tmp_path / "alone")
+    assert (alone.side, alone.goals.key) == (None, among.goals.key)
+    toolless = replace(body, frames=())
+    wrong = sample_robot_goals(toolless, "push", RECIPE, obstacles=False, cache=tmp_path)
+    assert "no frame 'tool'" in wrong.error
 
 
-def test_every_member_has_a_set_in_train_test_order(cache):
+def test_every_member_has_a_set_in_train_test_order(cache, monkeypatch):
     member_sets = sample_sets(mixed(), cache, certified=True)
     assert [(one.side, one.robot, one.task) for one in member_sets] == [
         ("train", "gantry-plane", "reach"),
@@ -102,6 +108,17 @@ def test_every_member_has_a_set_in_train_test_order(cache):
     assert [one.certificate_errors for one in member_sets] == [(), (), ()]
     assert [0 < one.acceptance <= 1 for one in member_sets] == [True] * 3
     assert [one.certificate_errors for one in sample_sets(mixed(), cache)] == [None] * 3
+    line = "goal 3: its configuration is in collision"
+    monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
+    assert sample_sets(mixed(), cache, certified=True)[0].certificate_errors == (line,)
+
+
+def test_sets_drawn_in_several_processes_are_the_same_bytes(tmp_path):
+    here, there = (
+        [set_npz(one.goals) for one in sample_sets(mixed(), tmp_path / str(jobs), jobs=jobs)]
+        for jobs in (1, 2)
+    )
+    assert here == there
 
 
 def test_robot_without_goals_does_not_stop_the_others(tmp_path, monkeypatch):
@@ -116,13 +133,6 @@ def test_robot_without_goals_does_not_stop_the_others(tmp_path, monkeypatch):
     assert re.search(r"only \d of 12 random configurations .* \(acceptance rate 0\.\d+\)", few)
     assert "unknown part 'cubw'" in part
     assert fine == ""
-
-
-def test_uncertified_set_reports_its_faults(cache, monkeypatch):
-    line = "goal 3: its configuration is in collision"
-    monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
-    member_sets = sample_sets(reaching(), cache, certified=True)
-    assert {one.certificate_errors for one in member_sets} == {(line,)}
 
 
 def test_interrupted_run_reuses_completed_sets(tmp_path, monkeypatch):
@@ -142,33 +152,6 @@ def test_interrupted_run_reuses_completed_sets(tmp_path, monkeypatch):
         same(a.goals, b.goals)
         for a, b in zip(member_sets, sample_sets(reaching(), cache), strict=True)
     )
-
-
-@pytest.mark.slow
-def test_sets_do_not_depend_on_the_number_of_processes(tmp_path):
-    sizes = [f"base=gantry ee=cube ee.size={size}mm" for size in range(60, 68)]
-    which = split(
-        [member(words, f"cube-{i}", task="reach") for i, words in enumerate(sizes)],
-        [member(TEST[0], task="reach")],
-    )
-    here, there = (
-        sample_sets(which, tmp_path / str(jobs), jobs=jobs, certified=True) for jobs in (1, 2)
-    )
-    assert [one.robot for one in here] == [one.robot for one in there]
-    assert all(same(a.goals, b.goals) for a, b in zip(here, there, strict=True))
-    assert all(one.certificate_errors == () for one in there)
-
-
-def test_single_robot_has_the_same_set_as_in_a_split(cache):
-    body = robot("base=gantry ee=plane")
-    alone = sample_robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
-    among = sample_sets(reaching(), cache)[0]
-    assert (alone.side, alone.robot) == (None, body.name)
-    assert alone.goals.key == among.goals.key
-    wrong = sample_robot_goals(
-        replace(body, frames=()), "push", RECIPE, obstacles=False, cache=cache
-    )
-    assert "no frame 'tool'" in wrong.error
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +175,12 @@ def test_stored_sets_are_read_back_unchanged(home, cache):
     assert write_goals(home, member_sets, RECIPE) == home / "goals"
     read = read_split_goals(home)
     assert read.config == RECIPE
+    index = json.loads((home / "goals" / "index.json").read_text())
+    assert (index["format"], index["seed"], index["reach"]["goals"]) == (2, 0, 12)
+    for record, one in zip(index["sets"], member_sets, strict=True):
+        keys = ("robot", "side", "body", "key", "seed", "acceptance")
+        expected = [one.robot, one.side, one.robot_hash, one.goals.key, 0, one.acceptance]
+        assert [record[key] for key in keys] == expected
     assert read.sets.keys() == SplitGoals.from_results(member_sets, RECIPE).sets.keys()
     for one in member_sets:
         again = read.sets[one.side, one.robot]
@@ -240,19 +229,6 @@ def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
             make_split_batch(which, "train", 2, **{**options, **wrong})
 
 
-def test_index_describes_the_sets(home, cache):
-    member_sets = sample_sets(mixed(), cache)
-    write_goals(home, member_sets, RECIPE)
-    index = json.loads((home / "goals" / "index.json").read_text())
-    assert (index["format"], index["seed"], index["reach"]["goals"]) == (2, 0, 12)
-    for record, one in zip(index["sets"], member_sets, strict=True):
-        keys = ("robot", "side", "body", "key", "seed")
-        expected = [one.robot, one.side, one.robot_hash, one.goals.key, one.goals.seed]
-        assert [record[key] for key in keys] == expected
-        assert record["acceptance"] == record["accepted"] / record["tried"] == one.acceptance
-        assert (home / "goals" / record["file"]).is_file()
-
-
 def test_checksums_of_a_build_cover_its_goals(home, cache):
     write_goals(home, sample_sets(mixed(), cache), RECIPE)
     assert verify(home, LIBRARY).differences == ()
@@ -291,19 +267,11 @@ def test_missing_set_is_rejected_before_writing(home, cache):
     text = "train robot gantry-plane has no goal set: too few; nor has gantry-cylinder"
     assert str(caught.value) == text
     assert tree(home) == before
-
-
-def test_goals_are_added_only_to_finished_builds(tmp_path, cache):
-    member_sets = sample_sets(mixed(), cache)
-    (tmp_path / "other").mkdir()
-    with pytest.raises(MorphgenError, match="SHA256SUMS: no such file"):
-        write_goals(tmp_path / "other", member_sets, RECIPE)
-    assert tree(tmp_path / "other") == {}
-
-
-def test_build_without_goals_error_says_how_to_add_them(home):
     with pytest.raises(BenchmarkError, match=r"index\.json: no such file; morphgen split build --"):
         read_goals(home, "train")
+    (home / "SHA256SUMS").unlink()
+    with pytest.raises(MorphgenError, match="SHA256SUMS: no such file"):  # the build is unfinished
+        write_goals(home, member_sets, RECIPE)
 
 
 @pytest.mark.parametrize(
@@ -335,26 +303,24 @@ def test_broken_index_is_named(home, cache, old, new, message):
     assert str(home / "goals") in str(caught.value)
 
 
-def test_broken_file_is_named(cache, tmp_path):
-    whole = sample_sets(reaching(), cache)[0].goals
-    content = set_npz(whole)
-    path = tmp_path / "some.npz"
-    for broken in (b"", content[:100], content[:-200]):
-        with pytest.raises(BenchmarkError, match=r"some\.npz: not a goal set for reach"):
-            goals_from_npz(broken, "reach", path)
-    for wrong in (replace(whole, poses=whole.poses[1:]), replace(whole, q=whole.q[0])):
-        with pytest.raises(BenchmarkError, match=r"some\.npz: configurations and poses have"):
-            goals_from_npz(set_npz(wrong), "reach", path)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("name", ["q", "poses"])
-def test_non_finite_numbers_are_rejected(cache, tmp_path, name, value):
-    whole = sample_sets(reaching(), cache)[0].goals
-    values = getattr(whole, name).copy()
+def with_number(goals, name, value):
+    values = getattr(goals, name).copy()
     values[1, 2] = value
-    content = set_npz(replace(whole, **{name: values}))
-    with pytest.raises(
-        BenchmarkError, match=rf"s\.npz: not a goal set .*: {name} has a number that is"
-    ):
-        goals_from_npz(content, "reach", tmp_path / "s.npz")
+    return set_npz(replace(goals, **{name: values}))
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda goals: b"", "not a goal set for reach"),
+        (lambda goals: set_npz(goals)[:-200], "not a goal set for reach"),
+        (lambda goals: set_npz(replace(goals, poses=goals.poses[1:])), "configurations and poses"),
+        (lambda goals: set_npz(replace(goals, q=goals.q[0])), "configurations and poses have"),
+        (lambda goals: with_number(goals, "q", np.nan), ".*: q has a number that is not finite"),
+        (lambda goals: with_number(goals, "poses", np.inf), ".*: poses has a number that is not"),
+    ],
+)
+def test_broken_file_is_named(cache, tmp_path, broken, message):
+    content = broken(sample_sets(reaching(), cache)[0].goals)
+    with pytest.raises(BenchmarkError, match=rf"some\.npz: {message}"):
+        goals_from_npz(content, "reach", tmp_path / "some.npz")
