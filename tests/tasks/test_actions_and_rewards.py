@@ -33,13 +33,6 @@ from morphgen.tasks.task import TaskState
 CPU = torch.device("cpu")
 
 
-def test_continuous_actions_are_clipped_and_discrete_actions_index_bins():
-    shares = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
-    assert shares.tolist() == [[1.0, -0.5]]
-    shares = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
-    assert shares.tolist() == [[-1.0, 0.0, 1.0]]
-
-
 @pytest.mark.parametrize(
     ("actions", "kind", "words"),
     [
@@ -50,20 +43,13 @@ def test_continuous_actions_are_clipped_and_discrete_actions_index_bins():
         (torch.tensor([[0.0, 1.0]]), "discrete", "integers from 0"),
     ],
 )
-def test_invalid_actions_are_rejected(actions, kind, words):
+def test_invalid_actions_are_rejected_and_others_clipped(actions, kind, words):
+    numbers = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
+    assert numbers.tolist() == [[1.0, -0.5]]
+    numbers = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
+    assert numbers.tolist() == [[-1.0, 0.0, 1.0]]
     with pytest.raises(TaskError, match=words):
         decode_actions(actions, kind, (1, 2), CPU)
-
-
-def test_targets_move_from_the_previous_targets_by_each_joints_step(robot_tables):
-    body = torch.tensor([0, 1, 1])
-    mask = robot_tables.action_mask(fingers=True)[body]
-    before = robot_tables.home[body]
-    shares = torch.ones(3, robot_tables.max_links)
-    after = JointTargets(robot_tables, body, mask)(before, shares)
-    expected = torch.minimum(before + robot_tables.max_step[body], robot_tables.upper[body])
-    assert torch.equal(after, expected)
-    assert (after[0, 6:] == 0).all()
 
 
 def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
@@ -71,6 +57,12 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     mask = robot_tables.action_mask(fingers=False)[body]
     targets = robot_tables.home[body]
     moved_by = JointTargets(robot_tables, body, mask)
+    half = torch.minimum(targets + robot_tables.max_step[body] / 2, robot_tables.upper[body])
+    moves_tool = robot_tables.moves_tool[body]
+    assert torch.equal(
+        moved_by(targets, torch.full((1, robot_tables.max_links), 0.5)),
+        torch.where(moves_tool, half, targets),
+    )
     for _ in range(400):
         targets = moved_by(targets, torch.ones(1, robot_tables.max_links))
     moved = robot_tables.moves_tool[1]

@@ -12,7 +12,9 @@ from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import TOOL
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -185,3 +187,10 @@ def test_observed_tool_position_matches_forward_kinematics(build_batch):
         expected = frame_pose(each.robot, q[None], TOOL)[0, :3, 3]
         assert step.observation["tool"][env].tolist() == pytest.approx(expected, abs=1e-5)
         assert np.linalg.norm(expected - each.goals.poses[0, :3]) > 0.01
+
+
+def test_inverse_kinematics_reaches_its_goals_in_mujoco(build_batch):
+    batch = build_batch(config=replace(CONFIG, max_episode_steps=150))
+    episodes = run_episodes(batch, BASELINES["ik"].make(0), 1)
+    assert len(episodes) == 3
+    assert all(episode.success for episode in episodes)

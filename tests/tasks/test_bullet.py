@@ -10,7 +10,6 @@ import torch
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError
-from morphgen.model.dynamics import mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,
@@ -125,19 +124,6 @@ def test_link_poses_match_forward_kinematics(simulate, request_):
         )
         expected = T_world_link[body.link_index[name], :3, 3]
         assert found[4] == pytest.approx(expected, abs=1e-6), name
-
-
-def test_effort_is_limited(simulate):
-    body = robot("prims")
-    weak = tuple(replace(j, effort=5.0) if j.name == "gantry_x" else j for j in body.joints)
-    body = replace(body, joints=weak)
-    simulation = simulate(Scene(body))
-    q = reset(simulation, body.home)
-    q[0, 0] = 0.5
-    simulation.step(q)
-    acceleration = 5.0 / mass_matrix(body, body.home)[0, 0]
-    expected = acceleration * SUBSTEPS * TIMESTEP
-    assert float(simulation.qd[0, 0]) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("pushes", [False, True])

@@ -12,14 +12,12 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium import wrappers
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector
-from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -548,18 +546,6 @@ def test_goal_environments_compute_rewards_of_other_goals():
     with closing(make()) as env:
         assert not env.has_wrapper_attr("compute_reward")
         assert isinstance(env.observation_space["goal"], Box)
-
-
-@pytest.mark.slow
-def test_hindsight_replay_learns():
-    vec = make_vec_env(partial(make, goal_env=True), n_envs=2, seed=0)
-    model = SAC(
-        "MultiInputPolicy", vec, replay_buffer_class=HerReplayBuffer, learning_starts=40, seed=0
-    )
-    model.learn(200)
-    batch = model.replay_buffer.sample(64)
-    assert torch.isfinite(batch.rewards).all()
-    vec.close()
 
 
 @pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)])

@@ -183,16 +183,6 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
         stub_batch(specs, MIXED, 3).load_state_dict(one.state_dict())
 
 
-def test_a_seeded_reset_begins_with_the_first_episodes(specs):
-    one, other = (stub_batch(specs, MIXED, 6, seed=seed) for seed in (3, 2**64 - 1))
-    first = one.reset()
-    one.reset()
-    for name, values in other.reset(seed=3).items():
-        assert torch.equal(values, first[name]), name
-    with pytest.raises(TaskError, match="seed -1: expected 0 to"):
-        one.reset(seed=-1)
-
-
 @pytest.mark.parametrize("names", [("reach",), ("push",), MIXED])
 def test_skipping_what_changes_nothing_changes_no_bit(specs, names, monkeypatch):
     batches = [stub_batch(specs, names, 6, seed=3, observe=CHANNELS) for _ in range(2)]

@@ -149,6 +149,8 @@ def test_last_state_of_an_episode_can_be_rendered(make, name, robot):
     """The batch itself has already started the next episode."""
     env = make(name, robot, render_mode="rgb_array", size=(160, 120)).unwrapped
     env.reset(seed=3)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert make(name, robot).unwrapped.render() is None
     action = np.zeros(env.action_space.shape, dtype=np.float32)
     frames = [env.render()]
     for _ in range(STEPS):
@@ -158,13 +160,6 @@ def test_last_state_of_an_episode_can_be_rendered(make, name, robot):
     env.reset()
     moved = np.abs(env.render().astype(int) - frames[-1]).mean()
     assert still < moved / 5
-
-
-def test_no_render_mode_returns_no_frame(make):
-    env = make("morphgen/Reach-v0")
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="render_mode"):
-        assert env.unwrapped.render() is None
 
 
 def test_closed_environment_raises_a_clear_error(make):

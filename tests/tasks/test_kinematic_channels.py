@@ -16,7 +16,6 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import (
     COLUMN_SCALE,
     IK_SHARE,
@@ -209,17 +208,6 @@ def test_channels_are_asked_for_by_name():
         observation_config(["no_state"])
 
 
-def test_without_state_boxes_are_hidden(tmp_path):
-    robot = morphgen.compose("arm3", geometry="primitive")
-    config = replace(PushConfig(), num_goals=2)
-    spec = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)
-    hidden = observation_config(["points", "no_state"])
-    observation = batch_from_specs([spec], 1, sim="mujoco", observe=hidden).reset()
-    assert not observation["object"].any()
-    assert observation["points"].any()
-    assert observation["line"].any()
-
-
 CHANGE = 3
 """Column of the channel with the displacement of the joint in rad or m."""
 
@@ -284,15 +272,6 @@ def test_following_the_channel_reaches_every_goal_without_contacts(specs):
     assert all(episode.success for episode in episodes)
 
 
-def test_the_path_is_free_of_collisions(specs):
-    batch = batch_of(specs[1:], 30)
-    ends = solution_of(batch, batch.reset()).double().numpy()
-    space = FreeSpace(specs[1].scene)
-    starts = batch.targets.double().numpy()
-    free = [space.free_fraction(*path) == 1 for path in zip(starts, ends, strict=True)]
-    assert sum(free) >= 29
-
-
 def test_a_residual_policy_begins_with_the_path_that_the_channel_shows(specs):
     policy = PolicyConfig(
         "me-graph", discrete=False, observe=("ik",), normalize=True, residual=True
@@ -318,14 +297,3 @@ def test_goals_that_are_poses_are_solved_with_their_orientation(specs):
     angle = torch.arccos(((trace - 1) / 2).clamp(-1, 1))
     # Most poses are found, not all.
     assert (near & (angle < 0.05)).float().mean() >= 0.8
-
-
-def test_push_shows_the_path_to_its_first_point_wherever_the_block_is(tmp_path):
-    robot = morphgen.compose("arm3", geometry="primitive")
-    config = replace(PushConfig(), num_goals=3)
-    spec = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)
-    batch = batch_from_specs([spec], 2, sim="mujoco", observe=observation_config(["ik"]))
-    q = solution_of(batch, batch.reset())
-    points = batch.groups.tool_targets(batch.simulation.block_pose).points[:, 0]
-    tool = frame_pose(batch.robot_tables.tool_chain, batch.env_robot_index, q)[:, :3, 3]
-    assert (torch.linalg.vector_norm(tool - points, dim=1) < 0.05).all()

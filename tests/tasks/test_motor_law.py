@@ -1,23 +1,18 @@
 """Force limits of the joint motors."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from helpers.robots import arm, finger
+from helpers.robots import finger
 from helpers.scenes import robot
 from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 from morphgen.tasks.sim.motor_law import (
-    FASTEST_SLIDE,
-    FASTEST_TURN,
     GAIN,
     LAG,
     SLACK,
     MotorForces,
-    speed_limit,
 )
 
 PLENTY = 1e9
@@ -28,13 +23,6 @@ def limits(body, error, velocity=0.0, effort=PLENTY):
     errors, velocities = (np.broadcast_to(each, rows).astype(float) for each in (error, velocity))
     motors = MotorForces([body], [effort] * rows)
     return motors.limits((errors, errors), (velocities, velocities))
-
-
-def test_blocked_slide_force_equals_stiffness_times_error():
-    (along, up) = limits(finger(2.0), 0.01)
-    spring = (1 + SLACK) * GAIN * BANDWIDTH**2 * 0.01
-    assert along == pytest.approx(spring * 2.2)
-    assert up == pytest.approx(spring * 2.0)
 
 
 def test_joint_forces_of_an_arm_are_coupled():
@@ -51,23 +39,9 @@ def test_force_is_zero_at_rest_and_never_exceeds_the_effort():
     assert (limits(finger(), 0.05, effort=3.0) == 3).all()
 
 
-def test_force_at_the_expected_lag_is_only_the_slack():
-    speed = 0.3
-    (along, _) = limits(finger(2.0), 2 * speed / BANDWIDTH, speed)
-    assert along == pytest.approx(SLACK * GAIN * 2.2 * 4 * BANDWIDTH * speed)
-
-
 def test_position_error_is_limited_by_the_speed_limit():
     fast = 2.0
     assert (limits(finger(), 50.0) == limits(finger(), LAG * fast)).all()
-
-
-def test_joints_without_a_speed_limit_use_the_default():
-    body = arm()
-    joints = {joint.name: joint for joint in body.joints}
-    assert speed_limit(joints["elbow"]) == 2.0
-    assert speed_limit(replace(joints["elbow"], velocity=None)) == FASTEST_TURN
-    assert speed_limit(replace(joints["left"], velocity=None)) == FASTEST_SLIDE
 
 
 @pytest.mark.parametrize("mass", [0.1, 1.0, 5.0])

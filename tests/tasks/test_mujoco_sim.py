@@ -13,7 +13,7 @@ import torch
 from helpers.joint_targets import held
 from helpers.resets import reset_envs
 from helpers.robots import arm
-from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
+from helpers.scenes import mixed_scenes, push_scene, reach_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs
 from morphgen.errors import SimulationError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
@@ -54,21 +54,6 @@ def drive(sim, steps=25, seed=0):
 def put_back(sim, envs, home):
     q, pose = home
     reset_envs(sim, envs, q[envs], pose[envs])
-
-
-def test_effort_limit_bounds_the_lifted_load():
-    strong = real_arm_scene().robot
-    joints = tuple(replace(j, effort=5.0) if j.effort else j for j in strong.joints)
-    sim = MujocoSimulation(
-        [Scene(each, ground=None) for each in (strong, replace(strong, joints=joints))],
-        NOTHING_TOUCHES,
-    )
-    targets = sim.q + torch.tensor([0.3, 0, 0, 0, 0, 0])
-    for _ in range(5):
-        sim.step(targets)
-    moved = (sim.q[:, 0] - sim.scenes[0].robot.home[0]).tolist()
-    assert moved[0] > 0.15
-    assert 0 < moved[1] < 0.05
 
 
 def test_mimic_joints_root_poses_and_joint_order_are_kept():

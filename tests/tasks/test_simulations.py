@@ -154,20 +154,44 @@ def test_motors_hold_the_robot_against_gravity(load, scene):
 
 
 @pytest.mark.parametrize("sim", WITH_CONTACTS)
-@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims"])
-def test_motors_are_critically_damped(load, words):
-    body = robot(words)
-    free = replace(body, joints=tuple(replace(j, effort=None, velocity=None) for j in body.joints))
-    sim = load(Scene(free, ground=None), contacts=NOTHING_TOUCHES)
-    q, v = np.array(body.home), np.zeros(body.dof)
-    target = np.clip(q + 0.05 * (np.arange(body.dof) % 3 - 1), *joint_limits(body).T)
+def test_motors_are_critically_damped_in_a_whole_batch(load):
+    """Motors have the gains of their own robot, whatever else is in the batch."""
+    bodies = []
+    for words in ("arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims"):
+        joints = (replace(j, effort=None, velocity=None) for j in robot(words).joints)
+        bodies.append(replace(robot(words), joints=tuple(joints)))
+    sim = load(*(Scene(body, ground=None) for body in bodies), contacts=NOTHING_TOUCHES)
+    q, target = sim.q.double().numpy().copy(), np.zeros(sim.q.shape)
+    for env, body in enumerate(bodies):
+        moved = np.array(body.home) + 0.05 * (np.arange(body.dof) % 3 - 1)
+        target[env, : body.dof] = np.clip(moved, *joint_limits(body).T)
+    v = np.zeros_like(q)
     for _ in range(50):
-        sim.step(torch.tensor(target, dtype=torch.float32)[None])
+        sim.step(torch.from_numpy(target).float())
         for _ in range(SUBSTEPS):
             v = v + TIMESTEP * (BANDWIDTH**2 * (target - q) - 2 * BANDWIDTH * v)
             q = q + TIMESTEP * v
-        np.testing.assert_allclose(sim.q[0].numpy(), q, atol=3e-3)
-    np.testing.assert_allclose(sim.q[0].numpy(), target, atol=1e-4)
+        np.testing.assert_allclose(sim.q.numpy(), q, atol=3e-3)
+    np.testing.assert_allclose(sim.q.numpy(), target, atol=1e-4)
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_effort_limits_hold_in_a_whole_batch(load):
+    """Motors have the limits of their own robot: the weaker the motors, the later the arm."""
+    arm, scenes = robot("arm=ur5 ee=plane"), [Scene(robot("prims"), ground=None)]
+    for effort in (5.0, 15.0, 150.0):
+        joints = (replace(j, effort=effort) if j.effort else j for j in arm.joints)
+        scenes.append(Scene(replace(arm, joints=tuple(joints)), ground=None))
+    sim = load(*scenes, contacts=NOTHING_TOUCHES)
+    start, target = sim.q.clone(), sim.q.clone()
+    target[1:, 0] += 0.3
+    for _ in range(5):
+        sim.step(target)
+    still, weak, medium, strong = (sim.q - start)[:, 0].tolist()
+    assert abs(still) < 1e-4
+    assert 0 < weak < 0.05
+    assert 2 * weak < medium < strong / 2
+    assert strong > 0.15
 
 
 @pytest.mark.parametrize("sim", WITH_CONTACTS)
