@@ -389,51 +389,42 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
             writer: Any = imageio.get_writer(image or partial, **_writer_options(path.suffix, fps))
             with writer:
                 for frame in frames:
-                    _append(writer, frame)
+                    _append(writer, frame, path)
                     written += 1
             if image:
                 partial.write_bytes(image.getvalue())
             else:
-                _require_complete(partial, written)
+                _require_complete(partial, written, path)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
-    except VideoError as error:
-        raise FormatError(f"cannot write {path}: {error}") from error
 
 
-class VideoError(Exception):
-    """Reason why ffmpeg did not write a video."""
-
-
-def _append(
-    writer: Any,  # noqa: ANN401 - imageio has no type for it
-    frame: Frame,
-) -> None:
-    """Append a frame to a video; raise ``VideoError`` if ffmpeg has ended."""
+def _append(writer: Any, frame: Frame, path: Path) -> None:  # noqa: ANN401 - imageio has no type
+    """Append a frame to a video."""
     try:
         writer.append_data(frame)
     except OSError as error:
-        if error.errno is not None:
+        if error.errno is not None:  # else it is imageio's, as it finds the pipe to ffmpeg closed
             raise
-        raise VideoError(
-            "ffmpeg ended early; does it have the codec libx264, and is there room on the disk?"
+        raise FormatError(
+            f"cannot write {path}: ffmpeg ended early; does it have the codec libx264, and is "
+            "there room on the disk?"
         ) from error
     except RuntimeError as error:
-        raise VideoError(str(error)) from error
+        raise FormatError(f"cannot write {path}: {error}") from error
 
 
-def _require_complete(video: Path, frames: int) -> None:
+def _require_complete(video: Path, frames: int, path: Path) -> None:
     """Require that a video has all frames: imageio does not report ffmpeg's exit code."""
+    hint = "is the disk full, or was ffmpeg ended?"
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
     except RuntimeError as error:
-        raise VideoError(
-            "ffmpeg left a video that cannot be read; is the disk full, or was ffmpeg ended?"
+        raise FormatError(
+            f"cannot write {path}: ffmpeg left a video that cannot be read; {hint}"
         ) from error
     if count != frames:
-        raise VideoError(
-            f"ffmpeg wrote {count} of {frames} frames; is the disk full, or was ffmpeg ended?"
-        )
+        raise FormatError(f"cannot write {path}: ffmpeg wrote {count} of {frames} frames; {hint}")
 
 
 def _writer_options(suffix: str, fps: float) -> dict[str, Any]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own weight
 from morphgen.model.geometry import IDENTITY, Pose
@@ -169,6 +172,17 @@ class Simulator:
     """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
     takes_workers: bool = True
     """Whether processes or threads share its work; one without steps all environments at once."""
+
+
+def require_finite(scenes: Sequence[Scene], what: str, rows: NDArray[Any]) -> None:
+    """Require finite numbers in the row of each environment."""
+    finite = np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+    if not finite.all():
+        env = int(finite.argmin())
+        raise ValueError(
+            f"environment {env} (robot {scenes[env].robot.name!r}): {what} {rows[env].tolist()}; "
+            "expected finite numbers"
+        )
 
 
 def require_reset_shapes(

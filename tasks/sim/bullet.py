@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_reset_shapes
+from morphgen.tasks.sim.base import (
+    Contacts,
+    Scene,
+    Simulator,
+    require_finite,
+    require_reset_shapes,
+)
 from morphgen.tasks.sim.bullet_batch import (
     BulletBatch,
     ExportedRobot,
@@ -111,18 +117,22 @@ class BulletSimulation:
         self._require_open()
         joints = self._is_joint.shape[1]
         require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
-        indices = np.flatnonzero(mask.numpy())
-        positions, poses = self._checked_state(indices, q, block_pose)
+        rows, indices = mask.numpy(), np.flatnonzero(mask.numpy())
+        # Padding, poses without a block, and rows that are not reset may hold anything.
+        is_joint, is_block = rows[:, None] & self._is_joint, (rows & self._has_block)[:, None]
+        require_finite(self.scenes, "reset to q", np.where(is_joint, q.numpy(), 0))
+        require_finite(self.scenes, "reset to block", np.where(is_block, block_pose.numpy(), 0))
+        positions, poses = q.numpy()[indices], block_pose.numpy()[indices]
         obstacles: Float32 | None = None
         if obstacle_poses is not None:
-            obstacles = obstacle_poses.numpy()[indices]
-            if not np.isfinite(obstacles).all():
-                raise ValueError(f"reset of {len(indices)} environments: obstacles are not finite")
+            moved = np.where(rows[:, None, None], obstacle_poses.numpy(), 0)
+            require_finite(self.scenes, "reset to obstacles", moved)
+            obstacles = moved[indices]
 
         def state(envs: NDArray[np.int64]) -> BulletState:
-            rows = np.isin(indices, envs)
-            moved = None if obstacles is None else obstacles[rows]
-            return indices[rows], positions[rows], poses[rows], moved
+            mine = np.isin(indices, envs)
+            others = None if obstacles is None else obstacles[mine]
+            return indices[mine], positions[mine], poses[mine], others
 
         workers = [worker for worker in self._workers if np.isin(indices, worker.envs).any()]
         self._call("reset", workers, state)
@@ -130,7 +140,12 @@ class BulletSimulation:
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
-        self._targets[:] = self._checked_targets(targets)
+        given = self._view(targets)
+        if given.shape != self._is_joint.shape:
+            raise ValueError(f"targets have shape {given.shape}, not {self._is_joint.shape}")
+        np.copyto(self._targets, given, where=self._is_joint)  # padding may be anything
+        if not all_finite(self._targets):
+            require_finite(self.scenes, "targets", self._targets)
         faults = self._call("step", self._workers)
         if faults or self._faults:
             self._faults = faults
@@ -179,36 +194,6 @@ class BulletSimulation:
                 raise answer
             reasons |= answer or {}
         return dict(sorted(reasons.items()))
-
-    def _checked_targets(self, targets: torch.Tensor) -> Float32:
-        """Return valid targets of ``step`` as a contiguous array; padding may be anything."""
-        array = np.ascontiguousarray(self._view(targets), np.float32)
-        if array.shape != self._is_joint.shape:
-            raise ValueError(f"targets have shape {array.shape}, not {self._is_joint.shape}")
-        if not all_finite(array):
-            invalid = self._is_joint & ~np.isfinite(array)
-            if invalid.any():
-                env = int(invalid.any(axis=1).argmax())
-                raise ValueError(f"{self._label(env)}: targets {array[env].tolist()}")
-        return array
-
-    def _checked_state(
-        self, indices: NDArray[np.int64], q: torch.Tensor, block_pose: torch.Tensor
-    ) -> tuple[Float32, Float32]:
-        """Return valid positions and block poses of some environments."""
-        positions, poses = q.numpy()[indices], block_pose.numpy()[indices]
-        invalid = (self._is_joint[indices] & ~np.isfinite(positions)).any(axis=1)
-        invalid |= self._has_block[indices] & ~np.isfinite(poses).all(axis=1)
-        if invalid.any():
-            k = int(invalid.argmax())
-            raise ValueError(
-                f"{self._label(int(indices[k]))}: reset to q {positions[k].tolist()}, "
-                f"block {poses[k].tolist()}"
-            )
-        return positions, poses
-
-    def _label(self, env: int) -> str:
-        return f"environment {env} ({self.scenes[env].robot.name!r})"
 
 
 def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:

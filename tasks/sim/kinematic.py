@@ -15,6 +15,7 @@ from morphgen.tasks.sim.base import (
     Scene,
     Simulator,
     is_host,
+    require_finite,
     require_reset_shapes,
 )
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
@@ -95,8 +96,8 @@ class KinematicSimulation:
         require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, None)
         rows = mask[:, None]
         positions = torch.where(rows, torch.where(self._is_joint, q, 0.0), self.q)
-        if self._on_host and (env := _first_not_finite(positions)) is not None:
-            raise ValueError(f"{self._label(env)}: reset to q {q[env].tolist()}")
+        if self._on_host:
+            require_finite(self.scenes, "reset to q", positions.numpy())
         self.q.copy_(positions)
         self.qd.masked_fill_(rows, 0.0)
 
@@ -112,8 +113,8 @@ class KinematicSimulation:
                 f"targets have shape {tuple(targets.shape)}; expected {tuple(self.q.shape)}"
             )
         targets = torch.where(self._is_joint, targets, 0.0)
-        if self._on_host and (env := _first_not_finite(targets)) is not None:
-            raise ValueError(f"{self._label(env)}: targets {targets[env].tolist()} are not finite")
+        if self._on_host:
+            require_finite(self.scenes, "targets", targets.numpy())
         error = torch.clamp(targets, self._lower, self._upper) - self.q
         error = torch.clamp(error, -self._farthest, self._farthest)
         (error_to_error, velocity_to_error), (by_error, by_velocity) = CONTROL_STEP.tolist()
@@ -127,7 +128,11 @@ class KinematicSimulation:
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
         envs = torch.nonzero(self._diverged)[:, 0].tolist()
-        return {env: f"{self._label(env)}: a target or position is not finite" for env in envs}
+        return {
+            env: f"environment {env} (robot {self.scenes[env].robot.name!r}): a target or position "
+            "is not finite"
+            for env in envs
+        }
 
     def close(self) -> None:
         """End the simulation; a second call does nothing."""
@@ -140,9 +145,6 @@ class KinematicSimulation:
     def _require_open(self) -> None:
         if self._closed:
             raise SimulationError("the simulation is closed")
-
-    def _label(self, env: int) -> str:
-        return f"environment {env} (robot {self.scenes[env].robot.name!r})"
 
 
 def _joint_table(robots: Sequence[Robot]) -> Array:
@@ -160,12 +162,6 @@ def _joint_table(robots: Sequence[Robot]) -> Array:
         table[1:3, row, : robot.dof] = np.array(limits).reshape(-1, 2).T
         table[3, row, : robot.dof] = farthest_targets(robot, robot.independent_joints)
     return table
-
-
-def _first_not_finite(rows: torch.Tensor) -> int | None:
-    """Return the first row of a matrix that has a number which is not finite, or None."""
-    finite = torch.isfinite(rows)
-    return None if bool(finite.all()) else int((~finite).any(dim=1).int().argmax())
 
 
 SIMULATOR = Simulator(

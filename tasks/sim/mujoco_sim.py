@@ -22,6 +22,7 @@ from morphgen.tasks.sim.base import (
     Contacts,
     Scene,
     Simulator,
+    require_finite,
     require_reset_shapes,
 )
 from morphgen.tasks.sim.motor_law import (
@@ -341,8 +342,7 @@ class MujocoSimulation:
             raise ValueError(f"targets have shape {rows.shape}, not {self._targets.shape}")
         np.copyto(self._targets, rows, where=self._has_target)
         if not all_finite(self._targets):
-            env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
-            raise ValueError(f"{self._label(env)}: a target is not finite")
+            require_finite(self.scenes, "targets", self._targets)
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
         with np.errstate(invalid="ignore", over="ignore"), MujocoWarnings():
             self._control.controls(
