@@ -1,5 +1,6 @@
 """Fixtures shared by the task tests."""
 
+from contextlib import ExitStack, closing
 from dataclasses import replace
 
 import pytest
@@ -9,20 +10,19 @@ from morphgen.checks.self_collision import survey_collisions
 
 
 @pytest.fixture
-def simulate():
+def opened():
+    """Return a function that returns what it is given, which is closed after the test."""
+    with ExitStack() as stack:
+        yield lambda thing: stack.enter_context(closing(thing))
+
+
+@pytest.fixture
+def simulate(opened):
     """Create PyBullet simulations of scenes in this process."""
     pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
     from morphgen.tasks.sim.bullet import BulletSimulation
 
-    simulations = []
-
-    def make(*scenes, contacts=None):
-        simulations.append(BulletSimulation(scenes, contacts))
-        return simulations[-1]
-
-    yield make
-    for simulation in simulations:
-        simulation.close()
+    return lambda *scenes, contacts=None: opened(BulletSimulation(scenes, contacts))
 
 
 @pytest.fixture(scope="session")

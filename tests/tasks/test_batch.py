@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 import morphgen
 from helpers.goal_sets import draw_spec
 from morphgen.errors import TaskError
-from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.model.robot import TOOL
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import run_episodes
@@ -40,24 +37,13 @@ def settings(robots, cache):
 
 
 @pytest.fixture
-def build_batch(settings):
-    """Create batches and close them after the test."""
-    opened = []
-
+def build_batch(settings, opened):
     def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=CONFIG, **options):
         chosen = [replace(settings[obstacles][i], config=config) for i in robots]
         options = {"sim": "mujoco", **options}
-        opened.append(batch_from_specs(chosen, num_envs, **options))
-        return opened[-1]
+        return opened(batch_from_specs(chosen, num_envs, **options))
 
-    yield make
-    for batch in opened:
-        batch.close()
-
-
-def run(batch, controller, steps):
-    batch.reset()
-    return [batch.step(controller.act(batch)) for _ in range(steps)]
+    return make
 
 
 def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
@@ -87,12 +73,6 @@ def test_start_is_never_the_goal_configuration(build_batch):
         assert ((batch.targets - goal_q).abs().amax(dim=1) > 1e-3).all()
         there = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, goal_q)
         assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
-
-
-def test_reward_is_the_sum_of_its_terms(build_batch):
-    for step in run(build_batch(obstacles=True), Random(3), 20):
-        assert torch.allclose(step.reward, sum(step.terms.values()))
-        assert step.reward.isfinite().all()
 
 
 def test_batches_smaller_than_the_robot_list_are_rejected():
@@ -163,30 +143,6 @@ def test_spread_reset_staggers_the_first_episodes(build_batch):
     for _ in range(CONFIG.max_episode_steps - int(passed.max())):
         over |= batch.step(Zero().act(batch)).truncated
     assert torch.equal(over, passed == passed.max())
-
-
-def test_observed_velocities_and_actions_match_the_links(build_batch):
-    batch = build_batch(observe=ObservationConfig(velocity=True, previous_action=True))
-    assert batch.reset()["velocity"].abs().max() == 0
-    action = torch.ones(batch.action_mask.shape)
-    seen = batch.step(action).observation
-    assert torch.equal(seen["previous_action"] != 0, batch.action_mask)
-    assert (
-        (seen["velocity"] != 0) <= (batch.robot_tables.joint_of_link[batch.env_robot_index] >= 0)
-    ).all()
-    assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
-
-
-def test_observed_tool_position_matches_forward_kinematics(build_batch):
-    batch = build_batch(observe=ObservationConfig(tool=True))
-    batch.reset()
-    for _ in range(5):
-        step = batch.step(torch.ones(batch.action_mask.shape))
-    for env, each in enumerate(batch.specs):
-        q = batch.q[env, : each.robot.dof].double().numpy()
-        expected = frame_pose(each.robot, q[None], TOOL)[0, :3, 3]
-        assert step.observation["tool"][env].tolist() == pytest.approx(expected, abs=1e-5)
-        assert np.linalg.norm(expected - each.goals.poses[0, :3]) > 0.01
 
 
 def test_inverse_kinematics_reaches_its_goals_in_mujoco(build_batch):

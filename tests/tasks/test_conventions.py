@@ -212,10 +212,12 @@ def test_copies_are_refused_where_the_state_is_elsewhere(how):
         {"render_mode": "rgb_array", "size": FRAME, "goal_env": True},
         {"observe": {"velocity": True}, "config": {"max_episode_steps": 5}},
         {"contacts": {"scene": False, "self_collision": False}, "layouts": "eval", "max_links": 40},
+        {"observe": observation_config(["jacobian"]), "contacts": Contacts(), "cache": Path("c")},
     ],
 )
 @pytest.mark.parametrize("name", [REACH, PUSH])
-def test_checkers_accept_every_option(name, options):
+def test_checkers_accept_every_option(name, options, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     options = {"sim": "mujoco"} | options
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -228,8 +230,10 @@ def test_checkers_accept_every_option(name, options):
             check_for_sb3(wrappers.FlattenObservation(make(name, **options)))
     said = {str(each.message).partition(":")[0] for each in caught}
     assert all("unconventional shape" in text for text in said), said
+    assert json.loads(env.spec.to_json())["kwargs"]["robot"] == "arm3-stick"
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.observation_space == env.observation_space
+    assert again.unwrapped.env_spec.config == env.unwrapped.env_spec.config
     assert np.array_equal(*(rows_of_seed(each) for each in (env, again)))
 
 
@@ -238,24 +242,6 @@ def rows_of_seed(env):
         env.reset(seed=5)
         env.action_space.seed(5)
         return rows(env)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"config": ReachConfig(max_episode_steps=5, obstacle_size=(0.05, 0.06)), "obstacles": True},
-        {"observe": observation_config(["jacobian"]), "contacts": Contacts(self_collision=False)},
-        {"cache": Path("cache"), "library": ()},
-    ],
-)
-def test_specs_are_json(options, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with closing(make(**{"sim": "mujoco"} | options)) as env:
-        text = env.spec.to_json()
-        assert json.loads(text)["kwargs"]["robot"] == "arm3-stick"
-        with closing(gym.make(EnvSpec.from_json(text))) as again:
-            assert again.unwrapped.env_spec.config == env.unwrapped.env_spec.config
-            assert again.observation_space == env.observation_space
 
 
 def test_the_spec_of_a_robot_without_a_name_is_json(tmp_path):
@@ -300,12 +286,10 @@ def test_time_limit(name, config):
         assert envs.step(zero)[3].all()
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-@pytest.mark.parametrize("shared_memory", [True, False])
 @pytest.mark.slow
-def test_async_vectors(context, shared_memory):
-    fns = [partial(make, PUSH, render_mode="rgb_array", size=FRAME)] * 2
-    run(AsyncVectorEnv(fns, context=context, shared_memory=shared_memory))
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_async_vectors(context):
+    run(AsyncVectorEnv([partial(make, PUSH)] * 2, context=context))
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
@@ -338,20 +322,6 @@ def test_vectors_equal_those_of_gymnasium(name, mode):
                     assert where(infos)["distance"][held] == pytest.approx(
                         where(sync_infos)["distance"][held], abs=1e-5
                     )
-
-
-@pytest.mark.parametrize(
-    ("mode", "message"),
-    [
-        (AutoresetMode.DISABLED, "expected SAME_STEP or NEXT_STEP"),
-        ("Disabled", "expected SAME_STEP or NEXT_STEP"),
-        ("same", "expected SAME_STEP or NEXT_STEP"),
-        ("NextStep", "stable-baselines3 needs a vector with autoreset_mode SAME_STEP"),
-    ],
-)
-def test_modes_without_sense_are_refused(mode, message):
-    with pytest.raises(TaskError, match=message):
-        SB3Vector(make_vec(autoreset_mode=mode))
 
 
 def test_vectors_begin_at_random_unless_they_have_a_seed():
@@ -439,9 +409,7 @@ def test_options_begin_an_episode_there(name, keys):
     ("name", "options", "message"),
     [
         (REACH, {"gaol": [0, 0, 1]}, "unknown option 'gaol' of reach; did you mean 'goal'"),
-        (REACH, {"block": [0, 0, 1]}, "unknown option 'block' of reach"),
         (PUSH, {"blok": [0, 0, 1]}, "did you mean 'block'"),
-        (PUSH, {"goal": [0, 0, 1]}, "unknown option 'goal' of push"),
         (REACH, {3: 4}, "unknown option 3"),
         (REACH, [1], "expected a dictionary"),
         (REACH, {"q": [0.0] * 4}, r"has shape \(4,\); expected \(5,\)"),
@@ -450,7 +418,6 @@ def test_options_begin_an_episode_there(name, keys):
         (REACH, {"q": "home"}, "option 'q' 'home': expected numbers"),
         (REACH, {"q": [1.5, -1.5, 1.6, 3.1, 0.0]}, "collides|outside"),
         (REACH, {"goal": [9, 9, 9]}, "no configuration that is free of collisions"),
-        (REACH, {"goal": [0, 0, -0.5]}, "no configuration that is free of collisions"),
         (REACH, {"goal": [0.3, 0, 0.3, 5, 0, 0, 0]}, "quaternion"),
         (REACH, {"goal": [1, 2]}, r"has shape \(2,\); expected \(3,\) or \(7,\)"),
         (PUSH, {"block": [0.4, -0.2, 5]}, "stands upright on the ground"),
@@ -532,6 +499,8 @@ def test_goal_environments(name, config, terms):
         (lambda: task_vector(1, task="reach", robto="x"), "'robto'; did you mean 'robot"),
         (lambda: make_vec(goal_env=True), "unknown option 'goal_env'"),
         (lambda: make_vec(render_mode="rgb"), "did you mean 'rgb_array'"),
+        (lambda: make_vec(autoreset_mode="same"), "same: expected SAME_STEP or NEXT_STEP"),
+        (lambda: SB3Vector(make_vec(autoreset_mode="NextStep")), "needs a vector with autoreset_"),
         (lambda: make_vec(size=4), r"size 4: expected width and height \[pixels\]"),
         (lambda: make(observe={"velocty": True}), r"observe \{'velocty': True\}"),
         (lambda: make(config=CONFIGS[PUSH]), "PushConfig is not the config of reach"),

@@ -132,19 +132,6 @@ def test_layouts_are_equally_likely_and_leave_the_goals_free(specs):
     assert (counts[: REACH.train_layouts] - expected).abs().max() < BOUND * expected**0.5
 
 
-def test_starts_of_push_are_equally_likely(specs):
-    batch = stub_batch(specs, ["push"], 600)
-    starts = torch.from_numpy(batch.specs[0].goals.blocks).float()
-    counts = torch.zeros(len(starts))
-    for _ in range(10):
-        batch.reset()
-        distance = (batch.simulation.block_pose[:, None] - starts).abs().amax(dim=2)
-        assert (distance.amin(dim=1) == 0).all()
-        counts += torch.bincount(distance.argmin(dim=1), minlength=len(starts))
-    expected = counts.sum() / len(starts)
-    assert (counts - expected).abs().max() < BOUND * expected**0.5
-
-
 MIXED = ("pose", "push", "push among obstacles")
 
 

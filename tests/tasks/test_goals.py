@@ -1,4 +1,4 @@
-"""Goal sets and their obstacles, and faults of goal sets of the original released code."""
+"""Goal sets of reach and push and their obstacles, and faults of sets of the original code."""
 
 import re
 from dataclasses import replace
@@ -6,16 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers.goal_sets import CONFIG, LIFTED, sample_goals
+from helpers.goal_sets import CONFIG, LIFTED, draw_goals, sample_goals
 from helpers.scenes import robot
 from morphgen.benchmark.similarity import shoulder, workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
-from morphgen.tasks import free_space
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals import goal_sets
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.starts import (
+    CLOSE,
+    path_is_clear,
+    push_region,
+)
 from morphgen.tasks.reach import task as module
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.scenes import obstacles
@@ -27,7 +32,7 @@ from morphgen.tasks.scenes.obstacles import (
     layouts_of,
     place_boxes,
 )
-from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.sim.base import Block, Scene
 
 WORDS = (
     "arm=ur5 ee=plane",
@@ -39,7 +44,7 @@ WORDS = (
 
 
 @pytest.fixture
-def cache(tmp_path):
+def folder(tmp_path):
     """Folder of stored goal sets, which does not exist yet."""
     return tmp_path / "goals"
 
@@ -57,9 +62,9 @@ def files(folder):
 
 @pytest.mark.parametrize("words", WORDS)
 @pytest.mark.parametrize("boxes", [False, True])
-def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
+def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, folder):
     body = robot(words)
-    goal_set = sample_goals(body, cache, obstacles=boxes, ground=0.0)
+    goal_set = sample_goals(body, folder, obstacles=boxes, ground=0.0)
     assert goal_set.q.shape == (12, body.dof)
     assert goal_set.poses.shape == (12, 7)
     assert (goal_set.poses[:, 3] >= 0).all()
@@ -71,8 +76,8 @@ def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
     assert len(np.unique(goal_set.q, axis=0)) == 12
 
 
-def test_goals_are_above_the_ground_at_any_height(body, cache):
-    here, there = (sample_goals(body, cache, ground=ground) for ground in (0.0, LIFTED))
+def test_goals_are_above_the_ground_at_any_height(body, folder):
+    here, there = (sample_goals(body, folder, ground=ground) for ground in (0.0, LIFTED))
     assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
     assert REACH.certify(there, body, scene_of(body, there)) == []
     assert REACH.certify(there, body, scene_of(body, there, 0.5)) != []
@@ -80,11 +85,11 @@ def test_goals_are_above_the_ground_at_any_height(body, cache):
 
 
 @pytest.mark.parametrize("words", WORDS)
-def test_goals_are_never_inside_an_obstacle(words, cache):
+def test_goals_are_never_inside_an_obstacle(words, folder):
     """Neither the links at a usable configuration nor the tool point are inside an obstacle."""
     body = robot(words)
     config = replace(CONFIG, num_goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
-    goal_set = sample_goals(body, cache, obstacles=True, config=config, ground=0.0)
+    goal_set = sample_goals(body, folder, obstacles=True, config=config, ground=0.0)
     for layout, usable in enumerate(goal_set.usable):
         scene = scene_of(body, goal_set, 0.0, layout)
         hits = FreeSpace(scene).obstacle_hits(goal_set.q).any(axis=1)
@@ -99,10 +104,10 @@ def test_goals_are_never_inside_an_obstacle(words, cache):
 
 @pytest.mark.parametrize("ground", [0.0, -0.4])
 @pytest.mark.parametrize("words", WORDS)
-def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground, cache):
+def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground, folder):
     body = robot(words)
     goal_set = sample_goals(
-        body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6)
+        body, folder, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6)
     )
     reach, centre = workspace(body).reach, shoulder(body)
     q, _ = FreeSpace(Scene(body, ground=ground)).sample(300, np.random.default_rng(9))
@@ -117,11 +122,11 @@ def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground
         assert space.free(q).mean() > KEPT - 0.15
 
 
-def test_missing_room_for_obstacles_is_an_error(body, cache):
+def test_missing_room_for_obstacles_is_an_error(body, folder):
     config = replace(CONFIG, obstacles=2, obstacle_size=(3.0, 4.0))
     with pytest.raises(BenchmarkError, match=r"'arm': each of 16 .* home, .* fewer or smaller"):
-        sample_goals(body, cache, obstacles=True, config=config)
-    assert not cache.exists()
+        sample_goals(body, folder, obstacles=True, config=config)
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize(
@@ -132,7 +137,7 @@ def test_invalid_obstacles_are_rejected(body, count, size):
         draw_boxes(body, count, size, np.random.default_rng(0))
 
 
-def test_cache_key_depends_on_exactly_the_relevant_inputs(body, cache):
+def test_cache_key_depends_on_exactly_the_relevant_inputs(body, folder):
     changes = [
         {},
         {"seed": 1},
@@ -146,50 +151,39 @@ def test_cache_key_depends_on_exactly_the_relevant_inputs(body, cache):
         {"obstacles": True, "config": replace(CONFIG, obstacle_size=(0.06, 0.1))},
     ]
     first, second, *_ = sets = [
-        sample_goals(**{"body": body, "cache": cache, **change}) for change in changes
+        sample_goals(**{"body": body, "cache": folder, **change}) for change in changes
     ]
     assert len({goals.key for goals in sets}) == len(changes)
     assert not np.isin(first.q, second.q).any()
     assert (first.seed, second.seed) == (0, 1)
-    count = len(files(cache))
+    count = len(files(folder))
     same = replace(CONFIG, near=0.1, max_episode_steps=5, obstacles=7)
     other = replace(body, name="other")
-    assert sample_goals(other, cache, config=same).robot == "other"
-    assert (sample_goals(other, cache).q == sample_goals(body, cache).q).all()
-    assert len(files(cache)) == count
+    assert sample_goals(other, folder, config=same).robot == "other"
+    assert (sample_goals(other, folder).q == sample_goals(body, folder).q).all()
+    assert len(files(folder)) == count
 
 
-def test_stored_set_equals_the_sampled_set(body, cache, monkeypatch):
-    fresh = sample_goals(body, cache, obstacles=True)
+def test_stored_set_equals_the_sampled_set(body, folder, monkeypatch):
+    fresh = sample_goals(body, folder, obstacles=True)
 
     def forbidden(*_):
         raise AssertionError("it was made again")
 
     monkeypatch.setattr(module, "FreeSpace", forbidden)
-    stored = sample_goals(body, cache, obstacles=True)
+    stored = sample_goals(body, folder, obstacles=True)
     for name in ("robot", "key", "obstacles", "tried", "accepted", "seed"):
         assert getattr(stored, name) == getattr(fresh, name)
     assert (stored.q == fresh.q).all()
     assert (stored.poses == fresh.poses).all()
 
 
-def test_too_few_goals_error_has_the_acceptance_rate(body, cache, monkeypatch):
-    monkeypatch.setattr(free_space, "TRIES", 20)
-    with pytest.raises(BenchmarkError) as caught:
-        sample_goals(body, cache, ground=5.0)
-    text = str(caught.value)
-    assert "robot 'arm': only 0 of 240 random configurations" in text
-    assert "acceptance rate 0), 12 are needed" in text
-    assert "lift the robot off the ground" in text
-    assert not cache.exists()
-
-
-def test_fixed_tool_is_rejected(body, cache):
+def test_fixed_tool_is_rejected(body, folder):
     fixed = replace(body, frames=(replace(body.frame("tool"), link="base"),))
     with pytest.raises(BenchmarkError, match="no joint moves its tool"):
-        sample_goals(fixed, cache)
+        sample_goals(fixed, folder)
     with pytest.raises(BenchmarkError, match="no frame 'tool'"):
-        sample_goals(replace(body, frames=()), cache)
+        sample_goals(replace(body, frames=()), folder)
 
 
 @pytest.mark.parametrize(
@@ -226,17 +220,17 @@ def changed_byte(data, goal_set):
     "change",
     [lambda *_: b"", lambda data, _: data[:100], lambda data, _: data[:-200], changed_byte],
 )
-def test_broken_file_is_named(body, cache, change):
-    goal_set = sample_goals(body, cache)
-    (path,) = cache.iterdir()
+def test_broken_file_is_named(body, folder, change):
+    goal_set = sample_goals(body, folder)
+    (path,) = folder.iterdir()
     path.write_bytes(change(path.read_bytes(), goal_set))
     with pytest.raises(TaskError, match=f"{path.name}: not a ReachGoalSet: .*; delete it"):
-        sample_goals(body, cache)
+        sample_goals(body, folder)
     path.unlink()
-    first, second = sample_goals(body, cache), sample_goals(body, cache, seed=1)
-    path.replace(cache / f"{second.key}.npz")
+    first, second = sample_goals(body, folder), sample_goals(body, folder, seed=1)
+    path.replace(folder / f"{second.key}.npz")
     with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
-        sample_goals(body, cache, seed=1)
+        sample_goals(body, folder, seed=1)
 
 
 def test_unwritable_cache_is_a_warning(body, tmp_path, monkeypatch):
@@ -248,8 +242,8 @@ def test_unwritable_cache_is_a_warning(body, tmp_path, monkeypatch):
     assert len(goal_set.q) == 12
 
 
-def test_certificate_names_every_fault(body, cache):
-    goal_set = sample_goals(body, cache, obstacles=True)
+def test_certificate_names_every_fault(body, folder):
+    goal_set = sample_goals(body, folder, obstacles=True)
     scene = scene_of(body, goal_set)
 
     def faults(**changes):
@@ -272,17 +266,17 @@ def test_certificate_names_every_fault(body, cache):
     around = (Shape(Box((2.0, 2.0, 2.0))),)
     walled = body.with_links([Link("base", body.link("base").inertial, (), around)])
     assert "goal 0: its configuration is in collision" in REACH.certify(
-        sample_goals(body, cache), walled, scene_of(walled, sample_goals(body, cache))
+        sample_goals(body, folder), walled, scene_of(walled, sample_goals(body, folder))
     )
 
 
-def test_a_robot_whose_tool_stays_in_place_has_no_goals(cache):
+def test_a_robot_whose_tool_stays_in_place_has_no_goals(folder):
     joint = Joint("turn", "revolute", "base", "rod", IDENTITY, (0.0, 0.0, 1.0), limits=(-1.0, 1.0))
     rod = Link("rod", collisions=(Shape(Box((0.1, 0.1, 0.1))),))
     tool = Frame("tool", "rod", Pose((0.0, 0.0, 0.5)))
     body = Robot("spinner", (Link("base"), rod), (joint,), (tool,), (0.0,))
     with pytest.raises(TaskError, match="'spinner' cannot reach: over 12 configurations its tool"):
-        sample_goals(body, cache)
+        sample_goals(body, folder)
 
 
 def layouts_in(body, count=8, size=(0.5, 0.7), usable=lambda space: np.ones(1, bool)):
@@ -305,10 +299,12 @@ def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
     assert left(0.7) > 0.6
 
 
-def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, cache):
+def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, folder):
     config = replace(CONFIG, num_goals=30)
     more = replace(config, num_goals=60, train_layouts=5, eval_layouts=4)
-    small, large = (sample_goals(body, cache, obstacles=True, config=one) for one in (config, more))
+    small, large = (
+        sample_goals(body, folder, obstacles=True, config=one) for one in (config, more)
+    )
     assert small.obstacles == large.obstacles
     for side in ("train", "eval"):
         few, many = layouts_of(config, side), layouts_of(more, side)
@@ -326,3 +322,150 @@ def test_a_layout_without_goals_is_an_error(body):
 
     with pytest.raises(BenchmarkError, match=r"of its first 20 goals only 4 or fewer"):
         layouts_in(body, 1, (0.05, 0.1), usable=usable)
+
+
+PUSH = PushConfig(num_goals=5, train_layouts=3, eval_layouts=2)
+ARMS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm=arm3 ee=claw")
+FREE = ("prims", "cubes", "chain beads=3")
+SWEEPS = ("stick", "nlink")
+SHORT = "stick beam.length=0.15"
+
+
+def sample_starts(words, cache, *, config=PUSH, obstacles=False, seed=0, ground=0.0):
+    return draw_goals(
+        robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
+    )
+
+
+def space_of(words, push_set, layout=None):
+    boxes = () if layout is None else place_boxes(push_set.obstacles, push_set.layouts[layout])
+    return FreeSpace(
+        Scene(robot(words), block=push_set.block, obstacles=boxes, ground=push_set.ground)
+    )
+
+
+@pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
+@pytest.mark.parametrize("boxes", [False, True])
+def test_every_block_can_be_pushed_across_the_line(words, boxes, cache):
+    push_set = sample_starts(words, cache, obstacles=boxes)
+    body, space = robot(words), space_of(words, push_set)
+    edge, x, y = push_set.block.size[0], *push_set.blocks[:, :2].T
+    assert len(push_set.obstacles) == (3 if boxes else 0)
+    assert push_set.usable.shape == ((5, 5) if boxes else (0, 5))
+    for layout, usable in enumerate(push_set.usable):
+        among = space_of(words, push_set, layout)
+        assert usable.sum() >= 2
+        assert path_is_clear(among, push_set.line, push_set.blocks[usable]).all()
+        for q in (push_set.q, push_set.behind):
+            assert among.free(q[usable], push_set.blocks[usable]).all()
+        assert among.free(push_set.across[usable]).all()
+    assert 5 == push_set.accepted == len(push_set.q) <= push_set.tried
+    assert push_set.blocks[:, 2] == pytest.approx(edge / 2)
+    assert np.linalg.norm(push_set.blocks[:, 3:], axis=1) == pytest.approx(1.0)
+    assert ((-0.2 * push_set.scale <= y) & (y <= -0.15 * push_set.scale)).all()
+    assert push_set.line == pytest.approx(0.2 * push_set.scale)
+    for q in (push_set.q, push_set.behind, push_set.across):
+        assert ((q >= joint_limits(body)[:, 0]) & (q <= joint_limits(body)[:, 1])).all()
+    assert space.free(push_set.q, push_set.blocks).all()
+    assert space.free(push_set.behind, push_set.blocks).all()
+    assert space.free(push_set.across).all()
+    behind, across = (frame_pose(body, q)[:, :3, 3] for q in (push_set.behind, push_set.across))
+    assert (behind[:, 1] < y - edge / 2).all()
+    assert np.abs(behind[:, 0] - x).max() < CLOSE
+    assert np.abs(across[:, :2] - np.column_stack([x, np.full(5, push_set.line)])).max() < CLOSE
+    for tools in (behind, across):
+        assert ((tools[:, 2] > 0) & (tools[:, 2] < edge)).all()
+    for share in np.linspace(0, 1, 9):
+        on_its_way = push_set.blocks.copy()
+        on_its_way[:, 1] += share * (push_set.line - y)
+        assert space.block_is_clear(on_its_way).all()
+
+
+@pytest.mark.parametrize("words", ARMS)
+def test_arm_block_distance_scales_with_effective_reach(words, cache):
+    push_set, work = sample_starts(words, cache), workspace(robot(words))
+    edge = push_set.block.size[0]
+    reach = np.sqrt(work.reach**2 - (work.shoulder[2] - edge / 2) ** 2)
+    assert 0.15 * reach <= edge <= 0.2 * reach
+    x = push_set.blocks[:, 0] - work.shoulder[0]
+    assert ((0.4 * reach <= x) & (x <= 0.6 * reach)).all()
+    assert push_set.scale == 1
+
+
+@pytest.mark.parametrize("words", FREE)
+def test_mobile_bases_have_the_block_at_a_fixed_distance(words, cache):
+    push_set = sample_starts(words, cache)
+    assert 0.15 <= push_set.block.size[0] <= 0.2
+    assert (np.abs(push_set.blocks[:, 0]) <= 0.2).all()
+    assert push_set.scale == 1
+
+
+def test_short_robots_have_a_scaled_down_push_region(cache):
+    """A 0.15 m rod with a 0.03 m ball swings on a slide."""
+    push_set = sample_starts(SHORT, cache)
+    assert push_set.scale == pytest.approx(0.18 / np.sqrt(2) / 0.4, rel=0.2)
+    assert 0.15 * push_set.scale <= push_set.block.size[0] <= 0.2 * push_set.scale
+    assert push_set.line == pytest.approx(0.2 * push_set.scale)
+
+
+def test_block_matches_the_config(cache):
+    config = replace(PUSH, block_mass=0.3, friction=0.6, line=0.1, start=-0.1, start_depth=0.0)
+    push_set = sample_starts("prims", cache, config=config)
+    assert (push_set.block.mass, push_set.block.friction, push_set.line) == (0.3, 0.6, 0.1)
+    assert push_set.blocks[:, 1] == pytest.approx(-0.1)
+    x, y, z, *turn = push_set.blocks[0].tolist()
+    assert push_set.block.pose == Pose((x, y, z), tuple(turn))
+
+
+def test_block_positions_and_orientations_are_random(cache):
+    push_set = sample_starts("prims", cache, config=replace(PUSH, num_goals=60))
+    assert np.histogram(push_set.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
+    yaw = 2 * np.arctan2(push_set.blocks[:, 6], push_set.blocks[:, 3])
+    assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
+
+
+def test_robot_that_cannot_push_is_rejected_with_the_reason(tmp_path):
+    cache = tmp_path / "pushes"
+    with pytest.raises(
+        TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
+    ):
+        sample_starts("cartpole", cache)
+    with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 150 poses") as caught:
+        sample_starts("prims", cache, config=replace(PUSH, start=-0.9))
+    assert "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)" in str(
+        caught.value
+    )
+    with pytest.raises(TaskError, match="its tool does not get down to the ground"):
+        push_region(robot(ARMS[0]), PUSH, -3.0, np.random.default_rng(0))
+    with pytest.raises(TaskError, match="its tool is never as low as a block"):
+        push_region(robot("nlink"), PUSH, -0.5, np.random.default_rng(0))
+    assert not cache.exists()
+
+
+def test_obstacles_that_block_every_push_are_an_error(tmp_path, monkeypatch):
+    def wall(*_):
+        return (Block((9.0, 0.1, 0.1)),)
+
+    def across_the_way(*_):
+        return np.array([[0.0, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0]])
+
+    monkeypatch.setattr(obstacles, "draw_boxes", wall)
+    monkeypatch.setattr(obstacles, "_draw_poses", across_the_way)
+    with pytest.raises(BenchmarkError, match="of its first 20 goals only 0 or fewer: take"):
+        sample_starts("prims", tmp_path, obstacles=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"num_goals": 0}, "PushConfig: num_goals 0: expected an integer >= 1"),
+        ({"block_size": (0.2, 0.1)}, "a block of 0.2 to 0.1"),
+        ({"start": 0.3}, "is to cross 0.2: sizes must be positive, and the start"),
+        ({"line": -0.3}, "starts 0.05 below -0.15 and is to cross -0.3"),
+    ],
+)
+def test_invalid_pushes_are_rejected(changes, text, cache):
+    with pytest.raises((TaskError, BenchmarkError), match=text):
+        sample_starts("prims", cache, config=replace(PUSH, **changes))
+    with pytest.raises(BenchmarkError, match="with seed -1"):
+        sample_starts("prims", cache, seed=-1)

@@ -1,7 +1,5 @@
 """Layouts of obstacles over episodes: which are drawn, and that everything follows them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -11,11 +9,8 @@ from helpers.resets import reset_envs
 from helpers.scenes import robot
 from morphgen.errors import TaskError
 from morphgen.model.geometry import Pose
-from morphgen.progress import show_progress
 from morphgen.rl.baselines.ik import InverseKinematics
-from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -53,18 +48,12 @@ def specs(cache):
 
 
 @pytest.fixture
-def build_batch(specs):
-    """Create batches of some specifications and close them after the test."""
-    opened = []
-
+def build_batch(specs, opened):
     def make(*names, **options):
         chosen = [specs[name] for name in names]
-        opened.append(batch_from_specs(chosen, len(names), **{"sim": "mujoco", **options}))
-        return opened[-1]
+        return opened(batch_from_specs(chosen, len(names), **{"sim": "mujoco", **options}))
 
-    yield make
-    for batch in opened:
-        batch.close()
+    return make
 
 
 @pytest.mark.parametrize(("side", "expected"), [("train", {0, 1, 2, 3}), ("eval", {4, 5})])
@@ -201,37 +190,3 @@ def test_baselines_plan_around_the_current_obstacles(build_batch, monkeypatch):
     first = {tuple(batch.specs[0].goals.layouts[k, 0, :3].tolist()) for k in (4, 5)}
     assert {boxes[0].pose.position for boxes in scenes} == first
     assert len(scenes) == 4  # two robots of the batch, two layouts each
-
-
-def test_scripted_push_has_a_planner_for_each_layout(build_batch):
-    batch, controller = build_batch("push", layouts="eval"), ScriptedPush(0)
-    for _ in range(6):
-        batch.reset()
-        controller.act(batch)
-    assert set(controller._planners) == {(0, 4), (0, 5)}
-
-
-@pytest.mark.parametrize("side", ["train", "eval"])
-def test_a_gymnasium_environment_observes_the_obstacles_of_its_episode(side, tmp_path):
-    reports = []
-    with show_progress(lambda *now: reports.append(now)):
-        env = TaskEnv(
-            "reach",
-            robot("arm3"),
-            obstacles=True,
-            layouts=side,
-            config=replace(REACH, max_episode_steps=2),
-            sim="mujoco",
-            cache=tmp_path,
-        )
-    assert reports == [(0, 1), (1, 1)]
-    drawn = set()
-    for episode in range(24):
-        observation, _ = env.reset(seed=0 if episode == 0 else None)
-        for _ in range(2):
-            poses = env.batch.layouts.poses[0].numpy().copy()
-            assert (observation["obstacles"][:, :7] == poses).all()
-            drawn.add(int(env.batch.layouts.current[0]))
-            observation, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
-    env.close()
-    assert drawn == ({0, 1, 2, 3} if side == "train" else {4, 5})

@@ -1,4 +1,4 @@
-"""MuJoCo simulation: models, limits, divergence, threads, and contacts of block and robot."""
+"""MuJoCo simulation: models, rigid links, divergence, threads, contacts of block and robot."""
 
 import math
 import re
@@ -14,18 +14,22 @@ from helpers.joint_targets import held
 from helpers.resets import reset_envs
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, robot
-from morphgen.checks.self_collision import adjacent_pairs
+from morphgen.checks.self_collision import adjacent_pairs, untested_pairs
 from morphgen.errors import SimulationError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robot
-from morphgen.model.dynamics import armature, movable_mass_matrix
+from morphgen.model.dynamics import armature, mass_matrix, movable_mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits, movable_positions
-from morphgen.model.robot import Frame
+from morphgen.model.robot import Inertial, Joint, Link
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.registry import SIMULATORS
+from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
@@ -69,27 +73,6 @@ def test_mimic_joints_root_poses_and_joint_order_are_kept():
     assert data.joint("right").qpos[0] == pytest.approx(-0.03, abs=1e-3)
     assert data.body("base").xpos == pytest.approx(at.position)
     assert model.body("base").dofnum == 0
-
-
-def test_root_link_may_be_named_world():
-    plain = reach_scene().robot
-    first = plain.root.name
-
-    def named(name):
-        return "world" if name == first else name
-
-    body = replace(
-        plain,
-        links=(replace(plain.root, name="world"), *plain.links[1:]),
-        joints=tuple(replace(j, parent=named(j.parent)) for j in plain.joints),
-        frames=tuple(Frame(f.name, named(f.link), f.T_link_frame) for f in plain.frames),
-        ignore_pairs=tuple(sorted(tuple(sorted(map(named, p))) for p in plain.ignore_pairs)),
-    )
-    at = Pose((0.0, 0.0, 0.4))
-    sims = [MujocoSimulation([Scene(each, at)]) for each in (plain, body)]
-    for sim in sims:
-        drive(sim)
-    assert same_bits(outputs(sims[0]), outputs(sims[1]))
 
 
 def test_results_are_bit_identical_for_any_thread_count():
@@ -262,3 +245,52 @@ def test_mujoco_errors_become_one_line():
     ) as info:
         MujocoSimulation([reach_scene(), scene])
     assert "\n" not in str(info.value)
+
+
+@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain"])
+def test_merged_links_move_like_separate_ones(request_):
+    body = robot(request_)
+    merged = merge_rigid_links(body)
+    rng = np.random.default_rng(0)
+    for q in rng.normal(size=(3, body.dof)):
+        np.testing.assert_allclose(mass_matrix(merged, q), mass_matrix(body, q), atol=1e-9)
+    shapes = sum(len(link.collisions) for link in body.links)
+    assert sum(len(link.collisions) for link in merged.links) == shapes
+    assert len(merged.links) <= len(body.links)
+    assert merged.home == body.home
+
+
+@pytest.mark.parametrize("simulator", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("mass", [0.0, 5.0])
+@pytest.mark.parametrize("shifted", [False, True])
+def test_a_massive_link_may_be_welded_to_a_root_named_world(simulator, mass, shifted):
+    if simulator == "pybullet":
+        pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    body = arm()
+    world = Link("world", Inertial(mass) if mass else None)
+    weld = Joint("weld", "fixed", "world", body.root.name, Pose((0, 0, 0.5 * shifted)))
+    body = replace(body, links=(world, *body.links), joints=(weld, *body.joints))
+    simulation = SIMULATORS[simulator].load([Scene(body)], None, 1, torch.device("cpu"))
+    assert not simulation.step(simulation.q.clone()).any()
+    simulation.close()
+
+
+def test_links_with_different_ignored_pairs_are_not_merged():
+    """A fixed finger with other ignored pairs than its palm stays a separate body."""
+    body = arm()
+    fixed = replace(body.joints[3], kind="fixed", limits=None)
+    moving = replace(body.joints[4], mimic=None)
+    joints = (*body.joints[:3], fixed, moving)
+    body = replace(body, joints=joints, ignore_pairs=(("base", "left"),))
+    assert {"left", "slider"} <= {link.name for link in merge_rigid_links(body).links}
+    joined = merge_rigid_links(replace(body, ignore_pairs=()))
+    assert "left" not in {link.name for link in joined.links}
+    assert joined.mass == pytest.approx(body.mass)
+
+
+def test_adjacent_links_are_ignored_without_ignore_pairs():
+    made = load_robot("arm3-stick")
+    bare = replace(made, ignore_pairs=())
+    assert set(untested_pairs(bare)) <= set(untested_pairs(made)) == set(made.ignore_pairs)
+    _, tried = FreeSpace(Scene(bare, ground=-1.0)).sample(20, np.random.default_rng(0))
+    assert tried < 200

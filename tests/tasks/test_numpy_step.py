@@ -38,22 +38,16 @@ CHANNELS = ObservationConfig(
 
 
 @pytest.fixture
-def make(cache):
-    """Create an environment and a batch of the same one, and close them after the test."""
-    opened = []
+def make(cache, opened):
+    """Create an environment and a batch of the same one."""
 
     def pair(task, robot=None, config=None, **options):
         robot, config = robot or ROBOTS[task], config or CONFIGS[task]
         options = {"sim": "mujoco", "cache": cache} | options
-        env = TaskEnv(task, robot, config=config, **options)
-        opened.append(env)
-        batch = make_batch(task, [robot], 1, configs=(config,), **options)
-        opened.append(batch)
-        return env, batch
+        env = opened(TaskEnv(task, robot, config=config, **options))
+        return env, opened(make_batch(task, [robot], 1, configs=(config,), **options))
 
-    yield pair
-    for each in opened:
-        each.close()
+    return pair
 
 
 def assert_observation_equals(seen, env, expected):

@@ -41,32 +41,16 @@ def push(cache):
 
 
 @pytest.fixture
-def on():
-    """Create renderers and close them after the test."""
-    drawn = []
-
-    def of(spec, size=SIZE):
-        drawn.append(Renderer.of_spec(spec, size))
-        return drawn[-1]
-
-    yield of
-    for drawing in drawn:
-        drawing.close()
+def on(opened):
+    return lambda spec, size=SIZE: opened(Renderer.of_spec(spec, size))
 
 
 @pytest.fixture
-def plain():
-    """Create renderers of bare scenes and close them after the test."""
-    made = []
-
-    def of(scene):
-        home = np.array([scene.robot.home])
-        made.append(Renderer(scene, (), home, np.zeros((0, 3)), SIZE))
-        return made[-1]
-
-    yield of
-    for each in made:
-        each.close()
+def plain(opened):
+    """Create renderers of bare scenes."""
+    return lambda scene: opened(
+        Renderer(scene, (), np.array([scene.robot.home]), np.zeros((0, 3)), SIZE)
+    )
 
 
 def at_goal(spec, i):

@@ -24,19 +24,15 @@ NOTHING_TOUCHES = Contacts(False, False)
 
 
 @pytest.fixture
-def load(sim):
-    """Create simulations of scenes, reset to their homes, and close them after the test."""
-    made = []
+def load(sim, opened):
+    """Create simulations of scenes, reset to their homes."""
 
     def of(*scenes, contacts=None):
-        loaded = SIMULATORS[sim].load(scenes, contacts, 1, torch.device("cpu"))
-        made.append(loaded)
+        loaded = opened(SIMULATORS[sim].load(scenes, contacts, 1, torch.device("cpu")))
         put_home(loaded)
         return loaded
 
-    yield of
-    for each in made:
-        each.close()
+    return of
 
 
 @pytest.fixture

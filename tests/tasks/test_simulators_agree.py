@@ -107,7 +107,7 @@ def test_pushed_blocks_move_the_same_distance(friction, aside):
 EDGE = 0.08
 
 
-@pytest.fixture(params=[BulletSimulation, MujocoSimulation])
+@pytest.fixture(params=SIMULATIONS)
 def simulator(request):
     return request.param
 
