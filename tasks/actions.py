@@ -63,7 +63,7 @@ def encode_actions(normalized: torch.Tensor, kind: ActionKind) -> torch.Tensor:
     if kind == "continuous":
         return normalized
     bins = _bins(normalized.device)
-    size = normalized.abs()[..., None] + _TOLERANCE
+    size = normalized.abs()[..., None] + _TOLERANCE  # so that a bin encodes to itself
     fits = (bins.abs() <= size) & (bins * normalized[..., None] >= 0)
     return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)
 
@@ -76,6 +76,7 @@ class JointTargets:
     ) -> None:
         """Gather the tables of the robots (n,); the mask (n, L) has the joints that obey."""
         self._link = tables.link_of_joint[env_robot_index]
+        # Joints that do not obey have a step of zero: no mask is needed in a control step.
         self._max_step = tables.max_step[env_robot_index] * torch.gather(action_mask, 1, self._link)
         self._lower, self._upper = tables.lower[env_robot_index], tables.upper[env_robot_index]
 

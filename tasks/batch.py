@@ -224,7 +224,7 @@ class TaskBatch:
             TaskError: If a seed is out of range, or an option is invalid. The same episodes are
                 then still the next.
         """
-        before = self.state_dict() if options else {}
+        before = self.state_dict() if options else {}  # an option that is refused costs no episode
         if seed is not None:
             self._episodes.restart(seed, torch.zeros_like(self._episodes.next_episode))
         try:
@@ -290,9 +290,9 @@ class TaskBatch:
         self.episode_step += 1
         result, reward = self._evaluate(state, diverged)
         timed_out = self.episode_step >= self.max_episode_steps
-        truncated = (timed_out | diverged) & ~result.terminated
-        final_observation = self._observe(state)
-        q, block_pose = state.q.clone(), state.block_pose.clone()
+        truncated = (timed_out | diverged) & ~result.terminated  # an end wins over the time limit
+        final_observation = self._observe(state)  # before new episodes change goals and layouts
+        q, block_pose = state.q.clone(), state.block_pose.clone()  # the simulation overwrites them
         ended = truncated | result.terminated
         if is_host(self.device) and not ended.any():
             observation = copied(final_observation)
@@ -316,7 +316,7 @@ class TaskBatch:
         if is_host(self.device) and not diverged.any():
             return state
         rows = diverged[:, None]
-        self.previous_qd.masked_fill_(rows, 0)
+        self.previous_qd.masked_fill_(rows, 0)  # an undone step has no acceleration
         return PhysicsState(
             q=torch.where(rows, before.q, state.q),
             qd=state.qd.masked_fill(rows, 0),
@@ -405,7 +405,7 @@ class TaskBatch:
         sim_q = q[:, : self._num_sim_joints].contiguous()
         self.simulation.reset(mask, sim_q, block_pose, *obstacles)
         rows = mask[:, None]
-        self.targets.copy_(torch.where(rows, q, self.targets))
+        self.targets.copy_(torch.where(rows, q, self.targets))  # motors hold the start
         self.episode_step.masked_fill_(mask, 0)
         self.previous_qd.masked_fill_(rows, 0)
         self.previous_action.masked_fill_(rows, 0)
@@ -466,14 +466,14 @@ class StepGraph:
         stream = torch.cuda.Stream(batch.device)  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream(batch.device))
         with torch.cuda.stream(stream):
-            batch.reset()
+            batch.reset()  # a capture needs tensors that are allocated already
             for _ in range(WARM_UP):
                 batch.step(self._actions)
         torch.cuda.current_stream(batch.device).wait_stream(stream)
         self._act, self._finish = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._act):
             self._before = batch.act(self._actions)
-        with torch.cuda.graph(self._finish, pool=self._act.pool()):
+        with torch.cuda.graph(self._finish, pool=self._act.pool()):  # reads what the first wrote
             self._step = batch.finish(self._before, self._diverged)
         batch.load_state_dict(state)
 

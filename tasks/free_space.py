@@ -83,6 +83,7 @@ def in_other_component(planes: Sequence[JointPlane], q: Array) -> NDArray[np.boo
 def _is_outside(plane: JointPlane, q: Array) -> bool:
     """Return whether no equivalent of q within the limits, up to full turns, is in ``main``."""
     position, count = q[[*plane.joints]], np.array(plane.main.shape)
+    # Limits of real joints span two turns at most, so two turns lead from any end to the other.
     for times in product(*((-2, -1, 0, 1, 2) if turn else (0,) for turn in plane.turns)):
         fraction = (position + np.multiply(times, plane.turns) - plane.lower) / (
             plane.upper - plane.lower
@@ -113,6 +114,7 @@ def _joint_plane(robot: Robot, joints: tuple[int, ...], pairs: Sequence[Pair]) -
     if components.max() < 2:
         return None
     largest = int(np.bincount(components[components > 0]).argmax())
+    # A free configuration may be in a cell whose centre is not: it belongs to the nearest free one.
     nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
     periods = np.where(periodic_joints(robot)[columns], 2 * np.pi, 0.0)
     main = components[tuple(nearest)] == largest
@@ -121,7 +123,7 @@ def _joint_plane(robot: Robot, joints: tuple[int, ...], pairs: Sequence[Pair]) -
 
 def _components(free: NDArray[np.bool_], continuous: Sequence[bool]) -> NDArray[np.int64]:
     """Label the component of each free cell, from 1; continuous joints wrap around."""
-    labels, count = ndimage.label(free, np.ones((3,) * free.ndim))
+    labels, count = ndimage.label(free, np.ones((3,) * free.ndim))  # diagonal neighbours count
     merged_label = np.arange(count + 1)
     for axis, wraps in enumerate(continuous):
         if wraps:

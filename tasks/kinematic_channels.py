@@ -143,11 +143,11 @@ class IkSolutions:
         q = self._tables.nearest_turns(self._index[rows], q, now)
         distance = torch.linalg.vector_norm(error, dim=2)
         steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
-        cost = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance))
+        cost = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance))  # unsolved ones last
         order = cost.argsort(dim=0, stable=True).cpu().numpy()
         here, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
         solved = (distance < SOLVED).sum(dim=0).tolist()
-        chosen = []
+        chosen = []  # the first free one; if all paths collide, the nearest
         for i, env in enumerate(rows.tolist()):
             preferred = order[: solved[i], i]
             chosen.append(order[self._first_free(env, here[i], ends[preferred, i]) or 0, i])
@@ -261,7 +261,7 @@ class KinematicChannels:
         self._max_step = tables.max_step[index]
         # Padding has a largest step of zero; its columns are zero, too.
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
-        self._effort = tables.effort[index].clamp(min=NEAR).log() / 5
+        self._effort = tables.effort[index].clamp(min=NEAR).log() / 5  # 150 N m become one
         self._is_prismatic = tables.is_prismatic[index].float()
         self._solutions = IkSolutions(tables, index, first_free) if "ik" in names else None
         needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
@@ -384,6 +384,7 @@ class KinematicChannels:
         solutions.update(state.targets, state.goals, ROTATION_LENGTH)
         change = solutions.q - state.targets
         steps = change * self._per_step
+        # All joints arrive together, and none overshoots in the last step.
         share = steps / steps.abs().amax(dim=1, keepdim=True).clamp(min=1)
         log_error = ((solutions.error + NEAR).log() / 2)[:, None].expand_as(steps)
         columns = [torch.tanh(gain * steps) for gain in GAINS]
@@ -413,7 +414,7 @@ class KinematicChannels:
         step = along / (squares + SINGULAR) * self._per_step
         length = torch.linalg.vector_norm(error, dim=1)[:, None]
         cosine = along / (squares.sqrt() * length + SINGULAR)
-        log_length = ((length + NEAR).log() / 2).expand_as(cosine)
+        log_length = ((length + NEAR).log() / 2).expand_as(cosine)  # 1 mm is -3, 1 m is 0
         steps = [torch.tanh(gain * step) for gain in GAINS]
         return torch.stack([*steps, cosine, log_length], dim=1)
 

@@ -192,7 +192,7 @@ def tree_entries(
     above = ancestors[rows[..., None], order[:, :, None], order[:, None, :]]
     above &= exists[:, :, None] & exists[:, None, :]
     depth = above.sum(dim=2)
-    common = (above.float() @ above.float().transpose(1, 2)).long()
+    common = (above.float() @ above.float().transpose(1, 2)).long()  # torch multiplies no bools
     distance = (depth[:, :, None] + depth[:, None, :] - 2 * common).clamp(max=MAX_TREE_DISTANCE)
     same = torch.eye(K, dtype=torch.bool, device=order.device)
     kind = torch.where(above, 1, torch.where(above.transpose(1, 2), 2, 3))
@@ -271,7 +271,7 @@ class EpisodeLayouts:
 
     def _place(self) -> None:
         """Put the obstacles where the current layouts have them."""
-        self.poses.copy_(self._layout_poses[self._index, self.current.clamp(min=0)])
+        self.poses.copy_(self._layout_poses[self._index, self.current.clamp(min=0)])  # -1: zeros
         if self._is_observed:
             self.entries["obstacles"][:, : self.poses.shape[1], :7] = self.poses
 
@@ -335,6 +335,7 @@ class PointClouds:
         """Draw the points of new episodes among obstacles at poses in the world, (n, O, 7)."""
         n, P = self._on_block.shape
         numbers = random.uniform(Stream.POINTS, P * _NUMBERS).view(n, P, _NUMBERS)
+        # right=True: a face without area has the end of the one before, and is never drawn.
         face = torch.searchsorted(self._area, numbers[..., 0].contiguous(), right=True)
         box, axis = face // 3, face % 3
         position = numbers[..., 1:4] - 0.5
@@ -361,7 +362,7 @@ class PointClouds:
 def _normal(uniform: torch.Tensor) -> torch.Tensor:
     """Return normal numbers from uniform ones in [0, 1) (Box and Muller 1958), shape (..., 2 m)."""
     first, second = uniform.chunk(2, dim=-1)
-    radius = torch.sqrt(-2 * torch.log1p(-first))
+    radius = torch.sqrt(-2 * torch.log1p(-first))  # of 1 - first, which is never zero
     angle = 2 * math.pi * second
     return torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
 
@@ -390,7 +391,7 @@ class StraightPaths:
         tested: list[Array] = []
         for i, end in enumerate(ends[:, :dof]):
             if any(np.abs(end - other).max() < SAME for other in tested):
-                continue
+                continue  # many starts of inverse kinematics end in one configuration
             if space.free_fraction(start[:dof], end) == 1:
                 return i
             tested.append(end)

@@ -195,7 +195,7 @@ def philox(counter: torch.Tensor, seed: int | torch.Tensor) -> torch.Tensor:
     for k in range(ROUNDS):
         keys = (low_key + k * _KEY_STEPS[0]) % WORD, (high_key + k * _KEY_STEPS[1]) % WORD
         product = factors * multipliers
-        high = (product >> 32).add_(factors).bitwise_xor_(others)
+        high = (product >> 32).add_(factors).bitwise_xor_(others)  # see ``_MULTIPLIERS``
         factors = high.bitwise_xor_(_column(keys, counter)).flip(0)
         others = product.bitwise_and_(WORD - 1)
     return torch.stack([factors[1], others[0], factors[0], others[1]])

@@ -84,6 +84,7 @@ class GoalChoices:
             count[i, : len(rows)] = rows.sum(axis=1)
             if (least := int(count[i, : len(rows)].min())) < fewest:
                 raise TaskError(f"robot {goals.robot!r}: {least} goals; expected {fewest} or more")
+            # The possible ones first, in their order, so that a number below the count is one.
             index[i, : len(rows), : rows.shape[1]] = np.argsort(~rows, axis=1, kind="stable")
         device = env_spec_index.device
         self._index = torch.from_numpy(index).flatten(0, 1).to(device)

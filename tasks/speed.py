@@ -75,7 +75,7 @@ def measure_speed(
     batch.reset()
     for action in actions[:WARM_UP]:
         batch.step(action)
-    batch.reset(seed)
+    batch.reset(seed)  # after the warm-up, for the same episodes in all simulators
     steps = 0
     with ExitStack() as stack:
         for part, functions in parts.items():
@@ -87,7 +87,7 @@ def measure_speed(
             steps += 1
         total = clock() - start
     shares = {part: spent.get(part, 0.0) / total for part in parts}
-    shares["around the simulator"] -= shares["simulator"]
+    shares["around the simulator"] -= shares["simulator"]  # its time includes the native step
     shares["rest"] = 1 - sum(shares.values())
     if not own:
         shares["simulator"] = shares.pop("around the simulator")

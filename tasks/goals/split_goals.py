@@ -188,7 +188,7 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
     try:
         with locked_folder(home):
             sums = read_sums(home / SUMS_FILE)
-            (home / SUMS_FILE).unlink()
+            (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
             for leftover in home.glob(f".{GOALS}.*"):
                 shutil.rmtree(leftover, ignore_errors=True)
             with replacing_folder(folder) as partial:

@@ -139,6 +139,7 @@ class NumpyStepper:
         """Act for one control step."""
         self._previous_action[self._links] = self._normalized(action)
         change = self._previous_action[self._link_of_joint] * self._max_step
+        # np.clip takes four times as long.
         np.minimum(np.maximum(self._targets + change, self._lower), self._upper, out=self._targets)
         diverged = self._simulate()
         steps = self._episode_step.item() + 1
@@ -156,7 +157,7 @@ class NumpyStepper:
     def _normalized(self, action: NDArray[Any]) -> Float32:
         """Return an action as fractions of the joints' largest steps; see ``decode_actions``."""
         if not self._discrete:
-            if math.isfinite(action.dot(action)):  # all are finite
+            if math.isfinite(action.dot(action)):  # then all are finite; a sum may also overflow
                 return np.minimum(np.maximum(action.astype(np.float32), -1), 1)
         elif action.dtype.kind == "i" and ((action >= 0) & (action < len(BINS))).all():
             return np.asarray(_BINS[action])
@@ -387,7 +388,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         self._require_open()
         super().reset(seed=seed)
         if seed is None and not self._was_reset:
-            seed = int(self.np_random.integers(2**63))
+            seed = int(self.np_random.integers(2**63))  # Gymnasium: the first reset is random
         self._running = False
         next_has_begun = self._next_has_begun and seed is None and not options
         observation = self._without_padding(

@@ -230,6 +230,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         super().reset(seed=seed if isinstance(seed, int) else None)
         seeds: int | list[int] | None = None
         if isinstance(seed, Sequence | np.ndarray):
+            # For all of them, so that an environment's does not depend on who else has None.
             drawn = [int(self.np_random.integers(2**63)) for _ in seed]
             seeds = [
                 new if each is None else whole_number("seed", each, TaskError)

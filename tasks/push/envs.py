@@ -173,5 +173,6 @@ def goal_terms(config: PushConfig, y: torch.Tensor, line: torch.Tensor) -> torch
 def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
     """Return the position of the line in a curriculum, shape as ``line``."""
     steps = config.curriculum_steps
+    # Twice: during the first half. The summand keeps k / steps from being rounded down.
     reached = min(math.floor(2 * progress * steps + 1e-9), steps) / steps
     return line * (config.curriculum_start + (1 - config.curriculum_start) * reached)

@@ -111,7 +111,7 @@ def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator)
 def yawed(yaw: Array) -> Array:
     """Return quaternions of rotations about z, shape (n, 4), w >= 0."""
     zero = np.zeros_like(yaw)
-    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
+    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)  # w, x, y, z
     return np.where(q[:, :1] < 0, -q, q)
 
 
@@ -144,7 +144,7 @@ def _num_slide_directions(robot: Robot) -> int:
         for k in robot.joint_chain(robot.frame(TOOL).link)
         if robot.joints[k].kind == "prismatic"
     ]
-    return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0
+    return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0  # parallel: one
 
 
 def _tool_x_range(robot: Robot, ground: float, edge: float) -> tuple[float, float]:
@@ -282,7 +282,7 @@ def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bo
     step = _SPACING * space.scene.block.size[1]
     parts = int((line - blocks[:, 1].min()) / step) + 2
     turned = blocks.copy()
-    turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)
+    turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)  # a pushed block may turn: its widest ways
     poses = np.tile(np.stack([blocks, turned]), (parts, 1, 1, 1))
     advance = step * np.arange(parts)[:, None]
     poses[..., 1] = np.minimum(blocks[:, 1] + advance, line)[:, None]

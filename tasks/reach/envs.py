@@ -59,7 +59,7 @@ class ReachEnvs(TaskEnvs):
         count = self._choices.count(layout)[:, None]
         # The second number counts on from the first: it is never the same, modulo the count.
         numbers = random.integers(Stream.START, count - self._excluded)
-        numbers[:, 1] += numbers[:, 0] + 1
+        numbers[:, 1] += numbers[:, 0] + 1  # drawn below count - 1
         pair = self._choices.goals(layout, numbers % count)
         q = self._q[self._env_spec_index[:, None], pair]
         pose = self._poses[self._env_spec_index, pair[:, 1]]

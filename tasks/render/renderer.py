@@ -346,10 +346,10 @@ class Renderer:
         width, height = self.size
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         rectangle = mujoco.MjrRect(0, 0, width, height)
-        self._context.make_current()
+        self._context.make_current()  # another renderer may have been drawing
         mujoco.mjr_render(rectangle, self._scene, self._gpu)
         mujoco.mjr_readPixels(pixels, None, rectangle, self._gpu)
-        return np.ascontiguousarray(pixels[::-1])
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
 
 def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
@@ -438,7 +438,8 @@ def _writer_options(suffix: str, fps: float) -> dict[str, Any]:
         "codec": "libx264",
         "quality": 8,
         "ffmpeg_log_level": "quiet",
-        "macro_block_size": 2,
+        "macro_block_size": 2,  # imageio's default of 16 would scale 640 x 360
+        # Without the version of ffmpeg in the file: the same frames give the same bytes.
         "output_params": ["-fflags", "+bitexact", "-flags:v", "+bitexact"],
     }
 

@@ -167,7 +167,7 @@ def ground_under(robot: Robot) -> float:
     free_above_ground, free_without = (
         FreeSpace(Scene(robot, ground=ground)).free([robot.home])[0] for ground in (0.0, None)
     )
-    if free_above_ground or not free_without:
+    if free_above_ground or not free_without:  # lowering helps no robot that collides with itself
         return 0.0
     T_root_link = forward_kinematics(robot, np.array(robot.home))
     heights = [0.0]
@@ -175,4 +175,4 @@ def ground_under(robot: Robot) -> float:
         if link.collisions:
             corners = np.array(list(product(*bounding_box(link.collisions).T)))
             heights.append(float((corners @ T[2, :3] + T[2, 3]).min()))
-    return math.floor(min(heights) / GROUND_STEP) * GROUND_STEP
+    return math.floor(min(heights) / GROUND_STEP) * GROUND_STEP  # part of the key of a goal set

@@ -65,7 +65,7 @@ def with_obstacles(
     usable: UsableOf[G],
 ) -> G:
     """Return a robot's goal set with obstacles, whose layouts leave some of the goals possible."""
-    size_seeds, layout_seeds = seeds.spawn(2)
+    size_seeds, layout_seeds = seeds.spawn(2)  # more boxes change no random number of layouts
     rng = np.random.default_rng(size_seeds)
     boxes = draw_boxes(scene.robot, config.obstacles, config.obstacle_size, rng)
     space = FreeSpace(replace(scene, obstacles=boxes))
@@ -166,7 +166,7 @@ def _draw_poses(
                 continue
             left = probes[space.free(probes)]
             if len(left) >= KEPT * PROBES:
-                probes = left
+                probes = left  # the next box may block only what this one leaves
                 break
         else:
             return None

@@ -138,7 +138,7 @@ def _table_rows(
 
     link_tokens = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     rows["tokens"], rows["link_mask"] = pad_tokens(link_tokens, max_links)
-    rows["tokens"][:, POSITION.columns] = 0
+    rows["tokens"][:, POSITION.columns] = 0  # they change with every step; see ``LinkTokens``
     dof = robot.dof
     rows["lower"][:dof], rows["upper"][:dof] = joint_limits(robot).T
     rows["home"][:dof] = robot.home
@@ -147,7 +147,7 @@ def _table_rows(
         joint = robot.joints[k]
         rows["joint_of_link"][k + 1], rows["link_of_joint"][i] = i, k + 1
         max_step = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
-        if joint.velocity:
+        if joint.velocity:  # 0 is "unknown" in many URDFs
             max_step = min(max_step, joint.velocity * CONTROL_PERIOD)
         rows["max_step"][i], rows["is_prismatic"][i] = max_step, joint.kind == "prismatic"
         rows["effort"][i] = joint.effort or 0.0

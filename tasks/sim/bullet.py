@@ -213,7 +213,7 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
     shares: list[list[int]] = [[] for _ in range(min(processes, len(scenes)))]
     loads = [0] * len(shares)
     weights = [_BASE_LOAD + len(scene.robot.movable_joints) for scene in scenes]
-    for env in sorted(range(len(scenes)), key=lambda env: -weights[env]):
+    for env in sorted(range(len(scenes)), key=lambda env: -weights[env]):  # the heaviest first
         lightest = loads.index(min(loads))
         shares[lightest].append(env)
         loads[lightest] += weights[env]

@@ -153,7 +153,7 @@ class BulletScene:
         links = {merged.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[merged.joints[k].name] for k in merged.movable_joints]
         self.efforts = [_effort(merged, k) for k in merged.movable_joints]
-        fastest = max(limited_speeds(merged), default=math.inf)
+        fastest = max(limited_speeds(merged), default=math.inf)  # PyBullet has one limit a robot
         if math.isfinite(fastest):
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
@@ -187,7 +187,7 @@ class BulletScene:
         if self._scene.ground is not None:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **self._client)
             at = (0.0, 0.0, self._scene.ground)
-            ground = pybullet.createMultiBody(0, plane, basePosition=at, **self._client)
+            ground = pybullet.createMultiBody(0, plane, basePosition=at, **self._client)  # static
             self._add(ground, FRICTION, _STATIC)
             for link in self._level:
                 pybullet.setCollisionFilterPair(self.robot, ground, link, -1, 0, **self._client)
@@ -252,7 +252,7 @@ class BulletScene:
                 self.block, (x, y, z), (qx, qy, qz, qw), **self._client
             )
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
-            self._block_position = (x, y, z)
+            self._block_position = (x, y, z)  # where its weight acts in the next step
         if obstacle_poses is not None:
             for body, pose in zip(self._obstacles, obstacle_poses, strict=True):
                 x, y, z, qw, qx, qy, qz = pose
@@ -425,7 +425,7 @@ class BulletBatch:
             matrix, shift = robot.mimic_map
             self._spans.append(slice(start, start + len(shift)))
             if robot.dof:
-                leader = np.abs(matrix).argmax(axis=1)
+                leader = np.abs(matrix).argmax(axis=1)  # a row has one number that is not zero
                 source.extend((env * width + leader).tolist())
                 gain.extend(matrix[np.arange(len(matrix)), leader].tolist())
                 rows = robot.independent_rows
@@ -462,7 +462,7 @@ class BulletBatch:
             scene = self._scenes[i]
             positions = positions[: scene.robot.dof]
             if self._diverged.pop(env, None) is not None:
-                self._loaded[i].close()
+                self._loaded[i].close()  # numbers that are not finite stay in a client
                 self._loaded[i] = self._load(i)
             loaded, span = self._loaded[i], self._spans[i]
             self._positions[span] = movable_positions(scene.robot, positions)

@@ -156,6 +156,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
     for k, added in zip(robot.movable_joints, _missing_inertia(robot).tolist(), strict=True):
         spec.joint(robot.joints[k].name).armature += added
     for geom in spec.geoms:
+        # Two geoms collide if a bit of one's contype is in the other's conaffinity.
         geom.contype = _BY_LINKS if contacts.self_collision else 0
         geom.conaffinity = geom.contype | (_BY_SCENE | _BY_GROUND if contacts.scene else 0)
     option = spec.option
@@ -192,6 +193,7 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         for geom in spec.body(name).geoms:
             geom.conaffinity &= ~_BY_GROUND
     if scene.ground is not None:
+        # Without extent a plane is infinite; MuJoCo only requires the third number, for its grid.
         plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         plane.pos = [0.0, 0.0, scene.ground]
         plane.contype, plane.conaffinity = _BY_GROUND | _BY_BLOCK, 0
@@ -222,7 +224,7 @@ def _add_block(spec: mujoco.MjSpec, block: Block) -> mujoco.MjsBody:
     if block.mass > 0:
         body.add_freejoint()
         x, y, z = (edge * edge for edge in block.size)
-        body.explicitinertial = True
+        body.explicitinertial = True  # else MuJoCo computes them from the geom's density
         body.mass = block.mass
         body.inertia = [block.mass * total / 12 for total in (y + z, x + z, x + y)]
     geom = _add_box(body, block, _BLOCK_PRIORITY)

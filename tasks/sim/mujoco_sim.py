@@ -127,7 +127,7 @@ class MujocoState:
         if self._has_blocks:
             self._exact_pose = self._positions.flat[self._pose_at]
             quaternion = self._exact_pose[:, 3:]
-            quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
+            quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
             self._block_pose[:] = self._exact_pose
 
     def faults(self) -> dict[int, str]:
@@ -378,18 +378,19 @@ class MujocoSimulation:
         world, data = self._worlds[env], self._data[env]
         if not np.isfinite(q).all() or (world.block is not None and not np.isfinite(pose).all()):
             raise ValueError(f"{self._label(env)}: reset to q {list(q)}, block {list(pose)}")
+        # mj_resetData also puts mocap bodies back: obstacles shall stay where they are.
         obstacles = (values[world.obstacles] for values in (data.mocap_pos, data.mocap_quat))
         positions, quaternions = obstacles
         mujoco.mj_resetData(world.model, data)
         data.mocap_pos[world.obstacles], data.mocap_quat[world.obstacles] = positions, quaternions
         data.qpos[world.movable_q_at] = movable_positions(world.robot, q)
-        mujoco.mj_kinematics(world.model, data)
+        mujoco.mj_kinematics(world.model, data)  # these three give the inertia that controls need
         mujoco.mj_comPos(world.model, data)
         mujoco.mj_makeM(world.model, data)
         if world.block is not None:
             position, quaternion = world.block_pose_in(data)
             position[:], quaternion[:] = pose[:3], pose[3:]
-            if mujoco.mju_normalize4(quaternion) < 0.5:
+            if mujoco.mju_normalize4(quaternion) < 0.5:  # it returns the length before
                 raise ValueError(f"{self._label(env)}: {list(pose)} is not a pose of a block")
 
     def _put_obstacles(self, env: int, poses: Sequence[Sequence[float]]) -> None:

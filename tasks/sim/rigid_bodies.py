@@ -122,7 +122,7 @@ def _merged_inertial(pieces: list[_Piece]) -> Inertial | None:
     for (T, inertial), centre in zip(massive, centres, strict=True):
         d = centre - com
         matrix += T[:3, :3] @ inertial.matrix @ T[:3, :3].T
-        matrix += inertial.mass * (d @ d * np.eye(3) - np.outer(d, d))
+        matrix += inertial.mass * (d @ d * np.eye(3) - np.outer(d, d))  # Steiner
     x, y, z = com.tolist()
     return Inertial.from_matrix(float(mass), (x, y, z), matrix)
 
