@@ -15,14 +15,9 @@ from enum import IntEnum
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.sim.base import is_host
 
 MAX_SEED = 2**64 - 1
 """Largest seed."""
-AHEAD = 16
-"""Number of episodes whose random numbers are computed together: a hundred tensor operations."""
-STREAMS_AHEAD = 2
-"""Number of streams, the first ones, of which that is done."""
 ROUNDS = 10
 """Number of rounds of the generator."""
 WORD = 2**32
@@ -65,14 +60,11 @@ class EpisodeRandom:
     """Number of each environment, shape (k,), int64, 0 to 2^32 - 1."""
     episode: torch.Tensor
     """Number of the episode of each environment, shape (k,), int64, 0 to 2^32 - 1."""
-    words: torch.Tensor | None = None
-    """First words of the first streams if they are known, (k, ``STREAMS_AHEAD``, 4), int64."""
 
     def select(self, rows: torch.Tensor) -> EpisodeRandom:
         """Return the numbers of some of the environments, by their rows (m,), int64."""
-        words = None if self.words is None else self.words[rows]
         key = self.key if isinstance(self.key, int) else self.key[rows]
-        return EpisodeRandom(key, self.env_number[rows], self.episode[rows], words)
+        return EpisodeRandom(key, self.env_number[rows], self.episode[rows])
 
     def uniform(self, stream: int, count: int) -> torch.Tensor:
         """Return numbers that are uniform in [0, 1), multiples of 2^-24.
@@ -104,14 +96,15 @@ class EpisodeRandom:
 
     def _words(self, stream: int, count: int) -> torch.Tensor:
         """Return uniform words, shape (k, count), int64."""
-        if self.words is not None and stream < STREAMS_AHEAD and count <= 4:
-            return self.words[:, stream, :count]
         k, num_blocks = len(self.episode), -(-count // 4)
         counter = self.episode.new_empty(4, k, num_blocks)
         counter[0], counter[1] = self.env_number[:, None], self.episode[:, None]
         counter[2].fill_(stream)
         counter[3] = torch.arange(num_blocks, device=counter.device)
-        words = philox(counter.flatten(1), _repeated(self.key, num_blocks))
+        key = self.key
+        if not isinstance(key, int):
+            key = key.repeat_interleave(num_blocks, dim=0)  # the blocks of an environment follow
+        words = philox(counter.flatten(1), key)
         return words.T.reshape(k, 4 * num_blocks)[:, :count]
 
 
@@ -130,8 +123,6 @@ class EpisodeSequence:
         """Set up; for the arguments see the attributes."""
         self._numbers, self.next_episode = env_number, next_episode.clone()
         self.restart(seed, next_episode)
-        # Rows of the words of each environment, computed ahead: ``AHEAD`` episodes each.
-        self._first_row = AHEAD * torch.arange(len(env_number), device=env_number.device)
 
     def restart(self, seed: int | Sequence[int], next_episode: torch.Tensor) -> None:
         """Go on with another seed and other episodes; see the attributes."""
@@ -147,34 +138,13 @@ class EpisodeSequence:
             words = [divmod(env_seed, WORD)[::-1] for env_seed in seed]
             self._key = torch.tensor(words, device=self._numbers.device)
             self.seed, self.env_number = tuple(seed), torch.zeros_like(self._numbers)
-        self._uses_left = 0
         self.next_episode.copy_(next_episode)
 
     def begin(self, mask: torch.Tensor) -> EpisodeRandom:
         """Begin episodes in some environments (n,); return the numbers of all next episodes."""
-        if not is_host(mask.device):  # in place and without counting, as a CUDA graph has to
-            random = EpisodeRandom(self._key, self.env_number, self.next_episode.clone())
-            self.next_episode += mask
-            return random
-        if not self._uses_left:
-            self._look_ahead()
-        self._uses_left -= 1
-        row = self._first_row + (self.next_episode - self._first_ahead)
-        words = self._ahead.index_select(0, row).view(-1, STREAMS_AHEAD, 4)
-        random = EpisodeRandom(self._key, self.env_number, self.next_episode, words)
-        self.next_episode = self.next_episode + mask
+        random = EpisodeRandom(self._key, self.env_number, self.next_episode.clone())
+        self.next_episode += mask  # in place, as a CUDA graph has to
         return random
-
-    def _look_ahead(self) -> None:
-        """Compute words for ``AHEAD`` calls of ``begin``, which begin one episode each at most."""
-        n, device = len(self.env_number), self.env_number.device
-        self._first_ahead, self._uses_left = self.next_episode, AHEAD
-        counter = self.env_number.new_zeros(4, n, AHEAD, STREAMS_AHEAD)
-        counter[0] = self.env_number[:, None, None]
-        counter[1] = (self.next_episode[:, None] + torch.arange(AHEAD, device=device))[..., None]
-        counter[2] = torch.arange(STREAMS_AHEAD, device=device)
-        words = philox(counter.flatten(1), _repeated(self._key, AHEAD * STREAMS_AHEAD))
-        self._ahead = words.T.reshape(n * AHEAD, 4 * STREAMS_AHEAD)
 
 
 def require_seed(seed: int) -> None:
@@ -199,11 +169,6 @@ def philox(counter: torch.Tensor, seed: int | torch.Tensor) -> torch.Tensor:
         factors = high.bitwise_xor_(_column(keys, counter)).flip(0)
         others = product.bitwise_and_(WORD - 1)
     return torch.stack([factors[1], others[0], factors[0], others[1]])
-
-
-def _repeated(key: int | torch.Tensor, times: int) -> int | torch.Tensor:
-    """Return a key for each of several counters of an environment, one after the other."""
-    return key if isinstance(key, int) else key.repeat_interleave(times, dim=0)
 
 
 def _column(

@@ -1,24 +1,36 @@
-"""Episodes of a batch: their distribution, what they depend on, and steps that read no tensor."""
+"""Episodes of a batch: distribution, layouts, ends, what they depend on, reads of tensors."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+import morphgen
 from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
+from helpers.resets import reset_envs
 from helpers.scenes import robot
 from helpers.stub_simulation import StubSimulation
 from morphgen.errors import TaskError
-from morphgen.rl.baselines.simple import Zero
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics_torch import frame_positions
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines.ik import InverseKinematics
+from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import STEPS_UNREAD, run_episodes
+from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.render.renderer import render_state
+from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim import base
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=9, train_layouts=3, eval_layouts=1)
 PUSH = PushConfig(num_goals=6, max_episode_steps=11, train_layouts=3, eval_layouts=1)
@@ -255,3 +267,314 @@ def test_evaluations_read_tensors_only_now_and_then(specs):
     assert reads_of[count] <= reads_of[1] * rounds
     assert len(expected) == 6 * count
     assert {each.success for each in expected} == {True, False}
+
+
+MANY_REACH = ReachConfig(num_goals=20, train_layouts=4, eval_layouts=2)
+MANY_PUSH = PushConfig(num_goals=20, train_layouts=4, eval_layouts=2)
+
+
+def in_pybullet(scenes):
+    """Create a PyBullet simulation; skip the test where PyBullet is missing."""
+    pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+    from morphgen.tasks.sim.bullet import BulletSimulation
+
+    return BulletSimulation(scenes)
+
+
+SIMULATIONS = {
+    "mujoco": lambda scenes: MujocoSimulation(scenes),
+    "pybullet": in_pybullet,
+}
+
+
+@pytest.fixture(scope="module")
+def layout_specs(cache):
+    arm, gantry = robot("arm3"), robot("prims")
+    return {
+        "reach": draw_spec(arm, MANY_REACH, obstacles=True, cache=cache),
+        "push": draw_spec(gantry, MANY_PUSH, obstacles=True, cache=cache),
+        "free": draw_spec(arm, MANY_REACH, cache=cache),
+    }
+
+
+@pytest.fixture
+def build_layouts(layout_specs, opened):
+    def make(*names, **options):
+        chosen = [layout_specs[name] for name in names]
+        return opened(batch_from_specs(chosen, len(names), **{"sim": "mujoco", **options}))
+
+    return make
+
+
+@pytest.mark.parametrize(("side", "expected"), [("train", {0, 1, 2, 3}), ("eval", {4, 5})])
+def test_episodes_draw_the_layouts_of_their_side(build_layouts, side, expected):
+    batch = build_layouts("reach", "push", "free", layouts=side)
+    drawn = []
+    for _ in range(25):
+        batch.reset()
+        drawn.append(batch.layouts.current.tolist())
+    reach, push, free = zip(*drawn, strict=True)
+    assert set(reach) == set(push) == expected
+    assert set(free) == {-1}
+    assert reach != push
+
+
+def test_unknown_layouts_are_rejected(build_layouts):
+    with pytest.raises(TaskError, match="unknown layouts 'test'; valid: train, eval"):
+        build_layouts("reach", layouts="test")
+
+
+def test_starts_and_goals_are_free_in_their_layout(build_layouts, layout_specs):
+    batch = build_layouts("reach", "push")
+    for _ in range(10):
+        batch.reset()
+        reach, push = (FreeSpace(batch.layouts.scene(env)) for env in (0, 1))
+        goal = batch.groups["reach"].goal_configuration[0, : layout_specs["reach"].robot.dof]
+        start = batch.q[0, : layout_specs["reach"].robot.dof]
+        assert reach.free(torch.stack([goal, start]).double().numpy()).all()
+        block = batch.simulation.block_pose[1:].double().numpy()
+        assert push.free(
+            batch.q[1:, : layout_specs["push"].robot.dof].double().numpy(), block
+        ).all()
+        assert push.block_is_clear(block).all()
+
+
+def test_observations_and_pictures_follow_the_layout(build_layouts):
+    batch = build_layouts("reach", "push", "free", observe=ObservationConfig(points=40))
+    tokens = []
+    for _ in range(6):
+        seen = batch.reset()
+        for env in (0, 1):
+            layout = batch.specs[env].goals.layouts[batch.layouts.current[env]]
+            poses = torch.from_numpy(layout).float()
+            assert torch.equal(seen["obstacles"][env, :, :7], poses)
+            assert torch.equal(batch.layouts.poses[env], poses)
+            assert (render_state(batch, env).obstacles == poses.numpy()).all()
+            boxes = batch.layouts.obstacles(env)
+            assert [box.pose.position for box in boxes] == [
+                tuple(row[:3]) for row in layout.tolist()
+            ]
+        distance = np.min(
+            [_distance(seen["points"][0].double().numpy(), b) for b in batch.layouts.obstacles(0)],
+            axis=0,
+        )
+        assert distance.max() < 6 * NOISE
+        assert not seen["obstacles"][2].any()
+        assert not seen["obstacle_mask"][2].any()
+        tokens.append(seen["obstacles"].clone())
+    assert not all(torch.equal(tokens[0], other) for other in tokens)
+    sizes = {tuple(token[0, :, 10:].flatten().tolist()) for token in tokens}
+    assert len(sizes) == 1
+
+
+def _distance(points, box):
+    """Return the distances of points from the surface of a box."""
+    T = box.pose.inverse().matrix
+    local = np.abs(points @ T[:3, :3].T + T[:3, 3]) - np.array(box.size) / 2
+    return np.abs(local.max(axis=1))
+
+
+@pytest.mark.parametrize("name", SIMULATIONS)
+def test_a_simulated_robot_meets_obstacles_where_they_were_moved(name):
+    """A cube with edges of 0.11 m on slides moves towards a wall."""
+    wall = Block((0.1, 1.0, 1.0), Pose((5.0, 0.0, 0.5)))
+    scene = Scene(robot("cubes"), obstacles=(wall,))
+    simulation = SIMULATIONS[name]([scene] * 2)
+    zeros, q = torch.zeros(2, 7), torch.zeros(2, 2)
+    near, far = (torch.tensor([[[x, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]]]) for x in (0.4, 5.0))
+
+    def positions():
+        for _ in range(60):
+            simulation.step(torch.tensor([[0.9, 0.0]] * 2))
+        return simulation.q[:, 0].tolist()
+
+    both = [0, 1]
+    reset_envs(simulation, both, q, zeros, torch.cat([near, far]))
+    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
+    reset_envs(simulation, both, q, zeros)  # obstacles stay
+    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
+    reset_envs(simulation, [1], q[1:], zeros[1:], near)
+    reset_envs(simulation, [0], q[:1], zeros[:1], far)
+    assert positions() == pytest.approx([0.9, 0.295], abs=0.01)
+    with pytest.raises(ValueError, match="obstacles"):
+        simulation.reset(torch.ones(2, dtype=torch.bool), q, zeros, near)
+    with pytest.raises(ValueError, match="obstacles"):
+        reset_envs(simulation, both, q, zeros, torch.full((2, 1, 7), np.nan))
+    simulation.close()
+
+
+@pytest.mark.parametrize("name", SIMULATIONS)
+def test_a_moved_obstacle_gives_the_bits_of_a_loaded_one(name):
+    """A cube on slides pushes a block against a turned wall."""
+    pose = Pose.from_xyz_rpy((0.5, 0.25, 0.125), (0.0, 0.0, 0.5))
+    here, there = (Block((0.125, 0.5, 0.25), p) for p in (pose, Pose((0.5, 4.0, 0.125))))
+    block = Block((0.125, 0.125, 0.125), Pose((0.25, 0.25, 0.0625)), mass=0.1)
+    scenes = [Scene(robot("cubes"), block=block, obstacles=(box,)) for box in (here, there)]
+    loaded, moved = (SIMULATIONS[name]([scene]) for scene in scenes)
+    row = np.array([*pose.position, *pose.quaternion], np.float32)
+    poses, start = torch.from_numpy(row)[None, None], torch.tensor([[0.0, 0.25]])
+    block_pose = torch.tensor([[0.25, 0.25, 0.0625, 1.0, 0.0, 0.0, 0.0]])
+    for simulation in (loaded, moved):
+        reset_envs(simulation, [0], start, block_pose, poses)
+    for step in range(50):
+        for simulation in (loaded, moved):
+            simulation.step(torch.tensor([[0.02 * step, 0.25]]))
+    assert torch.equal(loaded.q, moved.q)
+    assert torch.equal(loaded.block_pose, moved.block_pose)
+    assert loaded.block_pose[0, 0] > 0.3
+    for simulation in (loaded, moved):
+        simulation.close()
+
+
+def test_baselines_plan_around_the_current_obstacles(build_layouts, monkeypatch):
+    batch = build_layouts("reach", "reach", layouts="eval")
+    controller, scenes = InverseKinematics(0), []
+    new_planner = InverseKinematics._new_planner
+
+    def recorded(self, task, robot_index, scene):
+        scenes.append(scene.obstacles)
+        return new_planner(self, task, robot_index, scene)
+
+    monkeypatch.setattr(InverseKinematics, "_new_planner", recorded)
+    for _ in range(6):
+        batch.reset()
+        controller.act(batch)
+    first = {tuple(batch.specs[0].goals.layouts[k, 0, :3].tolist()) for k in (4, 5)}
+    assert {boxes[0].pose.position for boxes in scenes} == first
+    assert len(scenes) == 4  # two robots of the batch, two layouts each
+
+
+LONG_REACH = replace(ReachConfig(), num_goals=20)
+WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
+
+
+@pytest.fixture(scope="module")
+def three_robots():
+    return [morphgen.compose(words, geometry="primitive") for words in WORDS]
+
+
+@pytest.fixture(scope="module")
+def settings(three_robots, cache):
+    return {
+        obstacles: [
+            draw_spec(robot, LONG_REACH, obstacles=obstacles, seed=0, cache=cache)
+            for robot in three_robots
+        ]
+        for obstacles in (False, True)
+    }
+
+
+@pytest.fixture
+def build_batch(settings, opened):
+    def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=LONG_REACH, **options):
+        chosen = [replace(settings[obstacles][i], config=config) for i in robots]
+        options = {"sim": "mujoco", **options}
+        return opened(batch_from_specs(chosen, num_envs, **options))
+
+    return make
+
+
+def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
+    batch = build_batch(config=replace(LONG_REACH, max_episode_steps=5))
+    batch.reset()
+    goal = batch.field("goal").clone()
+    controller = Random(0)
+    for k in range(4):
+        step = batch.step(controller.act(batch))
+        assert not step.truncated.any(), k
+        assert torch.equal(batch.field("goal"), goal)
+    step = batch.step(controller.act(batch))
+    assert step.truncated.all()
+    assert not step.terminated.any()
+    assert not torch.equal(batch.field("goal"), goal)
+    assert (batch.episode_step == 0).all()
+    assert torch.equal(step.final_observation["goal"], goal)
+    assert torch.equal(step.observation["goal"], batch.field("goal"))
+    assert not torch.equal(step.observation["tokens"], step.final_observation["tokens"])
+
+
+def test_start_is_never_the_goal_configuration(build_batch):
+    batch = build_batch(40, robots=(0,))
+    for _ in range(3):
+        batch.reset()
+        goal_q = batch.groups["reach"].goal_configuration
+        assert ((batch.targets - goal_q).abs().amax(dim=1) > 1e-3).all()
+        there = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, goal_q)
+        assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
+
+
+def test_batches_smaller_than_the_robot_list_are_rejected():
+    with pytest.raises(TaskError, match="2 environments for 3 robots"):
+        make_batch("reach", list(WORDS), 2)
+    with pytest.raises(TaskError, match=r"expected a list, \['prims'\]"):
+        make_batch("reach", "prims", 2)
+
+
+def test_actions_are_rounded_to_the_nearest_bin_towards_zero():
+    shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
+    bins = [BINS[i] for i in encode_actions(shares, "discrete")[0].tolist()]
+    assert bins == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
+
+
+def test_returned_tensors_are_copies(build_batch):
+    """Kept tensors do not change later, and writing to them does not change the batch."""
+    options = {
+        "obstacles": True,
+        "observe": ObservationConfig(velocity=True, previous_action=True, tool=True, points=8),
+    }
+    batch, whole, chance = build_batch(**options), build_batch(**options), Random(0)
+
+    def tensors(step):
+        parts = {"now": step.observation, "final": step.final_observation, "terms": step.terms}
+        plain = ("reward", "terminated", "truncated", "diverged", "success", "distance", "score")
+        named = {f"{of} {k}": v for of, part in parts.items() for k, v in part.items()}
+        return named | {k: getattr(step, k) for k in (*plain, "q", "block_pose")}
+
+    def spoil(values):
+        for each in values:
+            each.copy_(~each if each.dtype == torch.bool else each + 7)
+
+    spoil(batch.reset().values())
+    whole.reset()
+    state = batch.state_dict()
+    batch.load_state_dict(state)
+    spoil(
+        [
+            batch.q,
+            batch.field("goal"),
+            batch.field("line")[:, 0],
+        ]
+    )
+    for _ in range(3):
+        actions = chance.act(whole)
+        spoiled, kept = tensors(batch.step(actions)), tensors(whole.step(actions))
+        before = {name: each.clone() for name, each in kept.items()}
+        whole.observe()
+        for name, each in spoiled.items():
+            assert torch.equal(each, before[name]), name
+            spoil([each])
+        places = [each.data_ptr() for each in spoiled.values() if each.numel()]
+        assert len(places) == len(set(places))
+        spoil(batch.observe().values())
+        assert all(torch.equal(kept[name], before[name]) for name in kept)
+
+
+def test_spread_reset_staggers_the_first_episodes(build_batch):
+    batch = build_batch(60, robots=(0,), seed=1)
+    batch.reset(spread=True)
+    passed = batch.episode_step.clone()
+    assert passed.unique().numel() > 40
+    assert 0 <= passed.min() < 60 < 240 < passed.max() < LONG_REACH.max_episode_steps
+    batch.reset(seed=1, spread=True)
+    assert torch.equal(batch.episode_step, passed)
+    over = torch.zeros(60, dtype=torch.bool)
+    for _ in range(LONG_REACH.max_episode_steps - int(passed.max())):
+        over |= batch.step(Zero().act(batch)).truncated
+    assert torch.equal(over, passed == passed.max())
+
+
+def test_inverse_kinematics_reaches_its_goals_in_mujoco(build_batch):
+    batch = build_batch(config=replace(LONG_REACH, max_episode_steps=150))
+    episodes = run_episodes(batch, BASELINES["ik"].make(0), 1)
+    assert len(episodes) == 3
+    assert all(episode.success for episode in episodes)

@@ -5,7 +5,6 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.tasks.random_numbers import (
-    AHEAD,
     MAX_SEED,
     EpisodeRandom,
     EpisodeSequence,
@@ -81,26 +80,16 @@ def test_numbers_do_not_depend_on_other_rows_or_on_how_many_are_drawn():
     assert torch.equal(whole.uniform(Stream.POINTS, 3), drawn[:, :3])
 
 
-def test_numbers_computed_ahead_are_those_of_each_episode():
-    n = 6
-    sequence = EpisodeSequence(MAX_SEED, torch.arange(3, 3 + n), torch.zeros(n, dtype=torch.int64))
-    generator = torch.Generator().manual_seed(0)
-    high = torch.full((n, 2), 1000)
-    expected_episode = torch.zeros(n, dtype=torch.int64)
-    for call in range(3 * AHEAD):
-        mask = torch.rand(n, generator=generator) < (0.3 if call % 2 else 0.9)
-        random = sequence.begin(mask)
-        plain = EpisodeRandom(MAX_SEED, sequence.env_number, expected_episode)
-        assert torch.equal(random.episode, expected_episode)
-        for stream in (Stream.LAYOUT, Stream.START, Stream.POINTS):
-            assert torch.equal(random.integers(stream, high), plain.integers(stream, high))
-        assert torch.equal(random.uniform(Stream.START, 9), plain.uniform(Stream.START, 9))
-        rows = torch.tensor([4, 0])
-        assert torch.equal(
-            random.select(rows).uniform(Stream.START, 3), plain.uniform(Stream.START, 3)[rows]
-        )
-        expected_episode += mask
-    assert torch.equal(sequence.next_episode, expected_episode)
+def test_environments_begin_one_episode_after_the_other():
+    numbers_of = torch.arange(3, 7)
+    sequence = EpisodeSequence(MAX_SEED, numbers_of, torch.zeros(4, dtype=torch.int64))
+    first = sequence.begin(torch.tensor([True, False, True, False]))
+    second = sequence.begin(torch.tensor([True, True, False, False]))
+    assert first.episode.tolist() == [0, 0, 0, 0]
+    assert second.episode.tolist() == [1, 0, 1, 0]
+    assert sequence.next_episode.tolist() == [2, 1, 1, 0]
+    plain = EpisodeRandom(MAX_SEED, numbers_of, second.episode)
+    assert torch.equal(second.uniform(Stream.START, 9), plain.uniform(Stream.START, 9))
 
 
 @pytest.mark.parametrize("seed", [-1, 2**64])
