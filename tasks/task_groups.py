@@ -182,7 +182,7 @@ class TaskGroups:
         """Evaluate a step of all environments; return also the rewards, shape (n,)."""
         results: list[StepResult] = []
         for group in self._groups.values():
-            values = {
+            values: dict[str, Any] = {
                 name: None if value is None else self._rows_of(group, value)
                 for name, value in vars(state).items()
             }

@@ -342,7 +342,8 @@ class Buffers(NamedTuple):
 
 def allocate(num_envs: int, num_joints: int) -> SharedMemory:
     """Return memory of all processes for the buffers of n environments, filled with zeros."""
-    return _CONTEXT.RawArray("f", num_envs * (3 * num_joints + 7 + 6))
+    memory: SharedMemory = _CONTEXT.RawArray("f", num_envs * (3 * num_joints + 7 + 6))
+    return memory
 
 
 def buffers_in(memory: SharedMemory, num_envs: int) -> Buffers:

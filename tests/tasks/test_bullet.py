@@ -18,7 +18,6 @@ import pytest
 import torch
 
 from helpers.commands import heed_ctrl_c
-from helpers.resets import reset_envs
 from helpers.robots import arm, finger
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError
@@ -276,15 +275,6 @@ def workers():
     simulation.close()
 
 
-def starts(simulation):
-    q = torch.zeros_like(simulation.q)
-    pose = torch.zeros_like(simulation.block_pose)
-    for env, scene in enumerate(simulation.scenes):
-        q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
-        pose[env] = torch.tensor([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
-    return torch.arange(len(q)), q, pose
-
-
 def keep_stepping(simulation, q):
     while True:
         simulation.step(q)
@@ -330,23 +320,21 @@ def leftovers(scratch, pid):
 def test_workers_are_bit_identical_to_one_process(workers):
     alone = BulletSimulation(workers.scenes)
     generator = torch.Generator().manual_seed(0)
-    envs, q, pose = starts(alone)
-    for simulation in (alone, workers):
-        reset_envs(simulation, envs, q, pose)
+    q = reset(alone)
+    assert torch.equal(reset(workers), q)
     assert torch.equal(state(workers), state(alone))
     for step in range(40):
         q = q + 0.03 * torch.randn(q.shape, generator=generator)
         for simulation in (alone, workers):
             simulation.step(q)
             if step == 20:
-                reset_envs(simulation, envs[1:4], q[1:4], pose[1:4])
+                reset(simulation, envs=torch.tensor([1, 2, 3]))
         assert torch.equal(state(workers), state(alone)), step
     alone.close()
 
 
 def test_invalid_arguments_do_not_stop_the_workers(workers):
-    envs, q, pose = starts(workers)
-    reset_envs(workers, envs, q, pose)
+    q = reset(workers)
     with pytest.raises(ValueError, match=r"environment 0 .*targets"):
         workers.step(q * torch.nan)
     with pytest.raises(ValueError, match="shape"):
@@ -363,8 +351,7 @@ def test_diverged_environments_are_reported_and_the_others_step(heavy):
         scenes[env] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
     with closing(BulletSimulation(scenes, processes=2)) as simulation:
         assert [worker.envs.tolist() for worker in simulation._workers] == [[1, 3]]
-        envs, q, pose = starts(simulation)
-        reset_envs(simulation, envs, q, pose)
+        q = reset(simulation)
         others = sorted({0, 1, 2, 3} - heavy)
         before = state(simulation)[others]
         message = rf"environment {min(heavy)} \('prims'\) diverged"
@@ -372,7 +359,7 @@ def test_diverged_environments_are_reported_and_the_others_step(heavy):
         assert simulation.faults().keys() == heavy
         assert re.match(message, simulation.faults()[min(heavy)])
         assert (state(simulation)[others] != before).any(dim=1).all()
-        reset_envs(simulation, envs, q, pose)
+        reset(simulation)
         assert torch.isfinite(state(simulation)).all()
 
 
@@ -390,8 +377,7 @@ def test_robot_that_cannot_be_loaded_is_named_in_the_parent(monkeypatch, scratch
 
 def test_killed_worker_is_reported_and_everything_is_freed(scratch):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
-    envs, q, pose = starts(simulation)
-    reset_envs(simulation, envs, q, pose)
+    q = reset(simulation)
     simulation.step(q)
     running = pids(simulation)
     os.kill(running[0], signal.SIGKILL)
@@ -412,7 +398,7 @@ def test_nothing_is_left_of_a_simulation(scratch, closes):
         simulation.close()
         simulation.close()
         with pytest.raises(SimulationError, match="closed"):
-            reset_envs(simulation, *starts(simulation))
+            reset(simulation)
     del simulation
     gc.collect()
     assert not any(map(is_running, running))
@@ -425,14 +411,13 @@ import sys
 
 def main():
     sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tasks"]
-    from helpers.resets import reset_envs
+    from helpers.pybullet_states import reset
     from helpers.scenes import push_scene
-    from test_bullet import pids, starts
+    from test_bullet import pids
     from morphgen.tasks.sim.bullet import BulletSimulation
 
     simulation = BulletSimulation([push_scene(), push_scene(), push_scene()], processes=3)
-    envs, q, pose = starts(simulation)
-    reset_envs(simulation, envs, q, pose)
+    q = reset(simulation)
     print(*pids(simulation), flush=True)
 """
 MAIN = """
