@@ -32,7 +32,7 @@ from morphgen.tasks.sim.bullet_batch import (
     attempt,
     buffers_in,
 )
-from morphgen.tasks.sim.motor_law import all_finite, mask_of
+from morphgen.tasks.sim.motor_law import TensorView, all_finite, mask_of
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 from morphgen.typing import Array
 
@@ -77,6 +77,7 @@ class BulletSimulation:
         self._is_joint = np.arange(num_joints) < dofs[:, None]
         self._has_block = np.array([scene.block is not None for scene in scenes], bool)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
+        self._view = TensorView()
         self._faults: dict[int, str] = {}
         self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
         self._workers: list[Worker] = []
@@ -139,7 +140,7 @@ class BulletSimulation:
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step; see ``Simulation.step``."""
         self._require_open()
-        given = targets.numpy()
+        given = self._view(targets)
         if given.shape != self._is_joint.shape:
             raise ValueError(f"targets have shape {given.shape}, not {self._is_joint.shape}")
         np.copyto(self._targets, given, where=self._is_joint)  # padding may be anything

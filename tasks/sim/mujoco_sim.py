@@ -28,6 +28,7 @@ from morphgen.tasks.sim.base import (
 from morphgen.tasks.sim.motor_law import (
     CONTROL_STEP,
     GAIN,
+    TensorView,
     all_finite,
     clamp,
     farthest_targets,
@@ -231,7 +232,7 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_pool"}
+_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_view", "_pool"}
 """Attributes that ``_view_data`` makes."""
 
 
@@ -291,6 +292,7 @@ class MujocoSimulation:
             self._work.append(
                 (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
             )
+        self._view = TensorView()
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -335,7 +337,7 @@ class MujocoSimulation:
         Environments also diverge if their contacts do not fit into MuJoCo's memory.
         """
         self._require_open()
-        rows = targets.numpy()
+        rows = self._view(targets)
         if rows.shape != self._targets.shape:
             raise ValueError(f"targets have shape {rows.shape}, not {self._targets.shape}")
         np.copyto(self._targets, rows, where=self._has_target)
