@@ -61,12 +61,9 @@ class Step(StepResult):
 class BeforePhysics:
     """Targets of a control step, and the state of the robots and blocks before it."""
 
-    targets: torch.Tensor
-    """Targets of the joints of the simulation, shape (n, J) [rad or m]."""
-    q: torch.Tensor
-    """Positions of the independent joints, shape (n, J) [rad or m]."""
-    block_pose: torch.Tensor
-    """Poses of the blocks, shape (n, 7)."""
+    targets: torch.Tensor  # targets of the joints of the simulation, shape (n, J) [rad or m]
+    q: torch.Tensor  # positions of the independent joints, shape (n, J) [rad or m]
+    block_pose: torch.Tensor  # poses of the blocks, shape (n, 7)
 
 
 class TaskBatch:
@@ -428,8 +425,7 @@ class TaskBatch:
         return torch.nn.functional.pad(values, (0, missing)) if missing else values
 
 
-WARM_UP = 3
-"""Steps before the capture, which load kernels and choose algorithms."""
+WARM_UP = 3  # steps before the capture, which load kernels and choose algorithms
 
 
 class StepGraph:

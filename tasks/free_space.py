@@ -29,32 +29,22 @@ from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
 
-CELL = 0.1
-"""Width of a grid cell [rad or m]."""
-FEWEST, MOST = 16, 128
-"""Smallest and largest number of cells along a joint."""
-SAMPLES = 256
-"""Number of random configurations that reveal which links touch."""
-OFTEN = 0.02
-"""Fraction of these in which two links must touch for their plane to be tested."""
+CELL = 0.1  # width of a grid cell [rad or m]
+FEWEST, MOST = 16, 128  # smallest and largest number of cells along a joint
+SAMPLES = 256  # number of random configurations that reveal which links touch
+OFTEN = 0.02  # fraction of these in which two links must touch for their plane to be tested
 
 
 @dataclass(frozen=True, eq=False)
 class JointPlane:
     """Plane of one or two joints in which free configurations form several components."""
 
-    pairs: tuple[Pair, ...]
-    """Pairs of links that touch between the components."""
-    joints: tuple[int, ...]
-    """Indices of the independent joints, one or two."""
-    lower: Array
-    """Lower end of the grid for each joint [rad or m]."""
-    upper: Array
-    """Upper end of the grid for each joint [rad or m]."""
-    main: NDArray[np.bool_]
-    """Cells of the largest component, an axis for each joint."""
-    turns: tuple[float, ...]
-    """Period of each joint [rad]; 0 if it does not wrap."""
+    pairs: tuple[Pair, ...]  # pairs of links that touch between the components
+    joints: tuple[int, ...]  # indices of the independent joints, one or two
+    lower: Array  # lower end of the grid for each joint [rad or m]
+    upper: Array  # upper end of the grid for each joint [rad or m]
+    main: NDArray[np.bool_]  # cells of the largest component, an axis for each joint
+    turns: tuple[float, ...]  # period of each joint [rad]; 0 if it does not wrap
 
 
 def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
@@ -134,15 +124,11 @@ def _components(free: NDArray[np.bool_], continuous: Sequence[bool]) -> NDArray[
     return np.asarray(np.unique(merged_label, return_inverse=True)[1][labels], dtype=np.int64)
 
 
-TRIES = 1000
-"""Configurations to test per required free one before giving up."""
-RESOLUTION = 0.05
-"""Largest change of a joint between tested configurations of a path [rad or m]."""
+TRIES = 1000  # configurations to test per required free one before giving up
+RESOLUTION = 0.05  # largest change of a joint between tested configurations of a path [rad or m]
 
-_GROUND_SIZE = (200.0, 200.0, 20.0)
-"""Size of the box whose top is the ground [m]."""
-_POINT = 1e-3
-"""Radius of the ball that represents the tool point [m]."""
+_GROUND_SIZE = (200.0, 200.0, 20.0)  # size of the box whose top is the ground [m]
+_POINT = 1e-3  # radius of the ball that represents the tool point [m]
 _CHUNK = 256
 """Configurations drawn at a time; part of the random stream, so a change gives other goals."""
 _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
@@ -152,8 +138,7 @@ _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
     ("continuous", (0.0, 0.0, 1.0)),
     ("continuous", (0.0, 1.0, 0.0)),
     ("continuous", (1.0, 0.0, 0.0)),
-)
-"""Kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll."""
+)  # kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll
 _AWAY = (0.0, 0.0, 1e4, 0.0, 0.0, 0.0)
 """Positions of the block's virtual joints without a pose of the block: far above everything."""
 

@@ -44,8 +44,7 @@ class ToolTargets:
 
     points: torch.Tensor
     """Target points, in the order in which the tool should visit them, shape (n, P, 3) [m]."""
-    exists: torch.Tensor
-    """Points that an environment's task has, shape (n, P), bool."""
+    exists: torch.Tensor  # points that an environment's task has, shape (n, P), bool
     rotations: torch.Tensor | None = None
     """Orientations for the tool at the first point, shape (n, 3, 3); None if no task wants one."""
     has_rotation: torch.Tensor | None = None
@@ -55,14 +54,10 @@ class ToolTargets:
 FirstFree = Callable[[int, Array, Array], "int | None"]
 """Function that returns the first of the configurations (k, J) that an environment's robot reaches
 from another one, (J,), on a straight path without a collision; None if there is none."""
-STARTS = 32
-"""Number of start configurations of a solution."""
-ITERATIONS = 25
-"""Iterations of damped least squares."""
-SOLVED = 0.005
-"""Distance of tool and target that counts as a solution [m]."""
-MOVED = 0.01
-"""Distance that a target moves before it is solved again [m]."""
+STARTS = 32  # number of start configurations of a solution
+ITERATIONS = 25  # iterations of damped least squares
+SOLVED = 0.005  # distance of tool and target that counts as a solution [m]
+MOVED = 0.01  # distance that a target moves before it is solved again [m]
 
 
 class IkSolutions:
@@ -90,8 +85,7 @@ class IkSolutions:
         sobol = torch.quasirandom.SobolEngine(J)  # type: ignore[no-untyped-call]
         sobol.fast_forward(1)  # type: ignore[no-untyped-call]
         self._fractions = sobol.draw(STARTS - 1).to(device)
-        self.q = torch.zeros(n, J, device=device)
-        """The configurations, shape (n, J) [rad or m]."""
+        self.q = torch.zeros(n, J, device=device)  # the configurations, shape (n, J) [rad or m]
         self.error = torch.zeros(n, device=device)
         """Distance from tool to target there, shape (n,) [m]."""
         self._solved_for = torch.full((n, 3), math.inf, device=device)
@@ -156,16 +150,12 @@ class IkSolutions:
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
 
 
-IK_SHARE = 4
-"""Column of the channel ``ik`` with the joint's action along the straight path, -1 to 1."""
+IK_SHARE = 4  # column of the channel `ik` with the joint's action along the straight path, -1 to 1
 MAX_LAG = 3.0
 """Bound of the observed lag [largest steps]; no joint in free motion is further behind."""
-STEPS_TO_LIMIT = 10.0
-"""Distance to a joint limit that counts as far [largest steps]."""
-STEP_SCALE = 5.0
-"""Factor on the largest step of a joint [1/rad or 1/m]: 0.2 rad become one."""
-POSITION_SCALE = 3.0
-"""Factor on vectors to targets [1/m]: a third of a metre becomes one."""
+STEPS_TO_LIMIT = 10.0  # distance to a joint limit that counts as far [largest steps]
+STEP_SCALE = 5.0  # factor on the largest step of a joint [1/rad or 1/m]: 0.2 rad become one
+POSITION_SCALE = 3.0  # factor on vectors to targets [1/m]: a third of a metre becomes one
 COLUMN_SCALE = 20.0
 """Factor on the tool's displacement by the largest step of a joint [1/m]: 5 cm become one."""
 ROTATION_SCALE = 5.0
@@ -175,8 +165,7 @@ GAINS = (0.25, 1.0, 4.0)
 resolves the last millimetres, the lowest one distances of many steps."""
 SINGULAR = 1e-4
 """Added to the squared length of a Jacobian column, so that short ones ask for no large step."""
-NEAR = 1e-3
-"""Distance below which the logarithm of a distance hardly changes [m or rad]."""
+NEAR = 1e-3  # distance below which the logarithm of a distance hardly changes [m or rad]
 ROTATION_LENGTH = 0.3
 """Length by which rotation errors are multiplied to compare with position errors [m/rad]."""
 DAMPING = 0.03
@@ -187,8 +176,7 @@ DAMPING = 0.03
 class _State:
     """Quantities that several channels are computed from; n environments, J joints."""
 
-    chain: FrameChain
-    """Chains of the tools."""
+    chain: FrameChain  # chains of the tools
     robot_index: torch.Tensor
     q: torch.Tensor
     targets: torch.Tensor

@@ -32,8 +32,7 @@ bool. On request: ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 
 (n, P, 3) and ``point_mask`` (n, P) bool, the channels of ``kinematic_channels``, (n, L, size), and
 the entries of ``tree_entries``."""
 
-NUM_POINTS = 128
-"""Number of points of a cloud that is asked for by name."""
+NUM_POINTS = 128  # number of points of a cloud that is asked for by name
 
 
 @dataclass(frozen=True)
@@ -163,8 +162,7 @@ def obstacle_tokens(scenes: Sequence[Scene], min_rows: int, device: torch.device
     return {"obstacles": tokens.to(device), "obstacle_mask": mask.to(device)}
 
 
-MAX_TREE_DISTANCE = 8
-"""Largest number of joints between two joints that observations tell apart."""
+MAX_TREE_DISTANCE = 8  # largest number of joints between two joints that observations tell apart
 TREE_RELATIONS = 4 * (MAX_TREE_DISTANCE + 1)
 """Number of relations between two joints; see ``tree_entries``."""
 
@@ -293,8 +291,7 @@ def _layout_poses(specs: Sequence[EnvSpec], num_obstacles: int) -> torch.Tensor:
     return table
 
 
-NOISE = 0.005
-"""Standard deviation of a point's position along each axis, as of a depth camera [m]."""
+NOISE = 0.005  # standard deviation of a point's position along each axis, as of a depth camera [m]
 _NUMBERS = 8
 """Random numbers of a point: its face, its position in the box, and two pairs for noise."""
 
@@ -367,10 +364,8 @@ def _normal(uniform: torch.Tensor) -> torch.Tensor:
     return torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
 
 
-SAME = 0.02
-"""Largest difference of joints between configurations that count as the same [rad or m]."""
-COMPARED = 12
-"""Number of different configurations whose paths are tested."""
+SAME = 0.02  # largest difference of joints between configurations that count as the same [rad or m]
+COMPARED = 12  # number of different configurations whose paths are tested
 
 
 class StraightPaths:

@@ -28,8 +28,7 @@ COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry
 CHANNELS = (
     *KINEMATIC_CHANNELS,
     *("velocity", "previous_action", "tree", "points", "no_state"),
-)
-"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
+)  # channels of observations that can be asked for by name; `no_state` hides what it names
 
 
 class Named(Protocol):
@@ -43,8 +42,7 @@ class Named(Protocol):
 T = TypeVar("T", bound=Named)
 _RESERVED = frozenset(
     {"tokens", "links", "actions", "velocity", "previous_action", "tool", "points", "obstacles"}
-)
-"""Entries of observations that are no fields of tasks."""
+)  # entries of observations that are no fields of tasks
 
 
 class Registry(Generic[T]):
@@ -181,8 +179,7 @@ TASKS: Registry[Task[Any, Any]] = Registry(
     "morphgen.tasks",
     {"reach": "morphgen.tasks.reach.task:REACH", "push": "morphgen.tasks.push.task:PUSH"},
     _require_task,
-)
-"""Tasks; see ``morphgen.tasks.task.Task``."""
+)  # Tasks; see `morphgen.tasks.task.Task`
 SIMULATORS: Registry[Simulator] = Registry(
     "simulator",
     "morphgen.simulators",
@@ -192,8 +189,7 @@ SIMULATORS: Registry[Simulator] = Registry(
         "warp": "morphgen.tasks.sim.warp_sim:SIMULATOR",
         "kinematic": "morphgen.tasks.sim.kinematic:SIMULATOR",
     },
-)
-"""Simulators; see ``morphgen.tasks.sim.base.Simulator``."""
+)  # Simulators; see `morphgen.tasks.sim.base.Simulator`
 DEFAULT_SIMULATOR = "mujoco"
 """Simulator to use unless one is named. Every installation has it, so that a command gives the same
 episodes everywhere."""

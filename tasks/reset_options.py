@@ -16,10 +16,8 @@ from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import TaskGroups
 from morphgen.typing import Array
 
-Q = "q"
-"""Option of every task: joint positions at the start."""
-ROUNDING = 1e-6
-"""Distance beyond a joint limit that single precision explains [rad or m]."""
+Q = "q"  # option of every task: joint positions at the start
+ROUNDING = 1e-6  # distance beyond a joint limit that single precision explains [rad or m]
 
 
 class EpisodePlacer:

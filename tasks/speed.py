@@ -14,8 +14,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.sim.base import SUBSTEPS, is_host
 
-WARM_UP = 20
-"""Number of control steps before the measurement."""
+WARM_UP = 20  # number of control steps before the measurement
 
 
 @dataclass(frozen=True)
@@ -24,8 +23,7 @@ class Speed:
 
     steps_per_second: float
     """Control steps per second of all environments together, resets included."""
-    shares: dict[str, float]
-    """Fractions of the time by activity; they add up to 1."""
+    shares: dict[str, float]  # fractions of the time by activity; they add up to 1
 
     @property
     def substeps_per_second(self) -> float:

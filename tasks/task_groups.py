@@ -78,8 +78,7 @@ class _Group:
 
     task: Task[Any, Any]
     envs: TaskEnvs
-    rows: torch.Tensor
-    """Indices of its environments in the batch, shape (k,), int64."""
+    rows: torch.Tensor  # indices of its environments in the batch, shape (k,), int64
 
 
 class TaskGroups:

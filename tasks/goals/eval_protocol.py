@@ -21,10 +21,8 @@ from morphgen.tasks.scenes.env_specs import (
     task_configs,
 )
 
-SIMULATOR = "mujoco"
-"""Default simulator: the one that every installation has."""
-EPISODES = 34
-"""Default number of episodes per robot: 10,000 control steps."""
+SIMULATOR = "mujoco"  # default simulator: the one that every installation has
+EPISODES = 34  # default number of episodes per robot: 10,000 control steps
 
 
 @dataclass(frozen=True)
@@ -32,10 +30,8 @@ class EvalProtocol:
     """Rules of an evaluation."""
 
     simulator: str = SIMULATOR
-    episodes: int = EPISODES
-    """Minimum number of episodes per robot."""
-    seed: int = 0
-    """Seed of the episodes."""
+    episodes: int = EPISODES  # minimum number of episodes per robot
+    seed: int = 0  # seed of the episodes
     goals: GoalConfig = field(default_factory=GoalConfig)
     """Seed of the goals, and constants of the tasks."""
 
@@ -66,10 +62,8 @@ class ExpectedRobot:
 
     side: Side
     member: Member
-    goal_set: str
-    """Key of the goal set."""
-    reach: float
-    """Reach [m]."""
+    goal_set: str  # key of the goal set
+    reach: float  # reach [m]
 
 
 def rules_data(

@@ -42,8 +42,7 @@ from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
 
 Mask = NDArray[np.bool_]
-SidedReason = tuple[Side, str, str]
-"""Side and name of a robot, and the reason of its finding."""
+SidedReason = tuple[Side, str, str]  # side and name of a robot, and the reason of its finding
 
 _FIXES = {
     "task-unknown": "correct the task, or install the package that has it",
@@ -59,16 +58,11 @@ _FIXES = {
 }
 CODES = frozenset(_FIXES)
 
-EXACT = 1e-6
-"""Largest difference between numbers of a set and those of the same set sampled anew."""
-NEAR = 1e-3
-"""Distance below which positions of goals or blocks are the same [m]."""
-NEAR_TURN = math.radians(1)
-"""Angle below which orientations are the same [rad]."""
-NEAR_JOINT = 1e-3
-"""Difference of every joint below which configurations are the same [rad or m]."""
-MAX_SHARED = 0.5
-"""Fraction of a set that two different robots may have in common."""
+EXACT = 1e-6  # largest difference between numbers of a set and those of the same set sampled anew
+NEAR = 1e-3  # distance below which positions of goals or blocks are the same [m]
+NEAR_TURN = math.radians(1)  # angle below which orientations are the same [rad]
+NEAR_JOINT = 1e-3  # difference of every joint below which configurations are the same [rad or m]
+MAX_SHARED = 0.5  # fraction of a set that two different robots may have in common
 
 
 def goals_to_audit(
@@ -139,14 +133,10 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
 class _Examination:
     """A member's goal set, compared with the same set sampled anew."""
 
-    key: str = ""
-    """Key of the set sampled anew; empty if it cannot be sampled."""
-    robot_hash: str = ""
-    """Hash of the member's robot."""
-    error: str = ""
-    """Reason why the set cannot be sampled."""
-    is_same: bool = False
-    """Whether the set equals the one sampled anew."""
+    key: str = ""  # key of the set sampled anew; empty if it cannot be sampled
+    robot_hash: str = ""  # hash of the member's robot
+    error: str = ""  # reason why the set cannot be sampled
+    is_same: bool = False  # whether the set equals the one sampled anew
     certificate_errors: tuple[str, ...] = ()
 
 

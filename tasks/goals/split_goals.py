@@ -38,8 +38,7 @@ from morphgen.tasks.scenes.env_specs import (
 )
 from morphgen.tasks.task import EnvSpec, GoalSet
 
-GOALS = "goals"
-"""Name of the folder of goal sets in a built split."""
+GOALS = "goals"  # name of the folder of goal sets in a built split
 INDEX = "index.json"
 FORMAT = 2
 
@@ -71,15 +70,12 @@ class GoalResult:
     """A robot's goal set, or the reason why it cannot be sampled."""
 
     robot: str
-    side: Side | None
-    """Side of the split; None for a robot without a split."""
+    side: Side | None  # side of the split; None for a robot without a split
     task: str
     obstacles: bool
     goals: GoalSet | None = None
-    robot_hash: str = ""
-    """Hash of the robot with the collision shapes that the set was made for."""
-    error: str = ""
-    """Reason why there is no set."""
+    robot_hash: str = ""  # hash of the robot with the collision shapes that the set was made for
+    error: str = ""  # reason why there is no set
     certificate_errors: tuple[str, ...] | None = None
     """Faults of goals, a line each; None if the set was not certified."""
 
@@ -93,8 +89,7 @@ class GoalResult:
 class SplitGoals:
     """Goal sets of a split."""
 
-    config: GoalConfig
-    """Seed and constants that the sets were made with."""
+    config: GoalConfig  # seed and constants that the sets were made with
     sets: Mapping[tuple[Side, str], GoalResult]
     """Results with a goal set, by side and name of the member."""
 

@@ -94,21 +94,14 @@ def build_with_goals(
 class ReleaseRequest:
     """Request for a release."""
 
-    version: str
-    """Version, such as ``1.0.0``."""
-    date: str = ""
-    """Date of publication, such as ``2027-01-31``."""
+    version: str  # such as `1.0.0`
+    date: str = ""  # date of publication, such as `2027-01-31`
     creators: tuple[str, ...] = ()
-    url: str = ""
-    """Address where the release will be."""
-    allowed_licences: tuple[str, ...] = ()
-    """Licences with restrictions that parts may have."""
-    protocol: EvalProtocol = field(default_factory=EvalProtocol)
-    """Rules of the evaluation."""
-    goals: bool = True
-    """Ship the goal set of every robot."""
-    settings: BuildSettings = BUNDLED
-    """Settings of the build."""
+    url: str = ""  # address where the release will be
+    allowed_licences: tuple[str, ...] = ()  # licences with restrictions that parts may have
+    protocol: EvalProtocol = field(default_factory=EvalProtocol)  # rules of the evaluation
+    goals: bool = True  # ship the goal set of every robot
+    settings: BuildSettings = BUNDLED  # settings of the build
 
 
 @dataclass(frozen=True)
@@ -116,14 +109,11 @@ class ReleaseReport:
     """Result of a release."""
 
     archive: Path
-    sha256: str
-    """SHA-256 of the archive, hexadecimal."""
+    sha256: str  # SHA-256 of the archive, hexadecimal
     content: str
     """SHA-256 of ``SHA256SUMS``: the same for the same files, however they are compressed."""
-    files: int
-    """Number of files in the archive."""
-    size: int
-    """Size of the archive [bytes]."""
+    files: int  # number of files in the archive
+    size: int  # size of the archive [bytes]
     release: Release
 
 

@@ -49,8 +49,7 @@ class PushEnvs(TaskEnvs):
             (np.ptp(pushes.blocks[:, 0]) / 2 + pushes.blocks[:, 0].min(), pushes.ground)
             for pushes in sets
         ]
-        self.line = self._final_line.clone()
-        """Current y that the block must cross, shape (k,) [m]."""
+        self.line = self._final_line.clone()  # current y that the block must cross, shape (k,) [m]
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None

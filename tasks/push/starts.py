@@ -27,29 +27,21 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.sim.base import Block
 from morphgen.typing import Array
 
-FULL_REACH = 0.4
-"""Reach below which everything is scaled down in proportion [m]."""
+FULL_REACH = 0.4  # reach below which everything is scaled down in proportion [m]
 
-_SAMPLES, _SEED = 16_384, 0
-"""Number and seed of the configurations that sample the tool's range."""
-_LEVEL = 1e-3
-"""Variation of its height below which a tool moves in a plane [m]."""
+_SAMPLES, _SEED = 16_384, 0  # number and seed of the configurations that sample the tool's range
+_LEVEL = 1e-3  # variation of its height below which a tool moves in a plane [m]
 
 
 @dataclass(frozen=True)
 class Region:
     """Size of a block, range of its start poses and line that it must cross, in the world frame."""
 
-    edge: float
-    """Edge length of the block, a cube [m]."""
-    scale: float
-    """Scale of lengths: 1, or less for robots that reach less than ``FULL_REACH``."""
-    x: tuple[float, float]
-    """Range of x of the block's centre at the start [m]."""
-    y: tuple[float, float]
-    """Range of y of the block's centre at the start [m]."""
-    line: float
-    """y that the block's centre must cross [m]."""
+    edge: float  # edge length of the block, a cube [m]
+    scale: float  # scale of lengths: 1, or less for robots that reach less than `FULL_REACH`
+    x: tuple[float, float]  # range of x of the block's centre at the start [m]
+    y: tuple[float, float]  # range of y of the block's centre at the start [m]
+    line: float  # y that the block's centre must cross [m]
 
 
 def push_region(
@@ -162,23 +154,16 @@ def _tool_x_range(robot: Robot, ground: float, edge: float) -> tuple[float, floa
 BEHIND = (0.1, 0.4, 0.8, 1.2, 1.6)
 """Distances of the tool behind the block's rearmost point, in block edges, in the order of trial.
 They exceed the radius of the largest sphere, whose tool is at its bottom."""
-CLOSE = 1e-3
-"""Largest distance of a tool from its goal along x and along y [m]."""
+CLOSE = 1e-3  # largest distance of a tool from its goal along x and along y [m]
 NEAREST = (1, 2, 3, 6)
 """Numbers of nearest sampled configurations from which inverse kinematics starts, in turn."""
 
-_SPACING = 0.125
-"""Distance of the tested poses on a path, in block edges."""
-_BANK = 2048
-"""Number of free configurations to collect."""
-_DRAWN, _ROUNDS = 65_536, 8
-"""Configurations drawn per round, and number of rounds."""
-_FEW = 8192
-"""Number of configurations whose tools are computed at a time."""
-_ARRIVED = 1e-6
-"""Distance from its goal at which inverse kinematics leaves a tool [m]."""
-_LOW, _HIGH = 0.15, 0.85
-"""Range of heights of the tool, in block edges."""
+_SPACING = 0.125  # distance of the tested poses on a path, in block edges
+_BANK = 2048  # number of free configurations to collect
+_DRAWN, _ROUNDS = 65_536, 8  # configurations drawn per round, and number of rounds
+_FEW = 8192  # number of configurations whose tools are computed at a time
+_ARRIVED = 1e-6  # distance from its goal at which inverse kinematics leaves a tool [m]
+_LOW, _HIGH = 0.15, 0.85  # range of heights of the tool, in block edges
 
 
 Indices = NDArray[np.int64]
@@ -344,15 +329,11 @@ def _yaws(blocks: Array) -> Array:
     return np.asarray(2 * np.arctan2(blocks[:, 6], blocks[:, 3]))
 
 
-TRIES = 30
-"""Poses of the block to test per required start before giving up."""
-RESTS = 1e-6
-"""Largest height above the ground of a block that stands on it [m]."""
+TRIES = 30  # poses of the block to test per required start before giving up
+RESTS = 1e-6  # largest height above the ground of a block that stands on it [m]
 
-_STANDS = 1e-3
-"""Tolerance of a block that stands upright on the ground [m, and of a quaternion]."""
-_CONFIGURATIONS = 1000
-"""Free configurations to test for a start before giving up."""
+_STANDS = 1e-3  # tolerance of a block that stands upright on the ground [m, and of a quaternion]
+_CONFIGURATIONS = 1000  # free configurations to test for a start before giving up
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,18 +348,13 @@ class PushStartSet:
 
     robot: str
     key: str
-    q: Array
-    """Configurations at the start, free without obstacles, shape (S, dof) [rad or m]."""
+    q: Array  # configurations at the start, free without obstacles, shape (S, dof) [rad or m]
     blocks: Array
     """Poses of the block at the start in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
-    block: Block
-    """Cube that the robot pushes, at its pose in the first start."""
-    line: float
-    """y that the block's centre must cross [m]."""
-    scale: float
-    """Scale of lengths: 1, or less for robots that reach less than 0.4 m."""
-    ground: float
-    """Height of the ground [m]."""
+    block: Block  # cube that the robot pushes, at its pose in the first start
+    line: float  # y that the block's centre must cross [m]
+    scale: float  # scale of lengths: 1, or less for robots that reach less than 0.4 m
+    ground: float  # height of the ground [m]
     obstacles: tuple[Block, ...]
     layouts: Array
     usable: NDArray[np.bool_]

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
     from morphgen.tasks.push.envs import PushEnvs
 
-_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002
-"""Size of the strip that shows the line [m]."""
+_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002  # size of the strip that shows the line [m]
 
 
 class Push(Task[PushConfig, PushStartSet]):

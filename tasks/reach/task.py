@@ -57,8 +57,7 @@ class ReachGoalSet:
     shape (G, 7)."""
     obstacles: tuple[Block, ...]
     layouts: Array
-    usable: NDArray[np.bool_]
-    """Which configurations are free in each layout, shape (L, G)."""
+    usable: NDArray[np.bool_]  # which configurations are free in each layout, shape (L, G)
     tried: int
     accepted: int
     seed: int
@@ -86,8 +85,7 @@ def _free_goals(goals: ReachGoalSet, space: FreeSpace) -> NDArray[np.bool_]:
 MAX_DISTANCE = 3.0
 """Bound on the distance between tool and goal in reaches: each is within one, and a reach is an
 estimate."""
-_ROUNDING = 1e-6
-"""Rounding of a distance that is computed with single precision [m]."""
+_ROUNDING = 1e-6  # rounding of a distance that is computed with single precision [m]
 
 
 class Reach(Task[ReachConfig, ReachGoalSet]):

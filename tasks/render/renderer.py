@@ -39,8 +39,7 @@ from morphgen.typing import Array
 
 Colour = tuple[float, float, float, float]
 
-BLOCK = "block"
-"""Name of the block among the mocap bodies."""
+BLOCK = "block"  # name of the block among the mocap bodies
 _BLOCK, _OBSTACLE = (0.90, 0.55, 0.15, 1.0), (0.55, 0.25, 0.25, 1.0)
 _FRAME_MARKER, _BOX_MARKER = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
 _AXES = ((0.85, 0.15, 0.15, 1.0), (0.15, 0.70, 0.15, 1.0), (0.15, 0.30, 0.90, 1.0))
@@ -48,8 +47,7 @@ _GREY = (0.65, 0.67, 0.70, 1.0)
 _GROUND_SPACING = 2.0
 """Distance between the ground's vertices [m]. Without a GPU, a frame takes 15 ms longer with 0.1 m,
 and no pixel changes by more than 1%."""
-_SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
-"""Corners of a cube of edge 1."""
+_SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))  # corners of a cube of edge 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +55,10 @@ class RenderModel:
     """A MuJoCo model for rendering, and indices into its state."""
 
     model: mujoco.MjModel
-    q_at: NDArray[np.int64]
-    """Indices of the robot's movable joints in ``qpos``."""
-    mocap: dict[str, int]
-    """Mocap indices of the markers and, if there is one, of ``block``."""
-    obstacles: list[int]
-    """Mocap indices of the obstacles."""
-    points: Array
-    """Points that must be in view, shape (n, 3) [m]."""
+    q_at: NDArray[np.int64]  # indices of the robot's movable joints in `qpos`
+    mocap: dict[str, int]  # mocap indices of the markers and, if there is one, of `block`
+    obstacles: list[int]  # mocap indices of the obstacles
+    points: Array  # points that must be in view, shape (n, 3) [m]
 
 
 def render_model(
@@ -206,35 +200,28 @@ def _robot_corners(robot: Robot, q: Array) -> Array:
 
 Frame = NDArray[np.uint8]
 
-SIZE = (640, 480)
-"""Width and height of a frame [pixels]."""
-SUFFIXES = (".mp4", ".gif")
-"""Suffixes of video files."""
+SIZE = (640, 480)  # width and height of a frame [pixels]
+SUFFIXES = (".mp4", ".gif")  # suffixes of video files
 
-_FOV = 35.0
-"""Vertical field of view [degrees]."""
+_FOV = 35.0  # vertical field of view [degrees]
 _AZIMUTH, _ELEVATION = 220.0, -25.0
 """MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
-_MARGIN = 0.92
-"""Fraction of the picture that the points in view fill."""
+_MARGIN = 0.92  # fraction of the picture that the points in view fill
 _SHADOW_SIZE = 1536
 """Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take two
 thirds of the time; smoothed edges would take even longer, and are hardly visible in a video."""
 _SHADOW_CLIP = 2.0
 """Half the width of the shadow map, as a multiple of the extent of the scene. With 1.5, dark dots
 appear on the ground at the edge of some pictures of a turn."""
-_AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
-"""Pose of bodies that must not be visible."""
-_NUM_STARTS = 32
-"""Number of configurations of a goal set that must be in view."""
+_AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)  # pose of bodies that must not be visible
+_NUM_STARTS = 32  # number of configurations of a goal set that must be in view
 
 
 @dataclass(frozen=True, eq=False)
 class RenderState:
     """State of an environment for a picture."""
 
-    q: NDArray[np.float32]
-    """Positions of the robot's independent joints, shape (dof,) [rad or m]."""
+    q: NDArray[np.float32]  # positions of the robot's independent joints, shape (dof,) [rad or m]
     block: NDArray[np.float32] | None = None
     """Pose of the block, (x, y, z, qw, qx, qy, qz), or None."""
     markers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)

@@ -26,16 +26,14 @@ from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec, GoalSet, TaskConfig
 
-GROUND_STEP = 1e-4
-"""Resolution of the height of a lowered ground, so that all machines agree [m]."""
+GROUND_STEP = 1e-4  # resolution of the height of a lowered ground, so that all machines agree [m]
 
 
 @dataclass(frozen=True)
 class GoalConfig:
     """Seed and constants of tasks, from which goal sets are sampled."""
 
-    seed: int = 0
-    """Seed of all goals, the same in training and evaluation."""
+    seed: int = 0  # seed of all goals, the same in training and evaluation
     tasks: Sequence[TaskConfig] = ()
     """Constants of tasks, at most one config of a type; other tasks have their defaults."""
 

@@ -34,14 +34,10 @@ Usable = Callable[[FreeSpace], NDArray[np.bool_]]
 UsableOf = Callable[[G, FreeSpace], NDArray[np.bool_]]
 """Function that returns which goals of a set a scene leaves possible, shape (G,)."""
 
-KEPT = 0.5
-"""Fraction of otherwise free configurations that a layout must leave free."""
-PROBES = 128
-"""Number of free configurations that test it."""
-CANDIDATES = 16
-"""Number of random poses of a box before its layout is drawn anew."""
-ATTEMPTS = 16
-"""Number of times that a layout is drawn before giving up."""
+KEPT = 0.5  # fraction of otherwise free configurations that a layout must leave free
+PROBES = 128  # number of free configurations that test it
+CANDIDATES = 16  # number of random poses of a box before its layout is drawn anew
+ATTEMPTS = 16  # number of times that a layout is drawn before giving up
 KEPT_GOALS = 0.25
 """Fraction of the first ``FIRST_GOALS`` goals of a set that a layout must leave possible."""
 FIRST_GOALS = 20

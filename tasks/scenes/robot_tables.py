@@ -29,10 +29,8 @@ class RobotTables:
     """Tensors of R robots with L links and J independent joints, padded; float32, one device."""
 
     robots: tuple[Robot, ...]
-    tokens: torch.Tensor
-    """Link tokens, shape (R, L, 48); the codes of joint positions are zero."""
-    link_mask: torch.Tensor
-    """Existing links, shape (R, L), bool."""
+    tokens: torch.Tensor  # link tokens, shape (R, L, 48); the codes of joint positions are zero
+    link_mask: torch.Tensor  # existing links, shape (R, L), bool
     joint_of_link: torch.Tensor
     """Index of the independent joint that moves each link, shape (R, L), int64; -1 if none does."""
     link_of_joint: torch.Tensor
@@ -43,26 +41,21 @@ class RobotTables:
     """Upper limits of the independent joints, shape (R, J) [rad or m]; padding is 0."""
     max_step: torch.Tensor
     """Largest change of a target per control step, shape (R, J) [rad or m]; padding is 0."""
-    is_prismatic: torch.Tensor
-    """Independent joints that slide, shape (R, J), bool."""
+    is_prismatic: torch.Tensor  # independent joints that slide, shape (R, J), bool
     effort: torch.Tensor
     """Largest forces of the independent joints, shape (R, J) [N m or N]; 0 for none and padding."""
-    home: torch.Tensor
-    """Home configurations, shape (R, J) [rad or m]; padding is 0."""
-    moves_tool: torch.Tensor
-    """Independent joints that move the tool, shape (R, J), bool."""
+    home: torch.Tensor  # home configurations, shape (R, J) [rad or m]; padding is 0
+    moves_tool: torch.Tensor  # independent joints that move the tool, shape (R, J), bool
     position_gain: torch.Tensor
     """Matrix G, shape (R, L, J): the joint of each link has the scaled position G q + offset."""
-    position_offset: torch.Tensor
-    """Offset of the scaled joint positions, shape (R, L)."""
+    position_offset: torch.Tensor  # offset of the scaled joint positions, shape (R, L)
     wraps: torch.Tensor
     """Links whose joint turns without limits, so that its position wraps, shape (R, L), bool."""
     movable_links: torch.Tensor
     """Links that a joint moves, mimic joints included, shape (R, L), bool."""
     ancestors: torch.Tensor
     """Whether link j is link i or a link between it and the root, shape (R, L, L), bool."""
-    tool_chain: FrameChain
-    """Joints between root and tool of each robot."""
+    tool_chain: FrameChain  # joints between root and tool of each robot
 
     @property
     def device(self) -> torch.device:

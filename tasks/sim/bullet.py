@@ -39,8 +39,7 @@ from morphgen.typing import Array
 BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
 """Arguments of ``BulletBatch.reset``."""
 
-_BASE_LOAD = 5
-"""Cost of stepping an environment without joints, in joints."""
+_BASE_LOAD = 5  # cost of stepping an environment without joints, in joints
 
 
 class BulletSimulation:

@@ -45,10 +45,8 @@ except ImportError as error:
         "Python 3.11), or take another simulator"
     ) from error
 
-MAX_CLIENTS = 1024
-"""Number of clients that PyBullet supports in a process."""
-UNLIMITED = 1e6
-"""Effort of a joint without an effort limit [N m or N]."""
+MAX_CLIENTS = 1024  # number of clients that PyBullet supports in a process
+UNLIMITED = 1e6  # effort of a joint without an effort limit [N m or N]
 FRICTION = 1.0
 """Friction coefficient of ground, robots and obstacles. PyBullet multiplies the coefficients of two
 bodies, so that the block's own coefficient acts."""
@@ -326,8 +324,7 @@ MAX_POSITION = float(np.finfo(np.float32).max)
 _FROM_BULLET = [0, 1, 2, 6, 3, 4, 5]
 """Columns of a pose in morphgen's order: PyBullet's quaternions have w last."""
 Float32 = NDArray[np.float32]
-ExportedRobot = tuple[Path, Robot]
-"""URDF of a robot whose rigid links are merged, and that robot."""
+ExportedRobot = tuple[Path, Robot]  # URDF of a robot whose rigid links are merged, and that robot
 
 
 class Buffers(NamedTuple):
@@ -359,14 +356,10 @@ class Share:
     """Environments that one process simulates."""
 
     scenes: Sequence[Scene]
-    contacts: Contacts
-    """Pairs of things that collide."""
-    exported: Sequence[ExportedRobot]
-    """Robot of each scene, as ``export_robots`` wrote it."""
-    envs: Sequence[int]
-    """Index of each scene's environment, which is its row in all buffers."""
-    num_envs: int
-    """Number of environments of all processes."""
+    contacts: Contacts  # pairs of things that collide
+    exported: Sequence[ExportedRobot]  # robot of each scene, as `export_robots` wrote it
+    envs: Sequence[int]  # index of each scene's environment, which is its row in all buffers
+    num_envs: int  # number of environments of all processes
 
 
 _FINAL_RESPONSE = 1 - (1 - VELOCITY_GAIN) ** SUBSTEPS
@@ -558,8 +551,7 @@ class BulletBatch:
             loaded.close()
 
 
-_EXIT_CODE_WAIT = 0.5
-"""Time for a worker whose pipe has ended to exit [s]."""
+_EXIT_CODE_WAIT = 0.5  # time for a worker whose pipe has ended to exit [s]
 _CONTEXT = multiprocessing.get_context("spawn")
 R = TypeVar("R")
 

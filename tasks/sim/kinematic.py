@@ -21,8 +21,7 @@ from morphgen.tasks.sim.base import (
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
 from morphgen.typing import Array
 
-UNLIMITED = (-np.inf, np.inf)
-"""Position limits of joints without any [rad or m]."""
+UNLIMITED = (-np.inf, np.inf)  # position limits of joints without any [rad or m]
 NO_CONTACTS = Contacts(scene=False, self_collision=False)
 """The only contacts that this simulator can be asked for."""
 

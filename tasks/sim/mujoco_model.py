@@ -23,8 +23,7 @@ Indices = NDArray[np.int64]
 
 PASSIVE = 0.2
 """Fraction of the damping that belongs to joints instead of actuators; see ``PositionControl``."""
-IMPEDANCE_RATIO = 100.0
-"""Ratio of friction to normal impedance of contacts (MuJoCo's ``impratio``)."""
+IMPEDANCE_RATIO = 100.0  # ratio of friction to normal impedance of contacts (MuJoCo's `impratio`)
 BLOCK_IMPEDANCE = (0.1, 0.95, 0.001, 0.5, 2.0)
 """Impedance of the block's contacts (MuJoCo's ``solimp``): soft at touch, hard 1 mm deeper.
 
@@ -54,21 +53,15 @@ _OBSTACLE_PRIORITY, _BLOCK_PRIORITY = 1, 2
 class World:
     """A compiled scene."""
 
-    robot: Robot
-    """The robot after ``merge_rigid_links``."""
+    robot: Robot  # the robot after `merge_rigid_links`
     model: mujoco.MjModel
     movable_q_at: Indices
     """Indices in ``qpos`` of the movable joints, in the order of ``robot.movable_joints``."""
-    movable_qd_at: Indices
-    """Indices in ``qvel`` of the movable joints."""
-    q_at: Indices
-    """Indices in ``qpos`` of the independent joints."""
-    qd_at: Indices
-    """Indices in ``qvel`` of the independent joints."""
-    block: int | None
-    """Body id of the block, if there is one."""
-    obstacles: Indices
-    """Indices in ``mocap_pos`` of the obstacles, which are mocap bodies."""
+    movable_qd_at: Indices  # indices in `qvel` of the movable joints
+    q_at: Indices  # indices in `qpos` of the independent joints
+    qd_at: Indices  # indices in `qvel` of the independent joints
+    block: int | None  # body id of the block, if there is one
+    obstacles: Indices  # indices in `mocap_pos` of the obstacles, which are mocap bodies
 
     @property
     def block_moves(self) -> bool:

@@ -38,8 +38,7 @@ from morphgen.tasks.sim.motor_law import (
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World, worlds
 from morphgen.typing import Array
 
-MAX_SPEED = 1e4
-"""Speed above which a simulation counts as diverged [rad/s or m/s]."""
+MAX_SPEED = 1e4  # speed above which a simulation counts as diverged [rad/s or m/s]
 _TOO_FAST = f"diverged: a velocity is not finite or beyond {MAX_SPEED:g}"
 _NO_MEMORY = "diverged: its contacts do not fit into MuJoCo's memory"
 _FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
@@ -56,8 +55,7 @@ class GatheredArrays:
         """Allocate the memory; ``read`` copies."""
         self._arrays = [*arrays, np.zeros(1)]
         ends = np.cumsum([len(array) for array in self._arrays])
-        self.begin = np.concatenate([[0], ends[:-1]])
-        """Index in ``flat`` where each array begins."""
+        self.begin = np.concatenate([[0], ends[:-1]])  # index in `flat` where each array begins
         self.flat = np.zeros(ends[-1])
 
     def read(self) -> None:

@@ -12,8 +12,7 @@ from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
 from morphgen.model.tree import rigid_groups
 
-_Piece = tuple[Pose, Link]
-"""Pose of a link in the link that it is merged into, and the link."""
+_Piece = tuple[Pose, Link]  # pose of a link in the link that it is merged into, and the link
 _UPRIGHT = 1e-6
 """Tolerance of the vertical component of an axis that is horizontal (0) or vertical (1)."""
 

@@ -22,22 +22,17 @@ _MAX_SPEED = wp.constant(MAX_SPEED)
 class Joints:
     """Joints of a group of worlds with one structure; R rows of numbers, world w has row w % R."""
 
-    env: wp.array[int]
-    """Environment of each world."""
-    q_at: wp.array[int]
-    """Index in ``qpos`` of each independent joint."""
-    qd_at: wp.array[int]
-    """Index in ``qvel`` of each independent joint."""
+    env: wp.array[int]  # environment of each world
+    q_at: wp.array[int]  # index in `qpos` of each independent joint
+    qd_at: wp.array[int]  # index in `qvel` of each independent joint
     dof_leader: wp.array[int]
     """Independent joint that each degree of freedom follows; -1 for those of the block."""
     dof_gain: wp.array2d[float]
     """Velocity of each degree of freedom per velocity of its leader, (R, nv)."""
-    dof_q_at: wp.array[int]
-    """Index in ``qpos`` of each degree of freedom that has a leader."""
+    dof_q_at: wp.array[int]  # index in `qpos` of each degree of freedom that has a leader
     dof_offset: wp.array2d[float]
     """Position of each degree of freedom where its leader is at zero, (R, nv) [rad or m]."""
-    compliance: wp.array2d[float]
-    """Inverse gain of each actuator, (R, J) [rad/N m or m/N]."""
+    compliance: wp.array2d[float]  # inverse gain of each actuator, (R, J) [rad/N m or m/N]
     farthest: wp.array2d[float]
     """Largest distance between a target and its joint, (R, J) [rad or m]."""
 
@@ -46,14 +41,10 @@ class Joints:
 class Things:
     """Block and obstacles of a group of worlds."""
 
-    block_q_at: int
-    """Index in ``qpos`` of the pose of a block that moves, or -1."""
-    block_qd_at: int
-    """Index in ``qvel`` of the velocity of a block that moves."""
-    block_mocap: int
-    """Index in ``mocap_pos`` of a block that does not move, or -1."""
-    obstacles: wp.array[int]
-    """Indices in ``mocap_pos`` of the obstacles."""
+    block_q_at: int  # index in `qpos` of the pose of a block that moves, or -1
+    block_qd_at: int  # index in `qvel` of the velocity of a block that moves
+    block_mocap: int  # index in `mocap_pos` of a block that does not move, or -1
+    obstacles: wp.array[int]  # indices in `mocap_pos` of the obstacles
 
 
 @wp.func

@@ -43,12 +43,9 @@ UNUSED = frozenset({"dof_length", "key_time", "key_qpos", "key_qvel", "key_act",
 class Structure:
     """Environments whose models differ only in numbers that MuJoCo Warp has for every world."""
 
-    worlds: tuple[World, ...]
-    """Compiled scenes, R of them: the one of world w is ``worlds[w % R]``."""
-    envs: NDArray[np.int64]
-    """Environment of each world, shape (w,)."""
-    batched: dict[str, NDArray[Any]]
-    """Rows of the fields of the model that differ, R rows each."""
+    worlds: tuple[World, ...]  # compiled scenes, R of them: the one of world w is `worlds[w % R]`
+    envs: NDArray[np.int64]  # environment of each world, shape (w,)
+    batched: dict[str, NDArray[Any]]  # rows of the fields of the model that differ, R rows each
 
 
 def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
