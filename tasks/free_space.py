@@ -210,10 +210,7 @@ class FreeSpace:
         return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
 
     def sample(
-        self,
-        n: int,
-        rng: np.random.Generator,
-        accept: Callable[[Array], bool] = lambda q: True,
+        self, n: int, rng: np.random.Generator, accept: Callable[[Array], bool] = lambda q: True
     ) -> tuple[Array, int]:
         """Sample free configurations (n, dof), uniformly; return also the number of tested ones.
 

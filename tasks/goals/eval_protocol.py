@@ -100,11 +100,7 @@ def tasks_of_split(split: Split) -> tuple[str, ...]:
 
 
 def expected_robots(
-    split: Split,
-    protocol: EvalProtocol,
-    library: Library,
-    *,
-    jobs: int = 1,
+    split: Split, protocol: EvalProtocol, library: Library, *, jobs: int = 1
 ) -> list[ExpectedRobot]:
     """Return what a submission must hold for every member, train robots first."""
     members = [(side, member) for side in SIDES for member in split.side(side)]

@@ -81,11 +81,7 @@ def goals_to_audit(
 
 
 def audit_goals(
-    split: Split,
-    goals: SplitGoals,
-    library: Library,
-    *,
-    jobs: int = 1,
+    split: Split, goals: SplitGoals, library: Library, *, jobs: int = 1
 ) -> tuple[Finding, ...]:
     """Find goals that leak, and sets that do not match the split's robots.
 

@@ -95,10 +95,7 @@ class NumpyStepper:
     """
 
     def __init__(
-        self,
-        batch: TaskBatch,
-        row: NumpyRow,
-        unpadded: Callable[[Observation], NumpyObservation],
+        self, batch: TaskBatch, row: NumpyRow, unpadded: Callable[[Observation], NumpyObservation]
     ) -> None:
         """Take views of the batch's tensors; ``begin`` must follow."""
         self._batch, self._row, self._unpadded = batch, row, unpadded

@@ -79,10 +79,7 @@ def push_region(
     if slides == 2:
         x = (config.free_x[0] * scale, config.free_x[1] * scale)
     elif not slides and np.ptp(tool_positions[2]) > _LEVEL:
-        x = (
-            shoulder[0] + config.arm_x[0] * reach,
-            shoulder[0] + config.arm_x[1] * reach,
-        )
+        x = (shoulder[0] + config.arm_x[0] * reach, shoulder[0] + config.arm_x[1] * reach)
     else:
         x = _tool_x_range(robot, ground, edge)
     y = ((config.start - config.start_depth) * scale, config.start * scale)

@@ -42,11 +42,7 @@ from morphgen.tasks.registry import (
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
-from morphgen.tasks.sim.base import (
-    Contacts,
-    Scene,
-    Simulator,
-)
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 if TYPE_CHECKING:

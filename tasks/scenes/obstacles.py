@@ -54,11 +54,7 @@ def no_obstacles(num_goals: int) -> dict[str, Any]:
 
 
 def with_obstacles(
-    goals: G,
-    scene: Scene,
-    config: TaskConfig,
-    seeds: np.random.SeedSequence,
-    usable: UsableOf[G],
+    goals: G, scene: Scene, config: TaskConfig, seeds: np.random.SeedSequence, usable: UsableOf[G]
 ) -> G:
     """Return a robot's goal set with obstacles, whose layouts leave some of the goals possible."""
     size_seeds, layout_seeds = seeds.spawn(2)  # more boxes change no random number of layouts

@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.tasks.sim.base import (
-    Contacts,
-    Scene,
-    Simulator,
-    require_finite,
-    require_reset_shapes,
-)
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_finite, require_reset_shapes
 from morphgen.tasks.sim.bullet_batch import (
     BulletBatch,
     ExportedRobot,

@@ -207,11 +207,7 @@ class BulletScene:
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
         position, quaternion = _pose(block.pose)
         body: int = pybullet.createMultiBody(
-            block.mass,
-            shape,
-            basePosition=position,
-            baseOrientation=quaternion,
-            **self._client,
+            block.mass, shape, basePosition=position, baseOrientation=quaternion, **self._client
         )
         return body
 

@@ -135,8 +135,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
     """
     robot = merge_rigid_links(robot)
     bare = replace(
-        robot,
-        joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints),
+        robot, joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints)
     )
     spec = to_spec(bare)
     for actuator in spec.actuators:

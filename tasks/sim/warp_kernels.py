@@ -206,10 +206,7 @@ def find_diverged(
 
 @wp.func
 def _write_pose(
-    position: wp.vec3,
-    rotation: wp.quat,
-    out_pose: wp.array2d[float],
-    env: int,
+    position: wp.vec3, rotation: wp.quat, out_pose: wp.array2d[float], env: int
 ) -> None:
     """Write a pose as x, y, z, qw, qx, qy, qz with qw >= 0."""
     sign = wp.where(rotation[3] < 0.0, -1.0, 1.0)

@@ -25,13 +25,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 from morphgen.tasks.sim import warp_kernels as kernels
-from morphgen.tasks.sim.base import (
-    SUBSTEPS,
-    Contacts,
-    Scene,
-    Simulator,
-    require_reset_shapes,
-)
+from morphgen.tasks.sim.base import SUBSTEPS, Contacts, Scene, Simulator, require_reset_shapes
 from morphgen.tasks.sim.motor_law import farthest_targets
 from morphgen.tasks.sim.mujoco_model import World, worlds
 
