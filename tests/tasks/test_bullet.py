@@ -23,18 +23,10 @@ from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import (
-    forward_kinematics,
-    joint_limits,
-)
+from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import (
-    GAIN,
-    LAG,
-    SLACK,
-    MotorForces,
-)
+from morphgen.tasks.sim.motor_law import GAIN, LAG, SLACK, MotorForces
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
@@ -149,11 +141,7 @@ def test_joints_return_to_their_limits(simulate, pushes):
     farthest = 0.0
     for _ in range(100):
         pybullet.applyExternalTorque(
-            loaded.robot,
-            link,
-            [0.0, 200.0, 0.0],
-            pybullet.WORLD_FRAME,
-            physicsClientId=loaded.id,
+            loaded.robot, link, [0.0, 200.0, 0.0], pybullet.WORLD_FRAME, physicsClientId=loaded.id
         )
         simulation.step(q)
         farthest = max(farthest, float(simulation.q[0, 0]))

@@ -109,10 +109,7 @@ def pairs_of(batch, resets):
     starts, ends = [], []
     for _ in range(resets):
         batch.reset()
-        for q, found in (
-            (batch.q, starts),
-            (batch.groups["reach"].goal_configuration, ends),
-        ):
+        for q, found in ((batch.q, starts), (batch.groups["reach"].goal_configuration, ends)):
             distance = (q[:, None] - goals).abs().amax(dim=2)
             assert (distance.amin(dim=1) == 0).all()
             found.append(distance.argmin(dim=1))
@@ -281,10 +278,7 @@ def in_pybullet(scenes):
     return BulletSimulation(scenes)
 
 
-SIMULATIONS = {
-    "mujoco": lambda scenes: MujocoSimulation(scenes),
-    "pybullet": in_pybullet,
-}
+SIMULATIONS = {"mujoco": lambda scenes: MujocoSimulation(scenes), "pybullet": in_pybullet}
 
 
 @pytest.fixture(scope="module")
@@ -538,13 +532,7 @@ def test_returned_tensors_are_copies(build_batch):
     whole.reset()
     state = batch.state_dict()
     batch.load_state_dict(state)
-    spoil(
-        [
-            batch.q,
-            batch.field("goal"),
-            batch.field("line")[:, 0],
-        ]
-    )
+    spoil([batch.q, batch.field("goal"), batch.field("line")[:, 0]])
     for _ in range(3):
         actions = chance.act(whole)
         spoiled, kept = tensors(batch.step(actions)), tensors(whole.step(actions))

@@ -16,11 +16,7 @@ from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import (
-    CLOSE,
-    path_is_clear,
-    push_region,
-)
+from morphgen.tasks.push.starts import CLOSE, path_is_clear, push_region
 from morphgen.tasks.reach import task as module
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.scenes import obstacles

@@ -174,10 +174,7 @@ def test_joints_without_limits_turn_on():
 
 @pytest.mark.parametrize(
     ("scene", "thing"),
-    [
-        (push_scene(), "a block"),
-        (replace(push_scene(), block=None), "obstacles"),
-    ],
+    [(push_scene(), "a block"), (replace(push_scene(), block=None), "obstacles")],
 )
 def test_scenes_with_something_to_touch_are_refused(scene, thing):
     with pytest.raises(SimulationError, match=f"environment 1 .*has {thing}"):

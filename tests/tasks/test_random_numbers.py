@@ -4,13 +4,7 @@ import pytest
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.random_numbers import (
-    MAX_SEED,
-    EpisodeRandom,
-    EpisodeSequence,
-    Stream,
-    philox,
-)
+from morphgen.tasks.random_numbers import MAX_SEED, EpisodeRandom, EpisodeSequence, Stream, philox
 
 ZERO, ONES, PI = "00000000", "ffffffff", "243f6a88 85a308d3 13198a2e 03707344"
 KNOWN_ANSWERS = [
