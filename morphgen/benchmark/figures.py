@@ -119,7 +119,7 @@ def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
 def _png(figure: Figure) -> bytes:
     """Return the figure as a PNG without date and version, so that its bytes are reproducible."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})  # has a version
     return buffer.getvalue()
 
 

@@ -579,7 +579,7 @@ def hold_out(
         and task of the test candidates.
     """
     rng = np.random.default_rng(seed)
-    max_held = 0
+    max_held = 0  # of the best attempt, for the message
     for _ in range(NUM_ATTEMPTS):
         pool = _TrainPool(candidates)
         order = [int(i) for i in rng.permutation(len(candidates))]

@@ -326,7 +326,7 @@ def _from_grammars(
 ) -> Iterator[_Draft]:
     for grammar in grammars:
         stream = RobotStream.of(grammar, grammar.name, request)
-        for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):
+        for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):  # many repeat
             derivation = stream.derivation(number, maker.library)
             if derivation is not None:
                 yield maker.draft(stream.recipe(number), derivation, grammar.name)

@@ -146,7 +146,7 @@ def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
     """
     result: dict[str, float] = {}
     for index, node in enumerate(derivation.walk()):
-        yaw = {MOUNT_YAW: 0.0} if index else {}
+        yaw = {MOUNT_YAW: 0.0} if index else {}  # derivations omit it where it is 0
         values = yaw | _values(node, library)
         result |= {
             f"{index}.{name}": values[name]

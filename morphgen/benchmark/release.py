@@ -215,6 +215,7 @@ def card_text(
     names: Paths of the files of the release.
     """
     present = {name.partition("/")[0] for name in names}
+    # Every release has the other files of the table.
     absent = {"goals", SCORES_FILE, SUBMISSIONS_DIR} - present
     template = "".join(
         line

@@ -52,7 +52,7 @@ def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
 
 def digest(data: object) -> str:
     """Return the first 32 hexadecimal digits of the SHA-256 of data written as JSON."""
-    text = json.dumps(data, separators=(",", ":"))
+    text = json.dumps(data, separators=(",", ":"))  # its spelling is part of every hash
     return hashlib.sha256(text.encode()).hexdigest()[:HASH_LENGTH]
 
 

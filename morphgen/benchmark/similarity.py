@@ -35,7 +35,7 @@ CELLS = 10
 
 _PARALLEL = 0.5  # sine of the angle below which two axes count as parallel
 _IMMOBILE = 1e-9  # distance from the shoulder below which a tool counts as immobile [m]
-_SEED = 0
+_SEED = 0  # the same for all robots: equal robots have equal workspaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def density_overlap(a: Workspace, b: Workspace) -> float:
     The sum of the smaller density over all nodes (histogram intersection: Swain and Ballard, Color
     indexing, 1991), which is 1 minus half the L1 distance.
     """
-    return float(min(np.minimum(a.density, b.density).sum(), 1.0))
+    return float(min(np.minimum(a.density, b.density).sum(), 1.0))  # the sums are rounded
 
 
 def shoulder(robot: Robot) -> Vec3:
@@ -168,7 +168,7 @@ def _density(points: Array) -> Array:
     """Return the density of points (3, n) in [-1, 1]^3 on the grid, with trilinear weights."""
     side = 2 * CELLS + 1
     scaled = (points + 1) * CELLS
-    low = np.minimum(scaled.astype(np.int64), side - 2)
+    low = np.minimum(scaled.astype(np.int64), side - 2)  # a point at +1 is in the last cell
     weights = np.stack([1 - (scaled - low), scaled - low])
     total = np.zeros(side**3)
     for corner in np.ndindex(2, 2, 2):
@@ -309,7 +309,7 @@ def _in_postorder(nodes: list[_Node], parents: list[int]) -> LabelledTree:
     keys: list[tuple[object, ...]] = [()] * len(nodes)
     subtrees: list[list[int]] = [[] for _ in nodes]  # in postorder
     for node in reversed(range(len(nodes))):
-        children[node].sort(key=lambda child: keys[child])
+        children[node].sort(key=lambda child: keys[child])  # the file's order must not matter
         subtrees[node] = [n for child in children[node] for n in subtrees[child]] + [node]
         weight = math.fsum(_WEIGHTS[nodes[n].kind] for n in subtrees[node])
         keys[node] = (-weight, nodes[node].key, *(keys[child] for child in children[node]))
@@ -445,7 +445,7 @@ def cosine(a: Features, b: Features) -> float:
     n = min(len(a.tokens), len(b.tokens))
     product = float((a.tokens[:n] * b.tokens[:n]).sum())
     norms = np.linalg.norm(a.tokens) * np.linalg.norm(b.tokens)
-    return float(np.clip(product / norms, -1.0, 1.0))
+    return float(np.clip(product / norms, -1.0, 1.0))  # rounding may exceed 1 by a last bit
 
 
 def tree_distance(a: Features, b: Features) -> float:
@@ -550,6 +550,7 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
     rows = squared.mean(axis=0)
     values, vectors = np.linalg.eigh(-(squared - rows - rows[:, None] + rows.mean()) / 2)
     total = np.abs(values).sum()
+    # eigh sorts ascending; rounding may make the second eigenvalue of points on a line negative.
     largest = np.maximum(values[::-1][:2], 0.0)
     points = np.zeros((len(d), 2))
     points[:, : len(largest)] = vectors[:, ::-1][:, :2] * np.sqrt(largest)

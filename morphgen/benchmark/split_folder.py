@@ -434,7 +434,7 @@ def build_split(
     with _writing(split_folder), _removed_if_empty(split_folder):
         _prepare(split_folder, split, settings)
         with locked_folder(split_folder):
-            (split_folder / SUMS_FILE).unlink(missing_ok=True)
+            (split_folder / SUMS_FILE).unlink(missing_ok=True)  # marks the folder as unfinished
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
                 shutil.rmtree(leftover, ignore_errors=True)
             write = partial(_write_member, library, split_folder, settings, split.max_links)

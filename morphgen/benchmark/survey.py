@@ -135,6 +135,7 @@ def survey_split(
     total = len(members) + n
     with part_of(total):
         robots = list(parallel_map(partial(_measure, library, split.max_links), members, jobs))
+    # Each of them has 74 kB, most of it the density of the workspace.
     known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
     with part_of(total, len(members)):
         compare = partial(_compare, known[:n], known[n:], within_train)

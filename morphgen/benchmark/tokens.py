@@ -171,6 +171,7 @@ def encode_position(x: Array) -> Array:
 
 def decode_position(numbers: Array) -> float:
     """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2]."""
+    # The lowest frequency is the only one that is unique over [-2, 2].
     x = math.atan2(numbers[0], numbers[len(FREQUENCIES)]) / (math.pi / 2)
     error = np.abs(encode_position(np.array(x)) - numbers)
     if error.max() > TOLERANCE:
@@ -366,7 +367,7 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
         )
     limits = np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
     continuous = np.array([joint.is_continuous for joint in joints], dtype=bool)
-    wrapped = positions - math.tau * np.ceil((positions - math.pi) / math.tau)
+    wrapped = positions - math.tau * np.ceil((positions - math.pi) / math.tau)  # keeps +pi
     half_range = (limits[:, 1] - limits[:, 0]) / 2
     centred = np.where(continuous, wrapped, positions) - limits.mean(axis=1)
     return np.asarray(centred / half_range)

@@ -247,7 +247,7 @@ def _inspect(
     split: Split, library: Library, built: _BuiltFolder | None, jobs: int
 ) -> dict[tuple[str, str], _Inspection]:
     """Inspect each different robot once; return the results by derivation and hash."""
-    members = [member for _, member in reversed(sided_members(split))]
+    members = [member for _, member in reversed(sided_members(split))]  # the first one stays last
     firsts = {(member.derivation, member.robot_hash): member for member in members}
     inspect = partial(_inspect_member, library, split.max_links, built)
     return dict(zip(firsts, parallel_map(inspect, list(firsts.values()), jobs), strict=True))
@@ -342,6 +342,7 @@ def _token_differences(
     if names != expected or tokens.shape != computed.shape:
         yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT_FILE}")
         return
+    # Primitives of meshes are fitted here, in the last bits otherwise than where it was built.
     errors = np.abs(tokens - computed)
     for shape in (GEOMETRY, SHAPE_POSE):
         errors[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE

@@ -71,7 +71,7 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
     x, y, z = R[:, 2].tolist()
     if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
         x, y, z = -x, -y, -z
-    return normalize((1 + z, -y, x, 0.0))
+    return normalize((1 + z, -y, x, 0.0))  # the shortest rotation from z to the axis
 
 
 def rounded(quaternion: Quat) -> Quat:

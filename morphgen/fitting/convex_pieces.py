@@ -156,7 +156,7 @@ def _run_coacd(mesh: Mesh, settings: Mapping[str, object]) -> tuple[list[Array] 
                 capture_output=True,
                 text=True,
                 check=False,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
+                env={**os.environ, "OMP_NUM_THREADS": "1"},  # else the order of sums varies
             )
         except subprocess.TimeoutExpired as error:
             raise FitError(

@@ -132,7 +132,7 @@ def _outermost(points: Array, n: int) -> Array:
 def _half_sphere(n: int) -> Array:
     """Return directions spread evenly over half the sphere (Fibonacci lattice), shape (n, 3)."""
     z = (np.arange(n) + 0.5) / n
-    angle = math.pi * (1 + math.sqrt(5)) * np.arange(n)
+    angle = math.pi * (1 + math.sqrt(5)) * np.arange(n)  # multiples of the golden angle
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
@@ -145,7 +145,7 @@ def _enclose(kind: Kind, hull: _Hull, points: Array) -> tuple[Box | Cylinder | S
     quaternion = rounded(quaternion)
     R = Pose(quaternion=quaternion).matrix[:3, :3]
     x, y, z = (R @ _centre(kind, points @ R)).round(_DECIMALS).tolist()
-    pose = Pose((x + 0.0, y + 0.0, z + 0.0), quaternion)
+    pose = Pose((x + 0.0, y + 0.0, z + 0.0), quaternion)  # adding zero turns -0.0 into 0.0
     local = (points - pose.position) @ R
     if kind == "sphere":
         return Sphere(_round_up(np.linalg.norm(local, axis=1).max())), pose
@@ -363,6 +363,7 @@ def enclose_solid(
     for k in range(2, max_primitives + 1):
         if best_iou >= iou:
             break
+        # Seeds depend on k, so that a search for more primitives begins with the same ones.
         for child in np.random.SeedSequence([seed, k]).generate_state(NUM_CLUSTERINGS):
             shapes = _enclose_clusters(target, k, int(child))
             if shapes and (shapes_iou := _iou(shapes, target)) > best_iou:

@@ -122,6 +122,7 @@ def fit_links(
     shared = representatives([solids[link.name].mesh for link in solid_links])
     unique = [link for i, link in enumerate(solid_links) if shared[i][0] == i]
     inputs = [(shapes_to_fit(link), solids[link.name]) for link in unique]
+    # A fit takes seconds: one item a worker at a time.
     attempts = parallel_map(partial(_try_fit, options), inputs, jobs, chunk=1)
     fits = {link.name: fit for link, fit in zip(unique, attempts, strict=True)}
     reports = []

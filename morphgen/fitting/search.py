@@ -142,7 +142,7 @@ def ascend(
         {"params": [quaternions], "unit": 0.5 / size},
         {"params": [logs], "unit": 1.0 / size},
     ]
-    optimizer = torch.optim.Adam(groups, lr=rate[0], betas=(0.8, 0.98))
+    optimizer = torch.optim.Adam(groups, lr=rate[0], betas=(0.8, 0.98))  # short memory: 100 steps
     for step in range(num_steps):
         progress = step / max(num_steps - 1, 1)
         softness = tau[0] * (tau[1] / tau[0]) ** progress
@@ -154,7 +154,7 @@ def ascend(
         member, weighted_target = member * weight, (target * weight).expand_as(member)
         intersection = (member * target).sum(dim=1)
         union = member.sum(dim=1) + weighted_target.sum(dim=1) - intersection
-        loss = -(intersection / (union + 1e-9)).sum()
+        loss = -(intersection / (union + 1e-9)).sum()  # a candidate may be far from all points
         torch.autograd.backward(loss)
         optimizer.step()
     with torch.no_grad():
@@ -223,6 +223,7 @@ def _distance(
         distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
     if cylinders:
         points, half = local[boxes:end], size[boxes:end]
+        # The square root has no finite gradient at zero, on the axis.
         radial = (points[:, :2].square().sum(dim=1) + 1e-12).sqrt() - half[:, 0]
         axial = points[:, 2].abs() - half[:, 2]
         distances.append(_rounded(torch.stack([radial, axial], dim=1)))
@@ -396,7 +397,7 @@ def sample_solid(solid: Solid, seed: int) -> SampledSolid:
         [np.prod(near) / NEAR_POINTS, np.prod(far) / FAR_POINTS],
         [len(near_points), len(far_points)],
     )
-    order = rng.permutation(len(points))
+    order = rng.permutation(len(points))  # so that the first n are a sample of all
     points, volumes = points[order], volumes[order]
     inside = solid.contains(points * solid.size @ R_link_box.T + centre)
     if inside[:COARSE_POINTS].sum() < 2 * MIN_POINTS:

@@ -82,7 +82,7 @@ class Solid:
         """Sample about ``n`` points of the outer surface, without triangles inside of the solid."""
         points, faces = trimesh.sample.sample_surface(self.mesh, n, seed=rng)
         points = np.asarray(points)
-        step = 1e-4 * self.size * self.mesh.face_normals[faces]
+        step = 1e-4 * self.size * self.mesh.face_normals[faces]  # past rounding, within thin walls
         outer = self.contains(points - step) != self.contains(points + step)
         return points[outer] if outer.any() else points
 
@@ -246,6 +246,6 @@ def _directions() -> Array:
     """
     step = np.arange(NUM_RAYS) + 0.5
     z = 1 - 2 * step / NUM_RAYS
-    turn = np.pi * (1 + np.sqrt(5)) * step
+    turn = np.pi * (1 + np.sqrt(5)) * step  # multiples of the golden angle
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

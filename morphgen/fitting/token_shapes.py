@@ -177,6 +177,7 @@ def _sample(primitives: Sequence[Shape]) -> _Link:
     from scipy.stats import qmc  # takes a second to load, and most links have stored fits
 
     m = _LOG2_POINTS if len(primitives) <= _FEW else _LOG2_POINTS_OF_MANY
+    # The sequence begins at a corner of its cells; half a cell more centres it.
     cube = 2 * qmc.Sobol(3, scramble=False).random_base2(m).T - 1 + 0.5**m
     samples, volumes = [], []
     for shape in primitives:

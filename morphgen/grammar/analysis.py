@@ -166,6 +166,7 @@ def _count(alternative: Alternative, counts: Mapping[str, int]) -> int:
         low, high = item.repetition or (1, 1)
         power, total = 1, 0
         for n in range(1, high + 1):
+            # Uncapped, 64 doublings of a symbol would give a number of 2**64 bits.
             power = _capped(power * counts.get(item.name, 1))
             total += power if n >= low else 0
         product = _capped(product * total)

@@ -101,7 +101,7 @@ class RecordedChooser:
         value = distribution.closest(self.recorded[key]) if key in self.recorded else None
         if value is None:
             value = self.fallback.value(key, distribution)
-        return self._record(key, float(format_number(value)))
+        return self._record(key, float(format_number(value)))  # as a file would hold it
 
     def _record(self, key: str, value: float) -> float:
         if key in self.choices:

@@ -76,6 +76,7 @@ def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
             what = "a folder, not a grammar" if path.is_dir() else "no such file"
             raise GrammarError(f"{path}: {what}")
         return path
+    # Grammars of users hide shipped ones of their name.
     users = [folder for folder in folders if not _shipped().is_relative_to(folder)]
     paths = [path for folder in (*users, _shipped()) for path in sorted(folder.rglob(f"*{SUFFIX}"))]
     for path in paths:

@@ -79,7 +79,7 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
     """Return the value if it is in the parameter's range, to 12 digits."""
-    low = min(parameter.minimum, float(format_number(parameter.minimum)))
+    low = min(parameter.minimum, float(format_number(parameter.minimum)))  # 2 pi rounds up
     high = max(parameter.maximum, float(format_number(parameter.maximum)))
     if not low <= value <= high:
         raise PartError(f"{where}={value:g}: out of range{_expected(parameter)}")

@@ -213,7 +213,7 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     base_manifest = library.manifest(base.part, "base")
     for port, limb in limbs:
         _require_port(base_manifest, port, limb.label)
-    order = list(base_manifest.ports).index
+    order = list(base_manifest.ports).index  # words may name the limbs in any order
     return _node(base, base_manifest, tuple(sorted(limbs, key=lambda limb: order(limb[0]))))
 
 
@@ -256,6 +256,7 @@ def _parse_slots(words: Sequence[str]) -> dict[str, _Slot]:
         if key in slots:
             raise CompositionError(f"{key} is given twice: {slots[key].part} and {value}")
         slots[key] = _Slot(last, port[0] if port else "", value)
+    # A base alone is no robot; parse_request says so.
     if any(key != "base" for key in slots):
         slots.setdefault("base", _Slot("base", "", "fixed"))
     for key, value in values.items():

@@ -105,7 +105,7 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
             journal.write("\n")  # ends a line that an interruption cut short
             for made, record in enumerate(work(config, missing), 1):
                 journal.write(json.dumps(record) + "\n")
-                journal.flush()
+                journal.flush()  # a killed run keeps what it has made
                 show(n - len(missing) + made, n)
         report = _write_index(config, len(missing), len(finished))
         path.unlink()

@@ -72,7 +72,7 @@ class Distribution:
                 mean, deviation = self.arguments[:2]
                 return min(max(mean + deviation * normal(), low), high)
             case "choice":
-                return self.arguments[int(uniform() * len(self.arguments))]
+                return self.arguments[int(uniform() * len(self.arguments))]  # uniform() is below 1
             case _:
                 return low + math.floor(uniform() * (high - low + 1))
 
