@@ -568,15 +568,11 @@ class HoldOutCandidate:
 def hold_out(
     candidates: Sequence[HoldOutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
 ) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
-    """Choose test candidates, of as many different combinations as possible.
+    """Choose test candidates of as many combinations as possible; return them and train candidates.
 
     Candidates with the combination of a test candidate are excluded from training, for all tasks.
     With several tasks, candidates with the outermost part and the task of a test candidate are
-    excluded, too. The remaining candidates cover every part and task of the test candidates.
-
-    Returns:
-        Test candidates, and train candidates in an order such that the first few cover each part
-        and task of the test candidates.
+    excluded, too. The first few train candidates cover every part and task of the test candidates.
     """
     rng = np.random.default_rng(seed)
     max_held = 0  # of the best attempt, for the message

@@ -157,17 +157,12 @@ def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
 
 
 def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
-    """Return the distance of a point from the convex hull of other points.
+    """Return the distance of a point (d,) from the convex hull of others (n, d); 0 inside.
 
     The distance is the smallest L1 distance to a point of the hull, each coordinate divided by its
-    range over the other points. It is the solution of a linear program. A coordinate in which the
-    other points are equal is omitted, but a point that differs in it is infinitely far away.
-
-    point: The point, shape (d,).
-    points: The other points, shape (n, d), at least one.
-
-    Returns:
-        The distance; 0 inside, up to rounding, see ``ON_HULL``.
+    range over the other points. It is the solution of a linear program, exact to ``ON_HULL``. A
+    coordinate in which the other points are equal is omitted, but a point that differs in it is
+    infinitely far away.
     """
     x, others = np.asarray(point, dtype=np.float64), np.asarray(points, dtype=np.float64)
     low, span = others.min(axis=0), np.ptp(others, axis=0)

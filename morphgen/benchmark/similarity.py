@@ -475,11 +475,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
 
 
 def similarity_matrix(robots: Sequence[Features], measure: str) -> Array:
-    """Compare all pairs of robots.
-
-    Returns:
-        Symmetric matrix, shape (n, n).
-    """
+    """Compare all pairs of robots by a measure; return a symmetric matrix, shape (n, n)."""
     function = get_measure(measure).function
     values = np.empty((len(robots), len(robots)))
     num_pairs = len(robots) * (len(robots) + 1) // 2
@@ -498,13 +494,7 @@ def to_distances(values: Array, measure: str) -> Array:
 
 
 def most_alike(values: Array, measure: str) -> int | None:
-    """Return the index of the most similar robot, the first of several equal ones.
-
-    values: A measure of the similarity to n robots, NaN where it is not known, shape (n,).
-
-    Returns:
-        The index; None if no value is known.
-    """
+    """Return the index of the first most similar robot of values (n,); None if all are NaN."""
     best = np.nanargmax if get_measure(measure).larger_is_more_alike else np.nanargmin
     return None if np.isnan(values).all() else int(best(values))
 

@@ -122,12 +122,9 @@ def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
 
 
 def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Pad tokens with rows of zeros, so that robots of different sizes share a batch.
+    """Pad tokens (..., n_links, 48) with rows of zeros, so that robots of any size share a batch.
 
-    tokens: Tokens of one robot, shape (..., n_links, 48).
-
-    Returns:
-        Tokens (..., max_links, 48), and a mask (max_links,) that is True for links.
+    Returns also a mask (max_links,) that is True for links.
     """
     n_links = tokens.shape[-2]
     require_max_links(n_links, "the robot", max_links)
@@ -155,15 +152,10 @@ def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = 
 
 
 def encode_position(x: Array) -> Array:
-    """Encode normalized joint positions as sines and cosines of doubling frequencies.
+    """Encode normalized joint positions x (...) as eight sines and eight cosines, shape (..., 16).
 
     As in NeRF (Mildenhall et al. 2020, equation 4), but the lowest frequency is pi/2 instead of pi,
-    with which both limits would have the same code.
-
-    x: Positions, -1 at the lower and 1 at the upper limit, shape (...).
-
-    Returns:
-        Eight sines, then eight cosines, shape (..., 16).
+    with which both limits, x = -1 and x = 1, would have the same code.
     """
     angles = x[..., None] * FREQUENCIES
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
@@ -278,23 +270,11 @@ def tokens(
     *,
     max_links: int = MAX_LINKS,
 ) -> Array:
-    """Return the tokens of a robot's links, root first; ``LAYOUT`` describes their fields.
+    """Return the tokens of a robot's links, shape (..., n_links, 48), root first; see ``LAYOUT``.
 
-    Args:
-        robot: The robot.
-        shapes: One primitive per link, by link name; links without geometry are absent.
-        q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
-        max_links: Largest number of links among all compared robots; link indices are divided by
-            ``max_links - 1``.
-
-    Returns:
-        Tokens, shape (..., n_links, 48).
-
-    Raises:
-        BenchmarkError: If the robot has more links than ``max_links``, a shape is a mesh, has no
-            size or names an unknown link, a joint has no range, or a number is not finite.
-        RobotError: If a joint's axis is zero.
-        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
+    shapes: One primitive per link, by link name; links without geometry are absent.
+    q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
+    max_links: Largest number of links of all compared robots; indices are divided by one less.
     """
     require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
     for name in shapes:
@@ -328,10 +308,7 @@ def tokens(
 def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
     """Return the field ``joint position``, the only part of the tokens that changes with ``q``.
 
-    q: Independent joint positions, shape (..., dof) [rad or m].
-
-    Returns:
-        Codes, shape (..., n_links, 16); zeros for the root and for fixed joints.
+    Codes have the shape (..., n_links, 16) for q (..., dof); zeros for the root and fixed joints.
     """
     x = normalize_positions(robot, q)
     codes = np.zeros((*x.shape[:-1], len(robot.links), POSITION.size))
@@ -340,16 +317,11 @@ def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
 
 
 def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
-    """Scale the positions of the movable joints to -1 at the lower and 1 at the upper limit.
+    """Scale the movable joints to -1 at the lower and 1 at the upper limit, shape (..., n_movable).
 
     Positions of continuous joints, and of revolute ones without limits, are wrapped to (-pi, pi]
     and divided by pi. Those of prismatic joints without limits stay in metres. Mimic joints follow
-    their leaders.
-
-    q: Independent joint positions, shape (..., dof) [rad or m].
-
-    Returns:
-        Normalized positions in the order of ``robot.movable_joints``, shape (..., n_movable).
+    their leaders. q: Independent joint positions, shape (..., dof) [rad or m].
     """
     joints = [robot.joints[k] for k in robot.movable_joints]
     for joint in joints:
@@ -376,17 +348,12 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
 def robot_from_tokens(
     tokens: ArrayLike, name: str, *, max_links: int = MAX_LINKS
 ) -> tuple[Robot, dict[str, Shape]]:
-    """Decode tokens to a robot; the inverse of ``tokens``.
+    """Decode tokens (n_links, 48) of a robot to it and its primitives by link name.
 
     Links are named ``link0``, ``link1`` ..., and joints ``joint1`` ... after their child links.
     The primitives become collision shapes. Movable joints are independent and have limits (-1, 1),
     so that q is the normalized position. The home is the configuration of the tokens, and the tool
     frame is its link's frame. ``docs/tokens.md`` lists what tokens do not contain.
-
-    tokens: Tokens of one robot in one configuration, without padding, shape (n_links, 48).
-
-    Returns:
-        The robot, and its primitives by link name, as ``tokens`` takes them.
     """
     table = np.asarray(tokens, dtype=np.float64)
     what = f"tokens of {name!r}"

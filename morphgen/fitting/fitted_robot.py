@@ -69,14 +69,9 @@ class Agreement:
 def agreement(
     meshes: Robot, primitives: Robot, n: int = 1000, seed: int = 0
 ) -> tuple[Agreement, Agreement]:
-    """Compare self-collisions over random configurations.
+    """Return how primitives, and convex hulls, agree with meshes on random self-collisions.
 
     Pairs of links that one of the robots ignores are ignored on both.
-
-    primitives: The same robot with primitives as collision shapes.
-
-    Returns:
-        The agreement of the primitives, and that of the convex hulls, with the meshes.
     """
     ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))

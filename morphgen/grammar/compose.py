@@ -35,18 +35,7 @@ class ScopedPart:
 
 
 def compose(derivation: Derivation, library: Library, name: str) -> Robot:
-    """Build the robot of a derivation, with its ignored collision pairs and its stored fits.
-
-    Args:
-        derivation: Parts, parameters and attachments.
-        library: Library of the parts.
-        name: Name of the robot.
-
-    Raises:
-        CompositionError: If a part does not have the named port, or two parts have the same label.
-        PartError: If a part or parameter is unknown or invalid.
-        FormatError: If a part's source or stored fits cannot be read.
-    """
+    """Build the robot of a derivation, with its ignored collision pairs and its stored fits."""
     robot = with_stored_fits(join(derivation, library, name), library.folders)
     return replace(robot, ignore_pairs=survey_contacts(robot, derivation, library).ignore_pairs)
 

@@ -102,11 +102,7 @@ class Scope:
 
 
 def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
-    """Evaluate an arithmetic expression.
-
-    Returns:
-        The value in SI units, and its unit: ``m``, ``rad``, ``kg`` or empty for a pure number.
-    """
+    """Return the value of an arithmetic expression in SI units, and its unit, empty for none."""
     value, unit = _evaluate(expression, scope)
     if not math.isfinite(value):
         raise GrammarError(f"{expression.location}: {expression} is not finite")
