@@ -99,23 +99,8 @@ _TOKEN_NAMES = {
     "SIGN": "'+' or '-'",
     "FACTOR": "'*' or '/'",
     "COMPARATOR": "a comparison such as '<'",
-    "LPAR": "'('",
-    "RPAR": "')'",
-    "LBRACE": "'{'",
-    "RBRACE": "'}'",
-    "VBAR": "'|'",
-    "EQUAL": "'='",
-    "COLON": "':'",
-    "COMMA": "','",
-    "AND": "'and'",
-    "OR": "'or'",
-    "NOT": "'not'",
-    "INCLUDE": "'include'",
-    "LET": "'let'",
-    "WHERE": "'where'",
-    "_WEIGHT": "'@weight'",
-    "_ARROW": "'->'",
 }
+"""Names of the terminals that are no fixed text, for messages."""
 
 
 def require_at_most(number: int, most: int, text: str) -> None:
@@ -145,7 +130,8 @@ def _message(error: UnexpectedInput, text: str, origin: str) -> str:
     # Lark's parser and its lexer name what they expect by different attributes.
     attributes = (getattr(error, name, None) for name in ("accepts", "expected", "allowed"))
     names = next(filter(None, attributes), ())
-    expected = sorted({_TOKEN_NAMES.get(name, name) for name in names})
+    texts = {each.name: repr(each.pattern.value) for each in _parser().terminals} | _TOKEN_NAMES
+    expected = sorted({texts[name] for name in names})
     return f"{origin}:{line}:{column}: found {token_text}, expected {' or '.join(expected)}"
 
 

@@ -126,7 +126,6 @@ def test_an_unknown_part_is_reported_with_the_nearest():
     ("derivation", "why"),
     [
         ("base=planar[up: ee=cube]", "no port 'up'"),
-        ("base=planar[top: ee=cube(size=9)]", "out of range"),
         ("base=planar[", "invalid derivation"),
         ("base=fixed[top: ee=cube]", "no joint moves its tool"),
     ],

@@ -252,7 +252,6 @@ def test_duplicate_categories_are_errors(train, test, message):
         ((1,), {"test": 0}, "--train 1 --test 0 --seed 0: --train and --test start at 1"),
         ((1,), {"seed": -1}, "--seed at 0"),
         ((3, 2), {}, "--train 3,2: expected sizes that grow, such as 10,30,100"),
-        ((3, 3), {}, "--train 3,3: expected sizes that grow, such as 10,30,100"),
     ],
 )
 def test_invalid_orders_are_errors(sizes, changes, message):

@@ -128,15 +128,10 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
     [
         ("regime: composition", "regime: compostion", "7: regime: unknown value 'compostion'; did"),
         ("format: 1", "format: 2", "3: format: unknown value 2; valid: 1"),
-        ("format: 1", "fromat: 1", "1: unknown key 'fromat'; did you mean 'format'?"),
         ("summary: ", "name: x\nsummary: ", "8:1: invalid YAML: key 'name' is given twice"),
         ("summary: ", "summary: # ", "8: summary: invalid value None; expected text"),
-        ("name: mine/first", "name: 12", "5: name: invalid value 12; expected text"),
-        ("made:\n", "made: 5 #\n", "11:3: invalid YAML: "),
         ("test:\n- ", "test: []\n# ", "22: test: invalid value []; expected a list of length >= 1"),
-        ("test:\n- ", "tset:\n- ", "1: unknown key 'tset'; did you mean 'test'?"),
         ("task: push", "task: Push!", "23: test[0]: task: 'Push!': expected a name of lower-case"),
-        ("obstacles: true", "obstacles: maybe", "23: test[0].obstacles: invalid value 'maybe'"),
         ("name: ur5-stick, ", "", "23: test[0]: missing key 'name'"),
         ("name: mine/first", "name: ../first", "1: name: '../first': use letters, digits"),
         ("name: ur5-stick", "name: ../x", "23: test[0]: name: '../x': use letters, digits"),
@@ -144,8 +139,6 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
         ('body: "1e5', 'body: "1g5', "21: train[1]: body: '1g500"),
         ("seed: 3", "seed: 2024-13-45", " invalid YAML: month must be in 1..12"),
         ("seed: 3", "seed: &a [*a]", "11: invalid YAML: found unconstructable recursive node"),
-        ("statistics:\n", "statistics: x\n#", "17: statistics: invalid value 'x'; expected keys"),
-        ("part-unseen: ", "part-unseen: 5 #", "16: accepted.part-unseen: invalid value 5;"),
     ],
 )
 def test_errors_name_the_line(written, old, new, message):

@@ -92,27 +92,19 @@ def test_a_missing_key_is_an_error(tmp_path, key):
     ("changes", "message"),
     [
         ({"kind": "arn"}, "2: kind: unknown value 'arn'; did you mean 'arm'? valid: arm, base"),
-        ({"kind": ["ee"]}, "kind: unknown value ['ee']"),
         ({"file": None}, "needs 'source' (a data package) or 'file' (a template)"),
         ({"mount": "palm"}, "6: mount: invalid value 'palm'; expected keys and values"),
-        ({"mount": {"link": "palm", "xzy": [0, 0, 0]}}, "mount: unknown key 'xzy'; did you mean"),
         ({"tool": {"link": "palm", "xyz": [0, 1]}}, "tool.xyz: invalid value [0, 1]; expected a"),
-        ({"tool": {"link": "palm", "rpy": [0, 0, True]}}, "tool.rpy[2]: invalid value True;"),
         ({"tool": {"link": "palm", "xyz": [0, 0, float("inf")]}}, "tool.xyz[2]: invalid value"),
         ({"ports": {"flange": {"link": "palm", "at": 1}}}, "ports.flange: unknown key 'at'"),
         ({"ports": {5: {"link": "palm"}}}, "ports: key 5 is not text; quote it"),
-        ({"home": {"wheel": float("nan")}}, "home.wheel: invalid value nan; expected a finite"),
         ({"density": 0}, "density: invalid value 0; expected a number > 0"),
-        ({"without": "disc"}, "without: invalid value 'disc'; expected a list"),
-        ({"parameters": {"length": {"min": 0, "max": 1}}}, "length: missing key 'default'"),
         (
             {"parameters": {"length": {"default": 0, "min": 0, "mx": 1}}},
             "parameters.length: unknown key 'mx'; did you mean 'max'?",
         ),
         (REAL | {"source": {"package": "rtb-data"}}, "source: missing key 'file'"),
         (REAL | {"scaling": {"palm": 2}}, "scaling.palm: invalid value 2; expected text or keys"),
-        (REAL | {"scaling": {"palm": {"bye": "s"}}}, "scaling.palm: unknown key 'bye'; did you"),
-        (REAL | {"scaling": {"palm": {"face": [0, 0, "z"]}}}, "palm.face[2]: invalid value 'z';"),
     ],
 )
 def test_a_value_of_the_wrong_type_is_an_error_that_names_file_and_key(tmp_path, changes, message):
@@ -215,11 +207,9 @@ def test_the_smallest_manifest_is_valid(tmp_path):
         "file: tip.xacro\nmass: {tip: 1}",
         "source: {package: p, file: f}\ndensity: 1000",
         "source: {package: p, file: f}\nfile: tip.xacro",
-        "file: tip.xacro\ndensity: 0",
         "file: tip.xacro\nports: {end: {link: tip, xyz: [0, 0]}}",
         "file: tip.xacro\nparameters: {size: {default: 1, min: 0}}",
         "file: tip.xacro\nparameters: {size: {default: 1, min: 0, max: 2, unit: ft}}",
-        "file: tip.xacro\nhome: 0",
     ],
 )
 def test_what_the_reader_refuses_is_invalid(lines, tmp_path):
