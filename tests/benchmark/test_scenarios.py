@@ -1,7 +1,8 @@
-"""The scenarios of the paper: the shipped files hold what their tables of robots generate."""
+"""The shipped splits of the paper are what their tables of robots generate; licences of parts."""
 
 import pytest
 
+from helpers.splits import combined
 from morphgen.benchmark.generate import (
     ComposedRecipe,
     RobotFactory,
@@ -9,10 +10,22 @@ from morphgen.benchmark.generate import (
     members,
     stream_seed,
 )
+from morphgen.benchmark.licences import (
+    LICENCES,
+    NO_DERIVATIVES,
+    NON_COMMERCIAL,
+    UNKNOWN,
+    find_licence,
+    licence_ids,
+    licenced_parts,
+    require_allowed,
+    restricted,
+)
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.split import SIDES
 from morphgen.benchmark.split_file import find_split, read_split, split_names, split_text
 from morphgen.benchmark.survey import statistics
+from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import pin
@@ -86,3 +99,62 @@ def test_the_shipped_files_round_trip(name):
 def test_regime_findings_are_only_the_accepted_ones(name):
     split = read_split(name)
     assert {each.code for each in regime_findings(split, LIBRARY)} == set(split.accepted)
+
+
+RESTRICTED_SPLITS = {
+    f"{name}/{task}"
+    for name in ("composition/ee-arm", "extrapolation/arms")
+    for task in ("reach", "push")
+}
+
+
+def test_every_licence_of_the_library_is_known():
+    used = {LIBRARY.manifest(name).licence for name in LIBRARY.names()}
+    assert used - set(LICENCES) == set()
+    for name in used:
+        licence = find_licence(name)
+        assert ("NC" in name.split("-")) == (NON_COMMERCIAL in licence.restrictions)
+        assert ("ND" in name.split("-")) == (NO_DERIVATIVES in licence.restrictions)
+        assert licence.is_spdx == (not name.startswith("LicenseRef-"))
+
+
+def test_an_unlisted_licence_counts_as_unknown():
+    licence = find_licence("Proprietary")
+    assert (licence.restrictions, licence.url, licence.hub_id) == ((UNKNOWN,), "", "unknown")
+
+
+def test_four_scenarios_have_a_restricted_part():
+    found = {}
+    for name in split_names():
+        for part in restricted(licenced_parts(read_split(name), LIBRARY)):
+            found[name] = (part.part, part.licence.id, part.robots)
+    assert set(found) == RESTRICTED_SPLITS
+    assert set(found.values()) == {("sake_ez", "CC-BY-NC-ND-4.0", (("train", "ur5-ez"),))}
+
+
+def test_parts_name_every_robot_of_both_sides():
+    parts = {part.part: part for part in licenced_parts(combined(), LIBRARY)}
+    assert set(parts) == {"gantry", "planar", "plane", "cube", "cylinder"}
+    assert parts["plane"].as_dict() == {
+        "part": "plane",
+        "licence": "MIT",
+        "restrictions": [],
+        "source": LIBRARY.manifest("plane").citation,
+        "robots": {"train": ["gantry-plane"], "test": ["planar-plane"]},
+    }
+
+
+def test_a_restricted_licence_must_be_allowed():
+    split = read_split("composition/ee-arm/reach")
+    parts = licenced_parts(split, LIBRARY)
+    assert licence_ids(parts) == ("BSD-3-Clause", "CC-BY-NC-ND-4.0", "MIT")
+    with pytest.raises(BenchmarkError) as caught:
+        require_allowed(split, parts, ())
+    assert str(caught.value) == (
+        "composition/ee-arm/reach: sake_ez (CC-BY-NC-ND-4.0: non-commercial, no derivatives) in "
+        "robots ur5-ez; release a split without these parts, or allow the licence with "
+        "--licence-allow CC-BY-NC-ND-4.0"
+    )
+    require_allowed(split, parts, ("CC-BY-NC-ND-4.0",))
+    with pytest.raises(BenchmarkError, match=r"no part of .* has this licence; did you mean 'CC-"):
+        require_allowed(split, parts, ("CC-BY-NC-ND-3.0",))

@@ -1,7 +1,7 @@
 """Robot hashes, split ids, and robots composed from split members."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape
-from morphgen.model.robot import Frame, Mimic
+from morphgen.model.robot import Frame, Inertial, Mimic
 from morphgen.model.tree import rename
 
 LIBRARY = default_library()
@@ -39,38 +39,19 @@ def with_joint(robot, name, **changes):
     return replace(robot, joints=tuple(joints))
 
 
-def jittered(robot, size, rng):
-    """Return the robot with noise on every pose, mass, inertia and limit; rotations are kept."""
-
-    def noisy(values):
-        return tuple(float(v + size * rng.standard_normal() * max(1, abs(v))) for v in values)
-
-    def pose(T):
-        w, x, y, z = noisy(T.quaternion)
-        return Pose(noisy(T.position), (w, x, y, z))
-
-    def shapes(given):
-        return tuple(replace(shape, T_link_shape=pose(shape.T_link_shape)) for shape in given)
-
-    def body(inertial):
-        if inertial is None:
-            return None
-        (mass,) = noisy([inertial.mass])
-        # Noise of an inertia is that of the mass times a squared length.
-        moments = [v + size * inertial.mass * rng.standard_normal() for v in inertial.inertia]
-        return replace(inertial, mass=mass, com=noisy(inertial.com), inertia=tuple(moments))
-
-    def link(old):
-        collisions, visuals = shapes(old.collisions), shapes(old.visuals)
-        return replace(old, inertial=body(old.inertial), visuals=visuals, collisions=collisions)
-
-    def joint(old):
-        limits = old.limits and noisy(old.limits)
-        return replace(old, T_parent_joint=pose(old.T_parent_joint), limits=limits)
-
-    frames = tuple(replace(frame, T_link_frame=pose(frame.T_link_frame)) for frame in robot.frames)
-    links, joints = tuple(map(link, robot.links)), tuple(map(joint, robot.joints))
-    return replace(robot, links=links, joints=joints, frames=frames, home=noisy(robot.home))
+def jittered(value, size, rng):
+    """Return a robot, or a part of one, with noise on its numbers; rotations are kept."""
+    if isinstance(value, float):
+        return float(value + size * rng.standard_normal() * max(1, abs(value)))
+    if isinstance(value, tuple):
+        return tuple(jittered(each, size, rng) for each in value)
+    if not is_dataclass(value):
+        return value
+    noisy = {e.name: jittered(getattr(value, e.name), size, rng) for e in fields(value) if e.init}
+    if isinstance(value, Inertial):  # its noise is that of the mass times a squared length
+        noise = size * value.mass * rng.standard_normal(6)
+        noisy["inertia"] = tuple((noise + value.inertia).tolist())
+    return replace(value, **noisy)
 
 
 TURNED = Pose.from_xyz_rpy((0, 0, 0.3), (0, 1e-6, 0))

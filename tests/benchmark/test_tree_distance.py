@@ -203,24 +203,6 @@ def test_empty_links_do_not_change_the_distance():
     assert distance(plain, framed) == pytest.approx(0, abs=1e-12)
 
 
-@given(st.randoms(use_true_random=False))
-@settings(max_examples=25, deadline=None)
-def test_the_order_of_links_in_the_file_does_not_matter(random):
-    hand = morphgen.compose("arm=lwr ee=claw")
-    left, shuffled = list(hand.joints), []
-    known = {hand.root.name}
-    while left:
-        joint = random.choice([joint for joint in left if joint.parent in known])
-        left.remove(joint)
-        shuffled.append(joint)
-        known.add(joint.child)
-    links = (hand.root, *(hand.link(joint.child) for joint in shuffled))
-    home = {hand.joints[k].name: q for k, q in zip(hand.independent_joints, hand.home, strict=True)}
-    moved = tuple(home[joint.name] for joint in shuffled if joint.is_independent)
-    other = replace(hand, links=links, joints=tuple(shuffled), home=moved)
-    assert distance(hand, other) == pytest.approx(0, abs=1e-6)
-
-
 @pytest.mark.parametrize("order", list(itertools.permutations(range(4))))
 def test_the_order_of_siblings_and_the_sign_of_axes_do_not_matter(order):
     fingers = [

@@ -282,12 +282,6 @@ def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path):
     assert several.decimated_from == len(ball.faces) + 12
 
 
-def test_distances_are_measured_to_the_surface():
-    points = np.array([(0, 0, 0), (0.1, 0, 0), (0.3, 0, 0), (0.09, 0, 0), (0.2, 0.35, 0.2)])
-    far = [0.1, 0, 0.2, 0.01, math.hypot(0.1, 0.2)]
-    np.testing.assert_allclose(solid_of_mesh(box()).distance(points), far, atol=1e-12)
-
-
 def test_the_surface_of_a_box_is_sampled_uniformly():
     points = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
     assert len(points) == pytest.approx(6000, rel=0.02)

@@ -3,7 +3,6 @@
 import importlib.metadata
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, scale_shape
-from morphgen.model.kinematics import forward_kinematics
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
 GONE = {"file": None, "density": None, "parameters": None}
@@ -270,13 +268,6 @@ def test_unit_scale_factors_give_the_original_panda():
     panda, same = load_part(default_library().manifest("panda")).fragment, variation(*[1] * 7)
     assert panda.links[8].name == "panda_link8"  # a bare frame; the scaled part has a port there
     assert (same.links, same.joints, same.home) == (panda.links[:8], panda.joints[:7], panda.home)
-
-
-def test_the_offset_between_joint_faces_scales_with_the_link():
-    q = np.zeros(7)
-    plain, taller = (forward_kinematics(variation(*f), q) for f in ([1] * 7, [1, 1.4] + [1] * 5))
-    lifted = taller[3:, :3, 3] - plain[3:, :3, 3]
-    assert lifted == pytest.approx(np.tile([0, 0, 0.4 * 0.1925], (len(lifted), 1)))
 
 
 def test_lengths_masses_and_inertias_scale_at_constant_density():

@@ -176,7 +176,11 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     words = ("sample", "chain", "-n", 32, "--seed", 3, "--light", "--jobs", jobs)
     process = start(*words, "--out", tmp_path / "killed")
     journal = tmp_path / "killed" / JOURNAL
-    wait_for(lambda: journal.exists() and len(journal.read_bytes().splitlines()) > 3, process)
+    for _ in range(1200):
+        if journal.exists() and len(journal.read_bytes().splitlines()) > 3:
+            break
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)  # ends when no worker holds the pipe any more
     assert not (tmp_path / "killed" / INDEX).exists()
@@ -185,15 +189,6 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     assert (again.returncode, "32 made" in out) == (0, False), err
     make_set(plan(tmp_path / "whole", "chain", seed=3), 32, make_in_processes())
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
-
-
-def wait_for(happened, process):
-    for _ in range(1200):
-        if happened():
-            return
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    raise AssertionError("nothing happened for 24 s")
 
 
 @pytest.mark.parametrize(

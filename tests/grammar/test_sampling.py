@@ -201,20 +201,6 @@ def test_all_other_values_are_unchanged_to_the_last_digit():
             assert names in ({"gantry.low"}, {"gantry.stroke", "plane.size"})
 
 
-def test_choices_rounded_in_a_file_are_kept():
-    robot_grammar = grammar(
-        "robot -> gantry plane(size=uniform(0.1, 0.2), mount_yaw=choice(60deg, 60deg, 30deg))"
-    )
-    turned = [
-        i for i in range(20) if max(sample_robot(robot_grammar, LIBRARY, i).choices.values()) > 1
-    ]
-    assert turned
-    for index in turned[:5]:
-        origin = sample_robot(robot_grammar, LIBRARY, index)
-        for neighbour in neighbours(robot_grammar, origin, 4):
-            assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
-
-
 def test_neighbours_satisfy_the_conditions():
     robot_grammar = grammar(
         "robot -> post beam(length=uniform(0.1, 0.3)){2,5} jaw", "where 0.5 < reach < 0.9"
