@@ -202,7 +202,7 @@ def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ..
     split = replace(survey.split, train=tuple(composable["train"]), test=tuple(composable["test"]))
     findings = regime_findings(split, library)
     if has_hold_out_rules(survey.split):
-        findings += hold_out_findings(split, library)
+        return (*findings, *hold_out_findings(split, library))
     return findings
 
 

@@ -671,8 +671,8 @@ def hold_out_rules(split: Split, library: Library) -> tuple[HoldOutRule, ...]:
     return parse_rules(texts, library, origin)
 
 
-def hold_out_findings(split: Split, library: Library) -> tuple[Finding, ...]:
-    """Return the violations of what a split says is held out; all are errors.
+def hold_out_findings(split: Split, library: Library) -> Iterator[Finding]:
+    """Yield the violations of what a split says is held out; all are errors.
 
     - ``held-out-trained``: a train robot has what is held out;
     - ``held-out-absent``: a test robot does not have it;
@@ -684,11 +684,27 @@ def hold_out_findings(split: Split, library: Library) -> tuple[Finding, ...]:
         [(m, parse_derivation(m.derivation, f"derivation of {m.name!r}")) for m in members]
         for members in (split.train, split.test)
     )
-    return (
-        *_train_findings(rules, train, library),
-        *_test_findings(rules, train, test, library),
-        *_untested(rules, test, library),
-    )
+    trained = frozenset[str]().union(*(parts(derivation) for _, derivation in train))
+    for member, derivation in train:
+        for rule in rules:
+            if rule.holds(derivation, library):
+                names = ", ".join(sorted(rule.matching_parts(derivation, library)))
+                why = f"it has {names}, and the split holds out {rule}"
+                yield _finding("held-out-trained", "train", member, why, "leave it out of train")
+    for member, derivation in test:
+        if not any(rule.holds(derivation, library) for rule in rules):
+            why = f"it has nothing that the split holds out: {', '.join(map(str, rules))}"
+            yield _finding("held-out-absent", "test", member, why, "leave it out of test")
+        unseen = parts(derivation) - trained - held_out_parts(rules, derivation, library)
+        if unseen:
+            why = f"no train robot has {', '.join(map(repr, sorted(unseen)))}, which no rule names"
+            fix = "train on a robot that has it, or hold it out, too"
+            yield _finding("part-unseen", "test", member, why, fix)
+    for rule in rules:
+        if not any(rule.holds(derivation, library) for _, derivation in test):
+            why = "no test robot has what it holds out"
+            fix = "add a test robot that has it, or delete the rule"
+            yield Finding("held-out-untested", "error", f"rule {rule}", why, fix)
 
 
 def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
@@ -717,49 +733,6 @@ def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
         if manifest.manufacturer and same:
             related[f"{manifest.kind}.manufacturer={manifest.manufacturer}"] = tuple(same)
     return related
-
-
-Parsed = tuple[Member, Derivation]
-
-
-def _train_findings(
-    rules: Sequence[HoldOutRule], train: Sequence[Parsed], library: Library
-) -> Iterator[Finding]:
-    for member, derivation in train:
-        for rule in rules:
-            if rule.holds(derivation, library):
-                names = ", ".join(sorted(rule.matching_parts(derivation, library)))
-                why = f"it has {names}, and the split holds out {rule}"
-                yield _finding("held-out-trained", "train", member, why, "leave it out of train")
-
-
-def _test_findings(
-    rules: Sequence[HoldOutRule], train: Sequence[Parsed], test: Sequence[Parsed], library: Library
-) -> Iterator[Finding]:
-    trained = frozenset[str]().union(*(parts(derivation) for _, derivation in train))
-    for member, derivation in test:
-        if not any(rule.holds(derivation, library) for rule in rules):
-            why = f"it has nothing that the split holds out: {', '.join(map(str, rules))}"
-            yield _finding("held-out-absent", "test", member, why, "leave it out of test")
-        unseen = parts(derivation) - trained - held_out_parts(rules, derivation, library)
-        if unseen:
-            why = f"no train robot has {', '.join(map(repr, sorted(unseen)))}, which no rule names"
-            fix = "train on a robot that has it, or hold it out, too"
-            yield _finding("part-unseen", "test", member, why, fix)
-
-
-def _untested(
-    rules: Sequence[HoldOutRule], test: Sequence[Parsed], library: Library
-) -> Iterator[Finding]:
-    for rule in rules:
-        if not any(rule.holds(derivation, library) for _, derivation in test):
-            yield Finding(
-                "held-out-untested",
-                "error",
-                f"rule {rule}",
-                "no test robot has what it holds out",
-                "add a test robot that has it, or delete the rule",
-            )
 
 
 def _finding(code: str, side: Side, member: Member, why: str, fix: str) -> Finding:

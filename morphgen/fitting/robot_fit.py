@@ -33,7 +33,7 @@ from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Shape, StoredFit, StoredFits
-from morphgen.model.robot import Link, Robot
+from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 
 TOKEN_OPTIONS = FitOptions(max_primitives=1)
@@ -139,13 +139,17 @@ def fit_links(
             measured = quality(solids[link.name], primitives)
             copy = replace(fit, primitives=primitives, single=single, quality=measured, seconds=0.0)
             reports.append(LinkReport(link.name, copy, solid_links[first].name))
-    findings = [
-        _no_primitive(link, failures[link.name])
-        if link.name in failures
-        else _decimated(link, solids[link.name])
-        for link in links
-        if link.name in failures or solids[link.name].decimated_from
-    ]
+    findings = []
+    for link in links:
+        where, solid = f"link {link.name}", solids.get(link.name)
+        if link.name in failures:
+            why = f"no primitive can stand for its shapes: {failures[link.name]}"
+            fix = "give the link a collision shape with a volume, or none"
+            findings.append(Finding("no-primitive", "warning", where, why, fix))
+        elif solid and solid.decimated_from:
+            counts = f"{solid.decimated_from} triangles were decimated to {len(solid.mesh.faces)}"
+            fix = "give the link a lighter collision mesh"
+            findings.append(Finding("mesh-decimated", "info", where, f"its {counts}", fix))
     return FitReport(robot.name, options, tuple(reports), tuple(findings))
 
 
@@ -155,26 +159,6 @@ def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Link
         return fit_shapes(shapes, options, solid=solid)
     except FitError as error:
         return error
-
-
-def _no_primitive(link: Link, error: FitError) -> Finding:
-    return Finding(
-        "no-primitive",
-        "warning",
-        f"link {link.name}",
-        f"no primitive can stand for its shapes: {error}",
-        "give the link a collision shape with a volume, or none",
-    )
-
-
-def _decimated(link: Link, solid: Solid) -> Finding:
-    return Finding(
-        "mesh-decimated",
-        "info",
-        f"link {link.name}",
-        f"its {solid.decimated_from} triangles were decimated to {len(solid.mesh.faces)}",
-        "give the link a lighter collision mesh",
-    )
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:

@@ -34,6 +34,8 @@ from morphgen.grammar.values import (
     typical_value,
 )
 
+_MANY = MAX_COUNT + 1  # stands for any larger number of structures
+
 
 class SearchError(GrammarError):
     """The search for another structure was given up after ``MAX_SEARCH`` parts."""
@@ -49,7 +51,7 @@ def count_structures(grammar: Grammar) -> float:
     counts: dict[str, int] = {}
     try:
         for symbol in TopologicalSorter(_symbol_graph(grammar, alternatives)).static_order():
-            counts[symbol] = _capped(sum(_count(a, counts) for a in alternatives[symbol]))
+            counts[symbol] = min(sum(_count(a, counts) for a in alternatives[symbol]), _MANY)
     except CycleError:
         return math.inf
     return counts[grammar.start]
@@ -167,15 +169,10 @@ def _count(alternative: Alternative, counts: Mapping[str, int]) -> int:
         power, total = 1, 0
         for n in range(1, high + 1):
             # Uncapped, 64 doublings of a symbol would give a number of 2**64 bits.
-            power = _capped(power * counts.get(item.name, 1))
+            power = min(power * counts.get(item.name, 1), _MANY)
             total += power if n >= low else 0
-        product = _capped(product * total)
+        product = min(product * total, _MANY)
     return product
-
-
-def _capped(number: int) -> int:
-    """Return a number of structures, at most ``MAX_COUNT + 1``."""
-    return min(number, MAX_COUNT + 1)
 
 
 def _possible_alternatives(grammar: Grammar) -> dict[str, list[Alternative]]:
