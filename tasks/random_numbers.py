@@ -16,19 +16,14 @@ import torch
 
 from morphgen.errors import TaskError
 
-MAX_SEED = 2**64 - 1
-"""Largest seed."""
-ROUNDS = 10
-"""Number of rounds of the generator."""
-WORD = 2**32
-"""Number of values of a word, the unit in which the generator computes."""
+MAX_SEED = 2**64 - 1  # largest seed
+ROUNDS = 10  # number of rounds of the generator
+WORD = 2**32  # number of values of a word, the unit in which the generator computes
 _MULTIPLIERS = (0xCD9E8D57 - WORD, 0xD2511F53 - WORD)
 """Multipliers of the third and the first word of a counter, minus ``WORD``: products with words
 then fit into 64 bits with a sign, and ``WORD`` times the other factor is added afterwards."""
-_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
-"""Increments of the two words of the key from round to round."""
-_FLOAT_BITS = 24
-"""Bits of a number in [0, 1) in single precision."""
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)  # increments of the two words of the key from round to round
+_FLOAT_BITS = 24  # bits of a number in [0, 1) in single precision
 
 
 class Stream(IntEnum):

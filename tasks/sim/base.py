@@ -17,12 +17,9 @@ from morphgen.model.rotation import Vec3
 if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
     import torch
 
-TIMESTEP = 0.005
-"""Physics step: 200 Hz, as in AnyBody [s]."""
-SUBSTEPS = 4
-"""Number of physics steps per control step."""
-CONTROL_PERIOD = TIMESTEP * SUBSTEPS
-"""Duration of a control step: actions come at 50 Hz [s]."""
+TIMESTEP = 0.005  # physics step: 200 Hz, as in AnyBody [s]
+SUBSTEPS = 4  # number of physics steps per control step
+CONTROL_PERIOD = TIMESTEP * SUBSTEPS  # duration of a control step: actions come at 50 Hz [s]
 
 HOST_DEVICES = ("cpu",)
 """Types of devices whose tensors the processor reads without waiting.
