@@ -100,12 +100,12 @@ def _rows(args: argparse.Namespace) -> Iterator[Row]:
         yield _copies(args.split, (args.envs or (1024,))[0], args.device)
 
 
-@wp.kernel
+@wp.kernel  # type: ignore[untyped-decorator]
 def targets_as_controls(
     joints: Joints, targets: wp.array2d[float], control: wp.array2d[float]
 ) -> None:
     """Copy the targets of the independent joints to the actuators. Threads: (worlds, J)."""
-    world, joint = wp.tid()
+    world, joint = wp.tid()  # type: ignore[misc]  # Warp has several signatures
     control[world, joint] = targets[joints.env[world], joint]
 
 
