@@ -26,9 +26,8 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES
 from morphgen.rl.scores.episode_table import EPISODES, name_of, read_table
-from morphgen.rl.scores.leaderboard import relative_scores
 from morphgen.rl.scores.score_tables import ResultRow, result_rows
-from morphgen.rl.scores.scores import Interval, success_interval
+from morphgen.rl.scores.scores import Interval, relative_scores, success_interval
 from morphgen.rl.scores.submission import Submission
 
 ROOT = Path(__file__).resolve().parent.parent

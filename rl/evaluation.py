@@ -22,7 +22,14 @@ from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files
-from morphgen.rl.scores.scores import Interval, Score, episode_interval, success_interval
+from morphgen.rl.scores.scores import (
+    Interval,
+    RobotOutcomes,
+    Score,
+    episode_interval,
+    relative_scores,
+    success_interval,
+)
 from morphgen.rl.shipped_policies import name_of
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
@@ -36,15 +43,6 @@ EVAL_SEED_OFFSET = 0x5C0_4E5
 
 MakeController = Callable[[], Controller]
 """Function that returns a new controller."""
-Record = Callable[[EnvSpec, Side, Sequence[Episode], Sequence[Episode]], None]
-"""Callback with the specification of a robot, its side, its episodes, and those of the random
-policy, which begin alike."""
-
-
-def no_record(
-    spec: EnvSpec, side: Side, episodes: Sequence[Episode], random_episodes: Sequence[Episode]
-) -> None:
-    """Ignore the episodes."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +59,6 @@ class EvalConfig:
     """Number of PyBullet processes, or of MuJoCo threads; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of tasks; other tasks have their defaults."""
-
-    def as_data(self) -> dict[str, Any]:
-        """Return JSON values, with the config of each task under its name."""
-        data = asdict(self)
-        del data["tasks"]
-        return data | GoalConfig(tasks=self.tasks).as_data()
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -85,18 +77,12 @@ def episodes_for(steps: int, longest: int) -> int:
 
 
 def evaluate_run(
-    path: Path,
-    side: Side,
-    config: EvalConfig,
-    mode: Mode,
-    *,
-    device: str = "cpu",
-    record: Record = no_record,
+    path: Path, side: Side, config: EvalConfig, mode: Mode, *, device: str = "cpu"
 ) -> list[Score]:
     """Evaluate a run on the robots of a side of its split, or on its one robot."""
     files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(files, source, config, mode, device=device, record=record)
+    return evaluate_checkpoints(files, source, config, mode, device=device)
 
 
 def evaluate_checkpoints(
@@ -106,7 +92,6 @@ def evaluate_checkpoints(
     mode: Mode,
     *,
     device: str = "cpu",
-    record: Record = no_record,
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 
@@ -115,15 +100,20 @@ def evaluate_checkpoints(
     means over the episodes of all policies.
     """
     trained = [read_checkpoint(path) for path in paths]
-    sources = [run.source for run, _ in trained]
-    if all(trained_on.member for trained_on in sources) and _is_member(sources[0], source):
+
+    def make(learner: dict[str, Any]) -> Controller:
+        return PolicyController(Policy(learner, mode, config.seed, device))
+
+    controllers = [partial(make, learner) for _, learner in trained]
+    runs = [run for run, _ in trained]
+    if all(run.source.member for run in runs) and _is_member(runs[0].source, source):
         scores: list[Score] = []
-        for policy, trained_on in zip(trained, sources, strict=True):
-            robot = replace(source, member=trained_on.member)
-            scores += _evaluate_together([policy], robot, config, mode, device, record)
+        for run, controller in zip(runs, controllers, strict=True):
+            robot = replace(source, member=run.source.member)
+            scores += evaluate([controller], robot, config, run.interface)
         return scores
-    _require_same_interface(paths, [run for run, _ in trained])
-    return _evaluate_together(trained, source, config, mode, device, record)
+    _require_same_interface(paths, runs)
+    return evaluate(controllers, source, config, runs[0].interface)
 
 
 def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: str) -> None:
@@ -156,42 +146,11 @@ def _is_member(robot: RobotSource, side: RobotSource) -> bool:
     return members(replace(robot, member=None)) == members(side)
 
 
-def _evaluate_together(
-    trained: Sequence[tuple[RunConfig, dict[str, Any]]],
-    source: RobotSource,
-    config: EvalConfig,
-    mode: Mode,
-    device: str,
-    record: Record,
-) -> list[Score]:
-    """Evaluate policies on the same robots; scores are means over the episodes of all policies."""
-
-    def make(learner: dict[str, Any]) -> Controller:
-        return PolicyController(Policy(learner, mode, config.seed, device))
-
-    controllers = [partial(make, learner) for _, learner in trained]
-    interface = trained[0][0].interface
-    return evaluate(controllers, source, config, interface, record=record)
-
-
-def evaluate_baseline(
-    name: str,
-    source: RobotSource,
-    config: EvalConfig,
-    *,
-    record: Record = no_record,
-) -> list[Score]:
+def evaluate_baseline(name: str, source: RobotSource, config: EvalConfig) -> list[Score]:
     """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out."""
     baseline = BASELINES[name]
     make = partial(baseline.make, config.seed)
-    return evaluate(
-        [make],
-        source,
-        config,
-        Interface(),
-        tasks=baseline.tasks,
-        record=record,
-    )
+    return evaluate([make], source, config, Interface(), tasks=baseline.tasks)
 
 
 def evaluate(
@@ -200,14 +159,12 @@ def evaluate(
     config: EvalConfig,
     interface: Interface,
     *,
-    tasks: Sequence[str] | None = None,
-    record: Record = no_record,
+    tasks: tuple[str, ...] | None = None,
 ) -> list[Score]:
     """Return the scores of the robots of a source, in order.
 
     Scores may be relative to the random policy; its episodes have the same starts and goals.
     """
-    tasks = None if tasks is None else tuple(tasks)
     specs = _specs(source, config, tasks)
     if not specs and tasks is not None:
         raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
@@ -220,11 +177,11 @@ def evaluate(
         for robot_episodes, new in zip(episodes, new_episodes, strict=True):
             robot_episodes.extend(new)
     random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
-    scores: list[Score] = []
-    for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True):
-        record(spec, source.side, own, of_random)
-        scores.append(_score(spec, source.side, own, of_random))
-    return scores
+    hashes = {member.name: member.robot_hash for member in members(source)}
+    return [
+        _score(spec, source.side, hashes.get(spec.robot.name, source.robot_hash), own, of_random)
+        for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True)
+    ]
 
 
 @show_progress(None)  # goal sets are not episodes
@@ -291,33 +248,49 @@ def _run_all(
 
 
 def _score(
-    spec: EnvSpec, side: Side, episodes: Sequence[Episode], random_episodes: Sequence[Episode]
+    spec: EnvSpec,
+    side: Side,
+    robot_hash: str,
+    episodes: Sequence[Episode],
+    random_episodes: Sequence[Episode],
 ) -> Score:
     """Return the score of a robot from its episodes and those of the random policy."""
-    raw = np.array([episode.score for episode in episodes])
-    random_raw = np.array([episode.score for episode in random_episodes])
-    task = TASKS[spec.task]
-    relative = raw - np.resize(random_raw, len(raw)) if task.relative_to_random else raw
-    successes = np.array([episode.success for episode in episodes])
-    interval = episode_interval([relative], [successes], relative=task.relative_to_random)
-    distance = float(np.mean([episode.distance for episode in episodes]))
+    outcomes = RobotOutcomes(
+        robot=spec.robot.name,
+        side=side,
+        task=spec.task,
+        body=robot_hash,
+        goal_set=spec.goals.key,
+        success=tuple(each.success for each in episodes),
+        score=tuple(each.score for each in episodes),
+        distance=tuple(each.distance for each in episodes),
+        steps=tuple(each.steps for each in episodes),
+        diverged=tuple(each.unstable for each in episodes),
+        random_score=tuple(each.score for each in random_episodes),
+        random_success=tuple(each.success for each in random_episodes),
+    )
+    task, distance = TASKS[spec.task], float(np.mean(outcomes.distance))
+    interval = episode_interval(
+        [relative_scores(outcomes)], [outcomes.success], relative=task.relative_to_random
+    )
     return Score(
         robot=spec.robot.name,
         side=side,
         task=spec.task,
         episodes=len(episodes),
-        steps=sum(episode.steps for episode in episodes),
+        steps=sum(outcomes.steps),
         score=interval.value,
         low=interval.low,
         high=interval.high,
-        raw=float(raw.mean()),
-        random=float(random_raw.mean()),
-        success=float(successes.mean()),
-        random_success=float(np.mean([episode.success for episode in random_episodes])),
+        raw=float(np.mean(outcomes.score)),
+        random=float(np.mean(outcomes.random_score)),
+        success=float(np.mean(outcomes.success)),
+        random_success=float(np.mean(outcomes.random_success)),
         distance=distance,
         relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
-        unstable=sum(episode.unstable for episode in episodes),
+        unstable=sum(outcomes.diverged),
         angle=float(np.mean([episode.angle for episode in episodes])),
+        outcomes=outcomes,
     )
 
 
@@ -348,32 +321,24 @@ class ZeroShotResult:
 
 
 def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> list[ZeroShotResult]:
-    """Run a policy on a robot, and the controllers that do not learn.
+    """Run a policy on a robot, and the controllers that do not learn, but for zero actions.
 
     All of them have the same starts and goals.
     """
-    task, name = str(source.task), name_of(policy)
+    name = name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)
     (score,) = evaluate_checkpoints([policy], source, config, "deterministic")
-    scores = [(name, score)]
-    for baseline in compared_with(task):
-        (score,) = evaluate_baseline(baseline, source, config)
-        scores.append((baseline, score))
-    return [result_of(controller, score) for controller, score in scores]
-
-
-def compared_with(task: str) -> tuple[str, ...]:
-    """Return the baselines of a task that a policy is compared with: all but zero actions."""
-    return tuple(name for name in baselines_for(task) if name != ZERO.name)
+    results = [result_of(name, score)]
+    for baseline in baselines_for(str(source.task)):
+        if baseline != ZERO.name:
+            (score,) = evaluate_baseline(baseline, source, config)
+            results.append(result_of(baseline, score))
+    return results
 
 
 def result_of(controller: str, score: Score) -> ZeroShotResult:
     """Return the result of a controller from its score on a robot."""
+    success = success_interval(score.success, score.episodes)
     return ZeroShotResult(
-        controller,
-        score.episodes,
-        success_interval(score.success, score.episodes),
-        score.distance,
-        score.angle,
-        score.score,
+        controller, score.episodes, success, score.distance, score.angle, score.score
     )

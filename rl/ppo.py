@@ -67,11 +67,7 @@ def gae(
 def normalized_advantages(
     advantages: torch.Tensor, robots: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Return advantages with mean 0 and standard deviation 1, over all or robot by robot.
-
-    advantages: Advantages, shape (T, n).
-    robots: Robot of each advantage, shape (T, n), int64; None to normalize over all of them.
-    """
+    """Return advantages (T, n) with mean 0 and deviation 1, over all or by robot (T, n)."""
     if robots is None:
         return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     index, values = robots.flatten(), advantages.flatten()
@@ -124,10 +120,7 @@ FINETUNING_ACTOR_LR_SCALE = 0.1
 
 
 def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
-    """Return the factor on the actor's learning rate in the next update.
-
-    kl: Mean divergence of the last update's gradient steps [nats].
-    """
+    """Return the factor on the actor's learning rate after an update of a divergence [nats]."""
     if not config.desired_kl:
         return 1.0
     if kl > config.desired_kl:
@@ -147,11 +140,7 @@ class FinalObservations:
         self._truncated: list[torch.Tensor] = []
 
     def add(self, observation: Observation, truncated: torch.Tensor) -> None:
-        """Add a step.
-
-        observation: Observation after the action, tensors (n, ...), which are copied.
-        truncated: Whether the episode was truncated, shape (n,), bool.
-        """
+        """Copy the observation after a step (n, ...), and whether it was truncated, (n,), bool."""
         reads = is_host(truncated.device)
         self._observations.append(
             {n: value[truncated] if reads else value.clone() for n, value in observation.items()}
@@ -400,9 +389,7 @@ class Learner:
         """Return rewards and scores of the rollout, and counts of the episodes that ended in it.
 
         Of each robot they are the sum of its environments' mean scores, and their number: see
-        ``merged_metrics``.
-
-        terms: Mean of each reward term, shape ().
+        ``merged_metrics``. Terms are the means of the reward's terms, shape ().
         """
         ended = self.terminated | self.truncated
         num_ended = ended.sum()
@@ -520,9 +507,7 @@ class Learner:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the loss of a minibatch, shape (), and its ``LOSS_METRICS``, shape (5,).
 
-        observations: Observations, tensors (m, ...).
-        minibatch: Actions, log-probabilities, advantages, returns and robots, tensors (m, ...).
-        robot_weights: Weight of each robot's transitions, shape (R,).
+        Observations and the other facts of the transitions have the shape (m, ...), weights (R,).
         """
         head = self.actor.distribution(observations)
         log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]

@@ -16,8 +16,6 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
 
 STEPS_UNREAD = 32
 """Number of control steps after which the results on a GPU are read."""
-_NUMBERS = ("success", "distance", "total", "last", "steps", "diverged", "angle")
-"""Numbers that are recorded of an episode."""
 
 
 class Controller(Protocol):
@@ -55,16 +53,8 @@ class Episode:
 
 
 @one_torch_thread()
-def run_episodes(
-    batch: TaskBatch,
-    controller: Controller,
-    count: int,
-) -> list[Episode]:
-    """Return the first episodes of every environment, the same number of each.
-
-    Returns:
-        Episodes, ordered by environment and then by time.
-    """
+def run_episodes(batch: TaskBatch, controller: Controller, count: int) -> list[Episode]:
+    """Return the first ``count`` episodes of every environment, by environment and then by time."""
     batch.reset()
     n = batch.num_envs
     results = _Results(n, count, batch.device)
@@ -86,17 +76,16 @@ def run_episodes(
 class _Results:
     """Results of the first episodes of every environment, on the device of the batch.
 
-    Attributes:
-        finished: Number of episodes that ended, shape (n,), int64.
-        steps: Control steps of the running episodes, shape (n,), int64.
+    ``finished`` is the number of episodes that ended, ``steps`` that of the control steps of the
+    running ones, both (n,), int64.
     """
 
     def __init__(self, n: int, count: int, device: torch.device) -> None:
         """Prepare to record ``count`` episodes of each of n environments."""
-        self.finished = torch.zeros(n, dtype=torch.int64, device=device)
-        self.steps = torch.zeros_like(self.finished)
+        self.finished, self.steps = torch.zeros(2, n, dtype=torch.int64, device=device)
         self._total = torch.zeros(n, device=device)
-        self._numbers = torch.zeros(n, count, len(_NUMBERS), dtype=torch.float64, device=device)
+        # Success, distance, total and last score, steps, divergence and angle of each episode.
+        self._numbers = torch.zeros(n, count, 7, dtype=torch.float64, device=device)
         self._rows = torch.arange(n, device=device)
 
     def add(self, step: Step) -> None:
@@ -107,18 +96,12 @@ class _Results:
         if is_host(ended.device) and not ended.any():
             return
         angle = torch.full_like(step.score, math.nan) if step.angle is None else step.angle
-        values = (
-            step.success,
-            step.distance,
-            self._total,
-            step.score,
-            self.steps,
-            step.diverged,
-            angle,
-        )
+        scores = (self._total, step.score)
+        values = (step.success, step.distance, *scores, self.steps, step.diverged, angle)
         numbers = torch.stack([value.double() for value in values], dim=1)
         count = self._numbers.shape[1]
         column = self.finished.clamp(max=count - 1)
+        # Without a boolean index, which would wait for a GPU.
         is_new = (ended & (self.finished < count))[:, None]
         old = self._numbers[self._rows, column]
         self._numbers[self._rows, column] = torch.where(is_new, numbers, old)
@@ -128,22 +111,13 @@ class _Results:
 
     def episodes(self, batch: TaskBatch) -> list[Episode]:
         """Return the episodes, ordered by environment and then by time."""
-        robots = batch.env_robot_index.tolist()
         episodes = []
-        for env, rows in enumerate(self._numbers.tolist()):
-            task = TASKS[batch.specs[robots[env]].task]
-            for success, distance, total, last, steps, diverged, angle in rows:
+        for env, robot in enumerate(batch.env_robot_index.tolist()):
+            task = TASKS[batch.specs[robot].task]
+            for success, distance, total, last, steps, diverged, angle in self._numbers[
+                env
+            ].tolist():
                 score = task.episode_score(total, last, int(steps))
-                episodes.append(
-                    Episode(
-                        env,
-                        robots[env],
-                        bool(success),
-                        distance,
-                        score,
-                        int(steps),
-                        bool(diverged),
-                        angle,
-                    )
-                )
+                facts = bool(success), distance, score, int(steps), bool(diverged), angle
+                episodes.append(Episode(env, robot, *facts))
         return episodes

@@ -25,41 +25,24 @@ class ShippedPolicy:
     """Tasks that the policy is for."""
 
 
-_FOLDER = Path(__file__).resolve().parent / "checkpoints"
-ZERO_SHOT = ShippedPolicy("zero-shot", _FOLDER / "reach" / "checkpoint.pt", ("reach",))
-"""The policy of ``morphgen zeroshot``: it reaches with any robot."""
-ZERO_SHOT_OBSTACLES = ShippedPolicy(
-    "zero-shot-obstacles", _FOLDER / "reach-obstacles" / "checkpoint.pt", ("reach",)
-)
-"""The policy of ``morphgen zeroshot --obstacles``: it reaches among three boxes."""
-ZERO_SHOT_POSE = ShippedPolicy("zero-shot-pose", _FOLDER / "pose" / "checkpoint.pt", ("reach",))
-"""The policy of ``morphgen zeroshot --goal pose``: it reaches poses."""
-ZERO_SHOT_POSE_OBSTACLES = ShippedPolicy(
-    "zero-shot-pose-obstacles", _FOLDER / "pose-obstacles" / "checkpoint.pt", ("reach",)
-)
-"""The policy of ``morphgen zeroshot --goal pose --obstacles``: it reaches poses among boxes."""
-ZERO_SHOT_PUSH = ShippedPolicy("zero-shot-push", _FOLDER / "push" / "checkpoint.pt", ("push",))
-"""The policy of ``morphgen zeroshot --task push``: it pushes with any robot."""
+def _shipped(name: str, folder: str, task: str = "reach") -> ShippedPolicy:
+    file = Path(__file__).resolve().parent / "checkpoints" / folder / "checkpoint.pt"
+    return ShippedPolicy(name, file, (task,))
 
+
+_ZERO_SHOT = {
+    ("reach", "position", False): _shipped("zero-shot", "reach"),
+    ("reach", "position", True): _shipped("zero-shot-obstacles", "reach-obstacles"),
+    ("reach", "pose", False): _shipped("zero-shot-pose", "pose"),
+    ("reach", "pose", True): _shipped("zero-shot-pose-obstacles", "pose-obstacles"),
+    ("push", "position", False): _shipped("zero-shot-push", "push", "push"),
+}
+"""Policies of ``morphgen zeroshot`` for any robot, by task, goal and whether there are obstacles.
+"""
 POLICIES: Registry[ShippedPolicy] = Registry(
-    "policy",
-    "morphgen.policies",
-    {
-        "zero-shot": f"{__name__}:ZERO_SHOT",
-        "zero-shot-obstacles": f"{__name__}:ZERO_SHOT_OBSTACLES",
-        "zero-shot-pose": f"{__name__}:ZERO_SHOT_POSE",
-        "zero-shot-pose-obstacles": f"{__name__}:ZERO_SHOT_POSE_OBSTACLES",
-        "zero-shot-push": f"{__name__}:ZERO_SHOT_PUSH",
-    },
+    "policy", "morphgen.policies", {each.name: each for each in _ZERO_SHOT.values()}
 )
 """Shipped policies by name."""
-_ZERO_SHOT = {
-    ("reach", "position", False): ZERO_SHOT,
-    ("reach", "position", True): ZERO_SHOT_OBSTACLES,
-    ("reach", "pose", False): ZERO_SHOT_POSE,
-    ("reach", "pose", True): ZERO_SHOT_POSE_OBSTACLES,
-    ("push", "position", False): ZERO_SHOT_PUSH,
-}
 
 
 def zero_shot_policy(task: str, goal: str, *, obstacles: bool) -> ShippedPolicy:

@@ -57,7 +57,7 @@ class Registry(Generic[T]):
         self,
         kind: str,
         group: str,
-        builtin: Mapping[str, str],
+        builtin: Mapping[str, str | T],
         require: Callable[[T], None] = lambda item: None,
     ) -> None:
         """Create a registry.
@@ -65,7 +65,7 @@ class Registry(Generic[T]):
         Args:
             kind: Noun for the objects in messages.
             group: Entry point group of other packages.
-            builtin: Locations of morphgen's own objects by name, as ``module:attribute``.
+            builtin: Morphgen's own objects by name, or their locations as ``module:attribute``.
             require: Raises a ``TaskError`` for an object of others that lacks something.
         """
         self.kind, self.group, self._require = kind, group, require
@@ -120,6 +120,8 @@ class Registry(Generic[T]):
         path = self._builtin.get(name) or self._entry_points.get(name)
         if path is None:
             raise TaskError(f"unknown {self.kind} {name!r}{nearest(name, self)}")
+        if not isinstance(path, str):
+            return path
         module, _, attribute = path.partition(":")
         try:
             item: T = getattr(import_module(module), attribute)

@@ -6,8 +6,9 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
@@ -26,11 +27,10 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
-    from morphgen.rl.evaluation import EvalConfig, Record
+    from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import RobotSource
     from morphgen.rl.scores.scores import Score
-    from morphgen.rl.scores.submission import Training
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
     from morphgen.tasks.task import TaskConfig
 
@@ -50,24 +50,19 @@ def plan_submission(
     args: argparse.Namespace,
     source: RobotSource,
     config: EvalConfig,
-    *,
-    method: str,
-    mode: str = "",
-    training_seed: int | None = None,
-    training: Training | None = None,
-) -> tuple[Record, Callable[[], None]]:
-    """Return the callback for the episodes of robots, and the function that writes them at the end.
+    **facts: Any,  # noqa: ANN401
+) -> Callable[[Iterable[Score]], None]:
+    """Return the function that writes the episodes of scores as a submission.
 
-    Without ``--submission`` both do nothing.
+    Without ``--submission`` it does nothing. ``facts`` are arguments of ``make_submission``.
     """
     from morphgen.formats.files import require_writable_file
-    from morphgen.rl.evaluation import no_record
     from morphgen.rl.runs.robot_source import split_of
-    from morphgen.rl.scores.submission import SubmissionRecorder, require_rules, write_submission
+    from morphgen.rl.scores.submission import make_submission, require_rules, write_submission
     from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
     if args.submission is None:
-        return no_record, lambda: None
+        return lambda scores: None
     if not source.split:
         raise TaskError(f"--submission: {source.name} is no split; name one with --split")
     if args.on == "train":
@@ -78,16 +73,11 @@ def plan_submission(
     goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)
     followed = EvalProtocol(config.sim, config.episodes, config.seed, goals).as_data(split)
     require_rules(followed, rules.as_data(split), "--submission")
-    name = method if args.method is None else args.method
-    record = SubmissionRecorder(split)
-
-    def write() -> None:
-        submission = record.submission(name, mode, training_seed, followed, training)
-        write_submission(args.submission, submission)
-
-    # Refuses an invalid name or seed now, not after hours of episodes.
-    record.submission(name, mode, training_seed, followed)
-    return record, write
+    if args.method is not None:
+        facts["method"] = args.method
+    facts["evaluation"] = followed
+    make_submission(split, (), **facts)  # refuses an invalid name or seed before hours of episodes
+    return lambda scores: write_submission(args.submission, make_submission(split, scores, **facts))
 
 
 @command(
@@ -183,13 +173,13 @@ def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         args.workers,
         _with_goal(default_configs(), sources, args),
     )
-    record, write = plan_submission(args, sources[0], config, method=name)
+    write = plan_submission(args, sources[0], config, method=name, mode="", training_seed=None)
     _prepare(sources, config)
     scores: list[Score] = []
     for source in sources:
         with stage(source.side):
-            scores += evaluate_baseline(name, source, config, record=record)
-    write()
+            scores += evaluate_baseline(name, source, config)
+    write(scores)
     return {name: scores}
 
 
@@ -236,7 +226,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
     sides = _sides(args, has_test=bool(run.source.split))
-    record, write = plan_submission(
+    write = plan_submission(
         args,
         sources[0],
         config,
@@ -255,14 +245,12 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         if given:
             for source in given:
                 with stage(f"{mode} on {source.side}"):
-                    scores += evaluate_checkpoints(
-                        files, source, config, mode, device=args.device, record=record
-                    )
+                    scores += evaluate_checkpoints(files, source, config, mode, device=args.device)
             continue
         for side in sides:
             with stage(f"{mode} on {side}"):
-                scores += evaluate_run(path, side, config, mode, device=args.device, record=record)
-    write()
+                scores += evaluate_run(path, side, config, mode, device=args.device)
+    write(chain.from_iterable(results.values()))  # with --submission of one mode
     return results
 
 

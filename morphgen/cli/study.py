@@ -185,7 +185,7 @@ def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
             outcomes = run_cells(cells, execution, show.training)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
-            outcomes = run_cells_on_ray(args.ray or None, gpus=gpus)(cells, execution)
+            outcomes = run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
         for done, outcome in enumerate(outcomes, 1):
             show.close()
             cell = outcome.cell
@@ -224,7 +224,10 @@ MODES = ("deterministic", "stochastic", "all")
     "difference to jacobian (reach) or scripted (push) in the same episodes, with a 95% bootstrap "
     "interval over the episodes of each robot. Splits that come with morphgen are compared by "
     "their id and the hashes of their robots.",
-    examples=("score results", "score results/reach-30m --markdown"),
+    examples=(
+        "score results/reach-30m",
+        "score results/reach-24m results/graph-ablation --markdown",
+    ),
     extra="rl",
 )
 def score(args: argparse.Namespace) -> None:

@@ -83,14 +83,7 @@ ME_GRAPH = Agent(
 )
 
 AGENTS: Registry[Agent] = Registry(
-    "agent",
-    "morphgen.agents",
-    {
-        "se": f"{__name__}:SE",
-        "me-mlp": f"{__name__}:ME_MLP",
-        "me-tf": f"{__name__}:ME_TF",
-        "me-graph": f"{__name__}:ME_GRAPH",
-    },
+    "agent", "morphgen.agents", {each.name: each for each in (SE, ME_MLP, ME_TF, ME_GRAPH)}
 )
 """Agents by name: ``se`` (single embodiment) learns one robot, ``me-...`` (multi) learn many."""
 

@@ -164,8 +164,7 @@ def _max_pool(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the largest features of points (n, P, 3), as PointNet (Qi et al. 2017).
 
-    Returns:
-        Features (n, 1, features), and whether there is any point (n, 1).
+    They have the shape (n, 1, features); with them is returned whether there is any point, (n, 1).
     """
     features = encode(torch.where(mask[..., None], points, 0.0)).float()
     lowest = torch.finfo(features.dtype).min

@@ -129,10 +129,7 @@ class Network(encoder.Network):
     def _encoded(
         self, observation: Observation, links: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the encoded descriptions and states of joints, both (n, K, features).
-
-        links: Link of each joint, shape (n, K), int64.
-        """
+        """Return encoded descriptions and states of the joints of links (n, K), (n, K, features)."""
         extra = [observation[name][..., None] for name in self.channels]
         extra += [observation[name] for name in self.vectors]
         tokens = observation["tokens"]

@@ -121,12 +121,9 @@ class Block(nn.Module):
 
 
 def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return the attention (Vaswani et al. 2017, equation 1) to the tokens of a mask.
+    """Return the attention (Vaswani et al. 2017, equation 1) to the tokens of a mask (n, T).
 
-    q: Queries, shape (n, heads, T, features of a head).
-    k: Keys, of the same shape.
-    v: Values, of the same shape.
-    mask: Tokens that are attended to, shape (n, T), bool; at least one.
+    Queries, keys and values have the shape (n, heads, T, features of a head); the mask has a token.
     """
     if q.device.type == "cpu":
         return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None])

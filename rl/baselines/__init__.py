@@ -47,13 +47,7 @@ SCRIPTED = Baseline("scripted", "morphgen.rl.baselines.scripted_push:ScriptedPus
 BASELINES: Registry[Baseline] = Registry(
     "baseline",
     "morphgen.baselines",
-    {
-        "random": f"{__name__}:RANDOM",
-        "zero": f"{__name__}:ZERO",
-        "jacobian": f"{__name__}:JACOBIAN",
-        "ik": f"{__name__}:IK",
-        "scripted": f"{__name__}:SCRIPTED",
-    },
+    {each.name: each for each in (RANDOM, ZERO, JACOBIAN, IK, SCRIPTED)},
 )
 """Baselines by name; those that solve a task come last."""
 

@@ -79,8 +79,7 @@ class Tree:
     def extend(self, near: int, q: Array) -> int | None:
         """Add a node on the line from the node ``near`` to q, as far as the line is free.
 
-        Returns:
-            Index of the new node; None if the free part is shorter than ``MIN_EDGE``.
+        Returns its index, or None if the free part is shorter than ``MIN_EDGE``.
         """
         origin = self.nodes[near]
         length = float((np.abs(q - origin) / self._step).max())
@@ -117,18 +116,12 @@ def rrt_connect(
     rng: np.random.Generator,
     iterations: int = ITERATIONS,
 ) -> tuple[list[Array] | None, Tree]:
-    """Grow a tree from the start and one from the goals until they meet.
+    """Grow a tree from the start (dof,) and one from the goals (n, dof) until they meet.
 
-    RRT-Connect (Kuffner and LaValle 2000). Without goals, the tree of the start grows alone.
-
-    start: Configuration, shape (dof,).
-    goals: Configurations, shape (n, dof); n may be 0.
-    limits: Limits of the joints, shape (dof, 2).
-    step: Largest change of every joint in a control step, shape (dof,).
-
-    Returns:
-        Waypoints from the start to a goal, None if the trees did not meet; and the tree of the
-        start, whose nodes can all be reached.
+    RRT-Connect (Kuffner and LaValle 2000) between joint limits (dof, 2). Without goals, the tree of
+    the start grows alone. Its lengths count the largest steps of the joints, (dof,). Returns
+    waypoints from the start to a goal, None if the trees did not meet; and the tree of the start,
+    whose nodes can all be reached.
     """
     start_tree = Tree(start[None], step, free_fraction)
     growing, other = start_tree, Tree(goals, step, free_fraction)
@@ -165,11 +158,7 @@ class PathPlanner:
     def __init__(
         self, space: FreeSpace, step: Array, seed: int, movable: NDArray[np.bool_] | None = None
     ) -> None:
-        """Set up the planner.
-
-        step: Largest change of every joint in a control step, shape (dof,).
-        movable: Joints that a path may move, shape (dof,); by default all.
-        """
+        """Set up the planner with the largest steps of the joints, and which may move, (dof,)."""
         self.space, self._step, self._seed = space, step, seed
         self._limits = joint_limits(space.scene.robot)
         self._movable = np.ones(len(step), dtype=np.bool_) if movable is None else movable
@@ -193,15 +182,10 @@ class PathPlanner:
         block: Array | None = None,
         tree: Tree | None = None,
     ) -> Path | None:
-        """Return the cheapest free path that goes straight to a goal, or by way of its via.
+        """Return the cheapest free path straight to a goal, or by way of its via; None if none is.
 
-        start: Configuration, shape (dof,).
-        goals: Configurations, shape (n, dof).
-        vias: A configuration from which each goal may be approached, shape (n, dof).
-        block: Pose of the block, shape (7,); None for a scene without block.
-
-        Returns:
-            None if no path is free.
+        Start (dof,), goals (n, dof) and vias (n, dof) are configurations; the block has a pose (7,)
+        if the scene has one.
         """
         free_fraction = partial(self.space.free_fraction, block=block)
         cost = cost or PathCost(np.zeros(len(goals)), np.full(len(goals), np.inf))
@@ -237,14 +221,9 @@ class PathPlanner:
         attempt: int = 0,
         iterations: int = ITERATIONS,
     ) -> tuple[Path | None, Tree]:
-        """Plan by RRT-Connect to any of several goals; see ``rrt_connect``.
+        """Plan by RRT-Connect from a start (dof,) to any of n goals (n, dof); n may be 0.
 
-        start: Configuration, shape (dof,).
-        goals: Configurations, shape (n, dof); n may be 0.
-        block: Pose of the block, shape (7,); None for a scene without block.
-
-        Returns:
-            The shortened path, None if the search failed; and the tree of the start.
+        Returns the shortened path, None if the search failed; and the tree of the start.
         """
         free_fraction = partial(self.space.free_fraction, block=block)
         rng = np.random.default_rng([self._seed, attempt])
@@ -294,10 +273,9 @@ class PathFollower:
 
 
 def fractions_towards(task: TaskBatch, targets: torch.Tensor) -> torch.Tensor:
-    """Return actions that move the joint targets in a straight line to others (n, J).
+    """Return actions (n, L) that move the joint targets in a straight line to others (n, J).
 
-    Returns:
-        Fractions of the joints' largest steps by link, shape (n, L): all joints arrive together.
+    They are fractions of the joints' largest steps, such that all joints arrive together.
     """
     step = task.robot_tables.max_step[task.env_robot_index]
     change = targets - task.targets

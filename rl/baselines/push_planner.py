@@ -122,12 +122,7 @@ class ToolKinematics:
         return T[:, :3, 3], T[:, :3, :3]
 
     def move_towards(self, q: Array, position: Array, rotation: Array, iterations: int) -> Array:
-        """Return configurations after some iterations of ``pose_ik_step``, shape (n, dof).
-
-        q: Configurations to start from, shape (n, dof).
-        position: Goal positions of the tool, shape (n, 3) [m].
-        rotation: Goal rotations of the tool, shape (n, 3, 3).
-        """
+        """Return q (n, dof) after iterations of ``pose_ik_step`` to poses (n, 3), (n, 3, 3)."""
         robots, rows = self._rows(q)
         goals = torch.from_numpy(position).to(rows)
         rotations = torch.from_numpy(rotation).to(rows)
@@ -180,13 +175,9 @@ class PushPlanner:
     def plan(
         self, q: Array, block: Array, attempt: int = 0, steps_left: float = np.inf
     ) -> Plan | None:
-        """Return the cheapest plan of a push.
+        """Return the cheapest plan to push a block (7,) from a configuration (dof,).
 
-        q: Configuration of the robot, shape (dof,).
-        block: Pose of the block, shape (7,).
-
-        Returns:
-            None if there is no plan, or too little time to push the block across the line.
+        It is None if there is no plan, or too little time to push the block across the line.
         """
         if steps_left < (self._line - block[1]) / SPEED:
             return None
@@ -222,10 +213,7 @@ class PushPlanner:
         steps_left: float,
         tree: Tree | None = None,
     ) -> tuple[float, Path, _Candidates] | None:
-        """Return cost, path and candidates of the cheapest path; None if no path is free.
-
-        The index of the path's goal is that of its candidate; see ``PathPlanner.plan_straight``.
-        """
+        """Return cost, path and candidates of the cheapest path to a candidate; None if none is."""
         cost = PathCost(candidates.cost, steps_left - candidates.steps)
         if tree is None:
             order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")
@@ -259,11 +247,9 @@ class PushPlanner:
     def _behind(
         self, q: Array, tools: Array, block: Array, also: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Return starts of inverse kinematics (n, dof) and goals of the tool behind the block.
+        """Return starts of inverse kinematics (n, dof) and goals behind the block (n, 3).
 
-        q: Configurations to choose from, shape (k, dof).
-        tools: Positions of their tools, shape (k, 3) [m].
-        block: Pose of the block, shape (7,).
+        Starts are those of k configurations q whose tools (k, 3) are near, and the rows ``also``.
         """
         edge, yaw = self._edge, 2 * np.arctan2(block[6], block[3])
         hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
@@ -279,12 +265,7 @@ class PushPlanner:
         return np.concatenate(starts), np.concatenate(goals)
 
     def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
-        """Return collision-free solutions of inverse kinematics, shape (k, dof), k <= n.
-
-        starts: Configurations to start from, shape (n, dof).
-        goals: Positions of the tool, shape (n, 3) [m].
-        block: Pose of the block, shape (7,).
-        """
+        """Return the collision-free solutions (k, dof) for goals of the tool (n, 3), k <= n."""
         q, error = solve_position_ik(self._robot, starts, goals)
         solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
         q = q[solved & (np.abs(error[:, 2]) < self._edge / 2)]
@@ -306,13 +287,10 @@ class PushPlanner:
     def _simulate(
         self, contacts: PreContact, position: Array, rotation: Array, offset: Array, block: Array
     ) -> tuple[Array, Array]:
-        """Simulate the pushes by kinematics, without dynamics.
+        """Simulate pushes without dynamics; return their successful fractions and overhangs, (n,).
 
         At each point the arm must be free of collisions, and stay in contact: it must touch a block
         slightly nearer than the pushed one, and not touch one slightly farther.
-
-        Returns:
-            Fraction of each push that succeeds, and the largest overhang, each (n,).
         """
         edge, q = self._edge, contacts.q
         length = contacts.gap + self._line - block[1] + 0.1 * edge
@@ -398,12 +376,7 @@ class PreContact:
 
 
 def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
-    """Return those configurations that touch the block if they move along y.
-
-    q: Configurations free of the block, shape (n, dof).
-    block: Pose of the block, shape (7,).
-    edge: Edge length of the block [m].
-    """
+    """Return those configurations (n, dof), free of the block (7,), that touch it along y."""
     gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
     touching = np.isfinite(gap)
     q, gap = q[touching], gap[touching]
@@ -419,16 +392,9 @@ def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreC
 def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
     """Return the overhang of a robot over the block that it touches if it moves along y.
 
-    The overhang is the lead along y with which the robot touches the block above its middle before
-    it touches it below, from 0 to 1 edges. With overhang, a push presses the block to the ground or
-    tips it over.
-
-    q: Configurations free of the block, shape (n, dof).
-    blocks: Pose of the block for each of them, shape (n, 7).
-    edge: Edge length of the block [m].
-
-    Returns:
-        Overhangs, shape (n,) [edges].
+    It is the lead along y with which the robot touches the block (n, 7) above its middle before it
+    touches it below, shape (n,), 0 to 1 edges. With overhang, a push presses the block to the
+    ground or tips it over. The configurations (n, dof) are free of the block.
     """
     below, above = (
         np.minimum(_gaps(space, q, blocks, edge, dz * edge), SHIFTS[-1] * edge)
@@ -440,12 +406,9 @@ def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
 def touches(
     space: FreeSpace, q: Array, block: Array, dx: Array, dy: Array, dz: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Return whether configurations touch the shifted block, shape (n, k).
+    """Return whether configurations (n, dof) touch the shifted block, (7,) or (n, 7), shape (n, k).
 
-    q: Configurations, shape (n, dof).
-    block: Pose of the block, shape (7,), or one for each configuration, (n, 7).
-    dx: Shifts along x, of a shape that broadcasts to (n, k) [m].
-    dz: Shift along z [m].
+    ``dx`` and ``dy`` are shifts that broadcast to (n, k), ``dz`` is one for all [m].
     """
     n, k = len(q), max(dx.shape[-1], dy.shape[-1])
     blocks = np.broadcast_to(block.reshape(-1, 1, 7), (n, k, 7)).copy()
@@ -457,10 +420,7 @@ def touches(
 
 
 def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, dz: float) -> Array:
-    """Return distances along y from blocks (n, 7) to the robot, (n,) [m]; inf without contact.
-
-    The blocks are shifted along z by ``dz`` [m].
-    """
+    """Return how far blocks (n, 7), shifted by ``dz``, are along y from the robot; inf if never."""
     shifts, zero = SHIFTS * edge, np.zeros(1)
     touched = touches(space, q, blocks, zero, -shifts, dz)
     first = touched.argmax(axis=1)

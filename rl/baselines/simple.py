@@ -97,12 +97,9 @@ class JacobianColumns:
 
 
 def column_steps(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-    """Return the change of each joint that alone reduces the error most, shape (n, J).
+    """Return the change of each joint that alone reduces the error (n, m) most, shape (n, J).
 
-    It is the projection of the error on the joint's column; 0 for columns below ``MIN_COLUMN``.
-
-    J: Jacobians, shape (n, m, J).
-    error: Task-space errors, shape (n, m).
+    It is the projection on the joint's column of J (n, m, J); 0 for columns below ``MIN_COLUMN``.
     """
     squares = J.square().sum(dim=1)
     steps = (J * error[..., None]).sum(dim=1) / squares.clamp(min=MIN_COLUMN**2)

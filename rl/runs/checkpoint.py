@@ -28,6 +28,7 @@ from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
 from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
+from morphgen.rl.scores.scores import dotted_values
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
@@ -39,13 +40,20 @@ MAX_ROWS = 100_000
 """Largest number of links, obstacles or points of an observation, and of numbers of a token."""
 
 
+class _Optimiser(Record, frozen=True):
+    """The state of Adam, by the number of the parameter."""
+
+    state: dict[int, dict[str, Any]]
+    param_groups: list[Any]
+
+
 class _Learner(Record, frozen=True):
     """The state of a learner, as ``training.state_of`` returns it."""
 
     actor: dict[str, Any]
     critic: dict[str, Any]
     target_critic: dict[str, Any]
-    optimiser: dict[str, Any]
+    optimiser: _Optimiser
     generators: dict[str, Any]
     batch: dict[str, Any]
     layout: dict[str, Any]
@@ -68,11 +76,16 @@ def require_learner(learner: object, where: str) -> None:
             actor, critic = make_networks(policy, layout, 0)
     except TaskError as error:
         raise TaskError(f"{where}: {error}") from error
-    _require_network(state.actor, actor.state_dict(), f"{where}: actor")
-    for name, weights in (("critic", state.critic), ("target_critic", state.target_critic)):
-        _require_network(weights, critic.state_dict(), f"{where}: {name}")
+    _require_tensors(state.actor, actor.state_dict(), f"{where}: actor")
+    _require_tensors(state.critic, critic.state_dict(), f"{where}: critic")
+    _require_tensors(state.target_critic, critic.state_dict(), f"{where}: target_critic")
     parameters = [*actor.parameters(), *critic.parameters()]
-    _require_optimiser(state.optimiser, parameters, f"{where}: optimiser")
+    for number, moments in state.optimiser.state.items():
+        if not 0 <= number < len(parameters):
+            raise TaskError(f"{where}: optimiser: state of an unknown parameter {number}")
+        wanted = dict.fromkeys(("exp_avg", "exp_avg_sq"), parameters[number])
+        own = {name: moments[name] for name in moments if name != "step"}  # has no shape
+        _require_tensors(own, wanted, f"{where}: optimiser: parameter {number}")
 
 
 def _layout(stored: Mapping[str, Any], where: str) -> Layout:
@@ -86,9 +99,10 @@ def _layout(stored: Mapping[str, Any], where: str) -> Layout:
     return layout
 
 
-def _require_network(
+def _require_tensors(
     stored: Mapping[str, Any], wanted: Mapping[str, torch.Tensor], where: str
 ) -> None:
+    """Require tensors of the same names, shapes and types as others."""
     for name in wanted:
         if name not in stored:
             raise TaskError(f"{where} has no {name}")
@@ -104,24 +118,6 @@ def _require_network(
                 f"{where}: {name} has shape {actual[0]} of {actual[1]}; expected {expected[0]} of "
                 f"{expected[1]}"
             )
-
-
-def _require_optimiser(
-    stored: dict[str, Any], parameters: list[torch.nn.Parameter], where: str
-) -> None:
-    state, groups = stored.get("state"), stored.get("param_groups")
-    if not isinstance(state, dict) or not isinstance(groups, list):
-        raise TaskError(f"{where} has no state or no param_groups")
-    for number, moments in state.items():
-        if not isinstance(number, int) or not 0 <= number < len(parameters):
-            raise TaskError(f"{where}: state of an unknown parameter {shortened(repr(number))}")
-        if not isinstance(moments, dict):
-            raise TaskError(f"{where}: state {number} is {shortened(repr(moments))}")
-        for name in ("exp_avg", "exp_avg_sq"):
-            moment = moments.get(name)
-            shape = tuple(parameters[number].shape)
-            if not isinstance(moment, torch.Tensor) or tuple(moment.shape) != shape:
-                raise TaskError(f"{where}: {name} of parameter {number} is not of shape {shape}")
 
 
 HASH = "sha256"
@@ -161,21 +157,18 @@ def unpacked(file: Path) -> dict[str, Any]:
         _require_container(file)
         # Mapped, a storage that claims more than its record has cannot reach beyond the file.
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except (
+    except (  # what zipfile and torch 2 raise for damaged files; torch documents none of it
         pickle.UnpicklingError,
         zipfile.BadZipFile,
-        NotImplementedError,
-        OverflowError,
-        RecursionError,
-        RuntimeError,
-        EOFError,
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AttributeError,
+        ArithmeticError,
         AssertionError,
+        AttributeError,
+        EOFError,
+        LookupError,
+        OSError,
+        RuntimeError,
+        TypeError,
+        ValueError,
     ) as error:
         raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
     if not isinstance(data, dict) or HASH not in data:
@@ -418,13 +411,16 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
     A run without a checkpoint is overwritten: it has nothing to continue from.
     """
     require_open(folder, config, resume=resume)
-    path = folder / CONFIG
-    if _has_checkpoint(folder):
-        return
-    data = {"format": FORMAT, "morphgen": version("morphgen"), **config.as_data()}
+    if not _has_checkpoint(folder):
+        data = {"format": FORMAT, "morphgen": version("morphgen"), **config.as_data()}
+        _write(folder / CONFIG, (json.dumps(data, indent=2) + "\n").encode())
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file of a run in place of its last version, in a folder that is made for it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps(data, indent=2) + "\n")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, content)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
@@ -435,7 +431,7 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
     if _has_checkpoint(folder):
         if not resume:
             raise TaskError(f"{folder} has a run: pass --resume to continue it, or another --out")
-        require_same_run(folder, config)
+        require_same_config(read_config(folder), config, str(folder))
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
@@ -501,11 +497,7 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
     """Write the checkpoint of a run, in place of its last one."""
     path = folder / CHECKPOINT
     data = {"format": FORMAT, "run": config.as_data(), "learner": dict(learner)}
-    content = packed(data, f"{path} is not replaced")
-    try:
-        write_atomic(path, content)
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+    _write(path, packed(data, f"{path} is not replaced"))
 
 
 def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
@@ -534,11 +526,6 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
         )
 
 
-def require_same_run(folder: Path, config: RunConfig) -> None:
-    """Require that a folder has a run with this config."""
-    require_same_config(read_config(folder), config, str(folder))
-
-
 def require_same_config(stored: RunConfig, config: RunConfig, where: str) -> None:
     """Require that a stored run has this config."""
     theirs, ours = _flat(stored), _flat(config)
@@ -554,16 +541,7 @@ def require_same_config(stored: RunConfig, config: RunConfig, where: str) -> Non
 def _flat(config: RunConfig) -> dict[str, Any]:
     """Return the entries of a config by dotted name; a run may continue on another GPU."""
     device = config.device.partition(":")[0]
-    return _entries(config.as_data() | {"source": identity(config.source), "device": device})
-
-
-def _entries(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the entries of nested dictionaries by dotted name."""
-    flat: dict[str, Any] = {}
-    for name, value in data.items():
-        nested = isinstance(value, dict) and value
-        flat |= _entries(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return flat
+    return dotted_values(config.as_data() | {"source": identity(config.source), "device": device})
 
 
 def _short(value: object) -> str:

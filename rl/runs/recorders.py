@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.formats.data_files import parse_json, read_text
@@ -22,15 +22,8 @@ from morphgen.rl.scores.scores import finite_or_none
 
 METRICS, EVENTS = "metrics.jsonl", "events"
 
-
-class Recorder(Protocol):
-    """Destination of the metrics of a run."""
-
-    def record(self, report: UpdateMetrics) -> None:
-        """Record the metrics of an update."""
-
-    def close(self) -> None:
-        """Write what is buffered, and close the destination."""
+Recorder = Callable[[UpdateMetrics], None]
+"""Function that records the metrics of an update."""
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -53,75 +46,80 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     return reports
 
 
-class Metrics:
-    """Recorder to ``metrics.jsonl``: a line per update, with null for numbers not finite."""
+@contextmanager
+def recording(
+    folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
+) -> Iterator[Recorder]:
+    """Yield the recorder of a run that continues after an update; it is closed at the end."""
+    with ExitStack() as stack:
+        recorders = [stack.enter_context(_json_lines(folder, update))]
+        if tensorboard:
+            recorders.append(stack.enter_context(_tensorboard(folder, update)))
+        if wandb:
+            recorders.append(stack.enter_context(_weights_and_biases(folder, config)))
 
-    def __init__(self, folder: Path, update: int) -> None:
-        """Open the file to continue after an update; lines of later updates are removed."""
-        kept = [report for report in read_metrics(folder) if report["update"] <= update]
-        path = folder / METRICS
-        write_atomic(path, "".join(json.dumps(report) + "\n" for report in kept))
-        self._file = path.open("a", encoding="utf-8")
+        def record(report: UpdateMetrics) -> None:
+            for each in recorders:
+                each(report)
 
-    def record(self, report: UpdateMetrics) -> None:
-        """Write a line."""
-        with naming(Path(self._file.name)):
-            self._file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
-            self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        yield record
 
 
-class TensorBoard:
-    """Events for ``tensorboard --logdir``."""
+@contextmanager
+def _json_lines(folder: Path, update: int) -> Iterator[Recorder]:
+    """Write a line per update, with null for numbers not finite; remove those of later updates."""
+    kept = [report for report in read_metrics(folder) if report["update"] <= update]
+    path = folder / METRICS
+    write_atomic(path, "".join(json.dumps(report) + "\n" for report in kept))
+    with path.open("a", encoding="utf-8") as file:
 
-    def __init__(self, folder: Path, update: int) -> None:
-        """Continue after an update."""
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise MissingDependencyError(
-                "TensorBoard is not installed: pip install tensorboard, or say --no-tensorboard"
-            ) from error
-        self._writer = SummaryWriter(str(folder / EVENTS), purge_step=update + 1)
+        def record(report: UpdateMetrics) -> None:
+            with naming(path):
+                file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
+                file.flush()  # a killed run keeps its lines
 
-    def record(self, report: UpdateMetrics) -> None:
-        """Write scalars, by update."""
-        for name, value in scalars(report):
-            self._writer.add_scalar(name, value, report.update)
-
-    def close(self) -> None:
-        """Write the remaining events."""
-        self._writer.close()
+        yield record
 
 
-class WeightsAndBiases:
-    """A run of Weights & Biases."""
+@contextmanager
+def _tensorboard(folder: Path, update: int) -> Iterator[Recorder]:
+    """Write events for ``tensorboard --logdir``."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise MissingDependencyError(
+            "TensorBoard is not installed: pip install tensorboard, or say --no-tensorboard"
+        ) from error
+    # Events of later updates, which a killed run has written, are hidden from then on.
+    with closing(SummaryWriter(str(folder / EVENTS), purge_step=update + 1)) as writer:
 
-    def __init__(self, folder: Path, config: RunConfig) -> None:
-        """Begin, or continue the run of this folder."""
-        wandb = require_wandb()
-        try:
-            self._run = wandb.init(
-                project="morphgen",
-                name=str(folder),
-                id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
-                resume="allow",
-                dir=folder,
-                config=config.as_data(),
-            )
-        except wandb.errors.Error as error:
-            raise TaskError(f"--wandb: {error}") from error
+        def record(report: UpdateMetrics) -> None:
+            for name, value in _scalars(report):
+                writer.add_scalar(name, value, report.update)
 
-    def record(self, report: UpdateMetrics) -> None:
-        """Send scalars, by update."""
-        self._run.log(dict(scalars(report)), step=report.update)
+        yield record
 
-    def close(self) -> None:
-        """Finish."""
-        self._run.finish()
+
+@contextmanager
+def _weights_and_biases(folder: Path, config: RunConfig) -> Iterator[Recorder]:
+    """Begin a run of Weights & Biases, or continue that of the folder."""
+    wandb = require_wandb()
+    try:
+        run = wandb.init(
+            project="morphgen",
+            name=str(folder),
+            # The same folder continues the same run; an id has at most 64 characters.
+            id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
+            resume="allow",
+            dir=folder,
+            config=config.as_data(),
+        )
+    except wandb.errors.Error as error:
+        raise TaskError(f"--wandb: {error}") from error
+    try:
+        yield lambda report: run.log(dict(_scalars(report)), step=report.update)
+    finally:
+        run.finish()
 
 
 def require_wandb() -> ModuleType:
@@ -134,24 +132,7 @@ def require_wandb() -> ModuleType:
         ) from error
 
 
-@contextmanager
-def recording(
-    folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
-) -> Iterator[list[Recorder]]:
-    """Open the recorders of a run that continues after an update."""
-    with ExitStack() as stack:
-        kept: list[Recorder] = [Metrics(folder, update)]
-        stack.callback(kept[0].close)
-        if tensorboard:
-            kept.append(TensorBoard(folder, update))
-            stack.callback(kept[-1].close)
-        if wandb:
-            kept.append(WeightsAndBiases(folder, config))
-            stack.callback(kept[-1].close)
-        yield kept
-
-
-def scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:
+def _scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:
     """Yield names and values of a report's numbers; those of robots and terms as ``name/key``."""
     for name, value in asdict(report).items():
         if isinstance(value, Mapping):

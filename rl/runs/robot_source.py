@@ -25,7 +25,7 @@ from morphgen.benchmark.split_file import parse_split, read_split, split_names, 
 from morphgen.benchmark.tokens import LARGEST_MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, nearest
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import write_file
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.library import Library, default_library
@@ -387,10 +387,7 @@ def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
     }
     lines = ",\n".join(f"    {json.dumps(member.as_dict())}" for member in robots.members)
     text = json.dumps(head, indent=2).removesuffix("\n}")
-    try:
-        write_atomic(folder / FILE, f'{text},\n  "drawn": [\n{lines}\n  ]\n}}\n')
-    except OSError as error:
-        raise TaskError(f"cannot write {folder / FILE}: {error.strerror}") from error
+    write_file(folder / FILE, f'{text},\n  "drawn": [\n{lines}\n  ]\n}}\n')
 
 
 def read_drawn(folder: Path) -> tuple[Member, ...]:

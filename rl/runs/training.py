@@ -101,23 +101,18 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
     processes = len(state["generators"]["actions"])
     run = {"updates": state["updates"], "device": state["device"], "processes": processes}
     _require_same({**stored, **run}, ours)
-    _resume_batch(learner, state["batch"])
+    n, rank, batch = learner.batch.num_envs, learner.processes.rank, state["batch"]
+    if processes > 1:  # a checkpoint has the environments of all processes, one after another
+        own = slice(rank * n, (rank + 1) * n)
+        batch = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
+    learner.batch.load_state_dict(batch)
     for name, network in _networks(learner).items():
         network.load_state_dict(state[name])
     learner.optimiser.load_state_dict(state["optimiser"])
     for name, generator in learner.generators.items():
-        generator.set_state(state["generators"][name][learner.processes.rank].cpu())
+        generator.set_state(state["generators"][name][rank].cpu())
     learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
     learner.restart_episodes()
-
-
-def _resume_batch(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Restore the part of the state of all environments that belongs to this process."""
-    n, processes = learner.batch.num_envs, learner.processes
-    own = slice(processes.rank * n, (processes.rank + 1) * n)
-    if processes.size > 1:
-        state = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in state.items()}
-    learner.batch.load_state_dict(state)
 
 
 def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
@@ -568,23 +563,20 @@ def _learn(
     is_stopped = False
     interval = updates_between(part.config)
     with ExitStack() as stack:
-        recorders: Sequence[Recorder] = ()
+        record: Recorder | None = None
         if execution is not None:
-            recorders = stack.enter_context(
-                recording(
-                    part.folder,
-                    part.config,
-                    learner.update,
-                    tensorboard=execution.tensorboard,
-                    wandb=execution.wandb,
-                )
+            tensorboard, wandb = execution.tensorboard, execution.wandb
+            recorders = recording(
+                part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
             )
+            record = stack.enter_context(recorders)
+        stop.start_clock()
         while not learner.done and not is_stopped:
             metrics = learner.iterate()
             scores = batches.recorded_scores(metrics.scores, learner.update)
             metrics = replace(metrics, scores=scores)
-            for recorder in recorders:
-                recorder.record(metrics)
+            if record is not None:
+                record(metrics)
             if batches.changes_at(learner.update):
                 use_batch(learner, batches.make(learner.update))
             # A checkpoint has the state of the batch that the run continues with.
@@ -610,16 +602,21 @@ class _StopRequest:
     """
 
     def __init__(self, minutes: int | None) -> None:
-        """Begin to count the minutes, if there is a limit."""
-        self._end = math.inf if minutes is None else time.monotonic() + 60 * minutes
+        self._minutes, self._end = minutes, math.inf
         self._received: list[int] = []
         self._handlers: dict[int, Any] = {}
+
+    def start_clock(self) -> None:
+        """Begin to count the minutes, once: robots and networks that are built do not count."""
+        if self._minutes is not None and math.isinf(self._end):
+            self._end = time.monotonic() + 60 * self._minutes
 
     @property
     def is_requested(self) -> bool:
         return bool(self._received) or time.monotonic() >= self._end
 
     def __enter__(self) -> Self:
+        # Python sets handlers in the main thread only; a study's Ray tasks may run in another.
         if threading.current_thread() is threading.main_thread():
             handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
             # Workers ignore Ctrl-C; handlers of other languages are unknown, and stay.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -28,13 +28,15 @@ from morphgen.rl.scores.episode_table import EPISODES, name_of, read_submissions
 from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores.scores import (
     Interval,
+    RandomScores,
+    RobotOutcomes,
     episode_interval,
     finite_or_none,
+    relative_scores,
     score_decimals,
     success_interval,
 )
 from morphgen.rl.scores.submission import (
-    RobotOutcomes,
     Submission,
     check_submission,
     read_submission,
@@ -44,11 +46,8 @@ from morphgen.rl.scores.submission import (
 )
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 from morphgen.tasks.registry import TASKS
-from morphgen.typing import Array
 
 Source = Literal["submission", "reference"]
-RandomScores = Mapping[tuple[Side, str], Sequence[float]]
-"""Scores of the random policy's episodes, by side and name of the robot."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +106,8 @@ def score_submission(
 ) -> Row:
     """Compute the scores of a submission that was checked."""
     groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
-    for side in SIDES:
-        for outcomes in submission.robots:
-            if outcomes.side == side:
-                groups.setdefault((side, outcomes.task), []).append(outcomes)
+    for outcomes in sorted(submission.robots, key=lambda robot: SIDES.index(robot.side)):
+        groups.setdefault((outcomes.side, outcomes.task), []).append(outcomes)
     sides = []
     for (side, task), robots in groups.items():
         interval = episode_interval(
@@ -136,25 +133,6 @@ def score_submission(
 def random_scores(submission: Submission) -> RandomScores:
     """Return the scores of the random policy's episodes in a submission."""
     return {(each.side, each.robot): each.random_score for each in submission.robots}
-
-
-def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None) -> Array:
-    """Return the score of each episode, relative to the random policy where the task wants it."""
-    scores = np.array(outcomes.score)
-    if not TASKS[outcomes.task].relative_to_random:
-        return scores
-    if random is None:
-        random = {(outcomes.side, outcomes.robot): outcomes.random_score}
-    if (outcomes.side, outcomes.robot) not in random:
-        raise BenchmarkError(
-            f"{outcomes.side} robot {outcomes.robot}: the release has no episodes of the random "
-            "policy; leave the robots of this side out"
-        )
-    own = np.array(random[outcomes.side, outcomes.robot])
-    if len(scores) % len(own):  # of another run: some episodes would count more often than others
-        own = np.array([own.mean()])
-    relative: Array = scores - np.resize(own, len(scores))
-    return relative
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
@@ -214,9 +192,8 @@ def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def _cells(row: Row, side: SideScore | None, decimals: int) -> list[str]:
     if side is None:
         return ["-", "", ""]
-    # Releases of version 0.3.0 have ends without a width, which say nothing.
-    ends = () if side.low == side.high else (side.low, side.high)
-    interval = " to ".join(f"{end:.{decimals}f}" for end in ends if end is not None)
+    ends = (math.nan if end is None else end for end in (side.low, side.high))
+    interval = Interval(side.score, *ends).ends(f".{decimals}f")
     return [f"{side.score:.{decimals}f}", interval, row.success(side).as_percent()]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,20 +24,20 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.runs.recorders import read_metrics
 from morphgen.rl.runs.training import subruns_of
 from morphgen.rl.scores.episode_table import name_of
-from morphgen.rl.scores.leaderboard import relative_scores
 from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores.scores import (
     UNSTABLE,
     Interval,
+    RobotOutcomes,
     finite_or_none,
     iqm_interval,
+    relative_scores,
     score_decimals,
     stratified_mean_interval,
     success_interval,
 )
 from morphgen.rl.scores.study import Cell, stored_results
 from morphgen.rl.scores.submission import (
-    RobotOutcomes,
     Submission,
     require_comparable,
     require_same_random,
@@ -48,18 +47,6 @@ from morphgen.typing import Array
 TABLE, DATA, CURVES = "table.md", "results.json", "curves.png"
 MISSING = "missing"
 NOTE = "MT: train robots, ZS: test robots; intervals: 95%"
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Training curve of a run, a point per update."""
-
-    timesteps: list[float]
-    """Number of control steps of all environments up to each update."""
-    scores: list[float]
-    """Mean score of the control steps of each update."""
-    complete: bool
-    """Whether all updates of the run have been made."""
 
 
 def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
@@ -104,20 +91,15 @@ def curves(cells: Sequence[Cell]) -> bytes:
             if not runs:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
                 continue
-            steps = max((curve.timesteps for curve in runs), key=len)
-            values = np.full((len(runs), len(steps)), np.nan)
-            for row, curve in zip(values, runs, strict=True):
-                row[: len(curve.scores)] = curve.scores
-            done = sum(curve.complete for curve in runs)
+            steps = max((steps for steps, _, _ in runs), key=len)
+            values = np.full((len(runs), len(steps)), np.nan)  # nan where a seed is not there yet
+            for row, (_, scores, _) in zip(values, runs, strict=True):
+                row[: len(scores)] = scores
+            done = sum(complete for _, _, complete in runs)
             note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
             (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
-            panel.fill_between(
-                steps,
-                np.nanmin(values, axis=0),
-                np.nanmax(values, axis=0),
-                alpha=0.2,
-                color=line.get_color(),
-            )
+            low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+            panel.fill_between(steps, low, high, alpha=0.2, color=line.get_color())
         if panel.lines:
             panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize="small")
     content = io.BytesIO()
@@ -125,8 +107,12 @@ def curves(cells: Sequence[Cell]) -> bytes:
     return content.getvalue()
 
 
-def _curve(cell: Cell) -> Curve | None:
-    """Return the mean training curve of a run's parts; None if there are no metrics yet."""
+def _curve(cell: Cell) -> tuple[list[int], list[float], bool] | None:
+    """Return the mean training curve of a run's parts; None if there are no metrics yet.
+
+    It has the transitions and the mean score of a control step up to and of each update, and
+    whether all updates have been made.
+    """
     assert cell.config is not None
     runs = subruns_of(cell.folder, cell.config)
     parts = [read_metrics(part.folder) for part in runs]
@@ -135,7 +121,7 @@ def _curve(cell: Cell) -> Curve | None:
         return None
     steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
     scores = [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
-    return Curve(steps, scores, all(length == run.config.num_updates for run in runs))
+    return steps, scores, all(length == run.config.num_updates for run in runs)
 
 
 REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
@@ -193,41 +179,28 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
         groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
         for where, each in own.items():
             group = groups.setdefault(_key(each), {})
-            if each.training_seed in group:
-                other = group[each.training_seed][0]
-                raise BenchmarkError(f"{where}: the same run, seed and mode as {other}")
-            group[each.training_seed] = where, each
-        tasks = dict.fromkeys(robot.task for each in own.values() for robot in each.robots)
-        for task in tasks:
-            baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
-            reference = baseline.get(None)
-            for (method, mode, finetuned, transitions, simulator), group in groups.items():
-                runs = [each for _, each in group.values()]
-                sides = dict(_side_results(runs, task, reference[1] if reference else None))
-                if not sides:
-                    continue
-                rows.append(
-                    ResultRow(
-                        split,
-                        task,
-                        method,
-                        mode,
-                        finetuned,
-                        transitions,
-                        simulator,
-                        tuple(sorted(seed for seed in group if seed is not None)),
-                        sides,
-                    )
+            earlier, other = group.setdefault(each.training_seed, (where, each))
+            if each.robots != other.robots:  # several studies may have the same run of a baseline
+                raise BenchmarkError(
+                    f"{where}: the same run, seed and mode as {earlier} with other episodes; name "
+                    "one of the two files"
                 )
+        for task in dict.fromkeys(robot.task for each in own.values() for robot in each.robots):
+            baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
+            _, reference = baseline.get(None, ("", None))
+            for key, group in groups.items():
+                sides = dict(_side_results([run for _, run in group.values()], task, reference))
+                seeds = tuple(sorted(seed for seed in group if seed is not None))
+                if sides:
+                    rows.append(ResultRow(split, task, *key, seeds, sides))
     return rows
 
 
 _Key = tuple[str, str, int, int | None, str]
-"""Method, mode, transitions of fine-tuning and of training, and simulator of the training."""
+"""Fields of a ``ResultRow`` from ``method`` to ``simulator``, which its seeds have in common."""
 
 
 def _key(submission: Submission) -> _Key:
-    """Return what the seeds of one row have in common."""
     training = submission.training
     return (
         submission.method,
@@ -360,14 +333,8 @@ def _line(row: ResultRow, decimals: int) -> list[str]:
             continue
         line += [
             f"{result.mean:.{decimals}f}",
-            _text(result.iqm, f".{decimals}f"),
+            result.iqm.as_text(f".{decimals}f"),
             result.success.as_percent(),
-            "-" if result.difference is None else _text(result.difference, f"+.{decimals}f"),
+            "-" if result.difference is None else result.difference.as_text(f"+.{decimals}f"),
         ]
     return line
-
-
-def _text(interval: Interval, form: str) -> str:
-    if math.isnan(interval.low):
-        return f"{interval.value:{form}}"
-    return f"{interval.value:{form}} ({interval.low:{form}} to {interval.high:{form}})"

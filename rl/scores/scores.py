@@ -7,18 +7,22 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, bootstrap, trim_mean
 from tabulate import tabulate
 
 from morphgen.benchmark.split import Side
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
+from morphgen.formats.records import FiniteNumber, Record
+from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
 
 LEVEL = 0.95
 """Confidence level of the intervals."""
@@ -42,6 +46,15 @@ class Interval:
     low: float
     high: float
 
+    def ends(self, form: str) -> str:
+        """Return the ends as text, such as ``0.64 to 0.95``; nothing if they are not known."""
+        return "" if math.isnan(self.low) else f"{self.low:{form}} to {self.high:{form}}"
+
+    def as_text(self, form: str) -> str:
+        """Return the value and the ends that are known, such as ``0.85 (0.64 to 0.95)``."""
+        ends = self.ends(form)
+        return f"{self.value:{form}} ({ends})" if ends else f"{self.value:{form}}"
+
     def as_percent(self) -> str:
         """Return a rate as text, such as ``85% (64% to 95%)``."""
         ends = (self.low, self.high)
@@ -53,7 +66,7 @@ class Interval:
 def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
     """Return the mean of the strata's means, with a bootstrap that resamples every stratum.
 
-    strata: Independent samples of each stratum, such as the episodes of each robot, shape (k,).
+    A stratum has independent samples, shape (k,), such as the episodes of a robot.
     """
     tables = tuple(_table(samples, 1) for samples in strata)
     mean = float(np.mean([table.mean() for table in tables]))
@@ -73,9 +86,8 @@ def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
     It has a width at 0 and 1, too. It is that of one rate for all strata: strata of different rates
     make it too wide, never too narrow.
 
-    rates: Success rate of each stratum, such as the episodes of a robot and seed, shape (k,);
-        or that of all, a number.
-    trials: Number of trials of each stratum, at least 1, shape (k,) or a number.
+    Rates and numbers of trials, at least 1, are those of the strata, such as the episodes of a
+    robot and seed, shape (k,), or one number for all.
     """
     rates, trials = np.broadcast_arrays(np.asarray(rates, dtype=np.float64), trials)
     mean = float(rates.mean())
@@ -91,10 +103,7 @@ def episode_interval(
     """Return the mean over robots of their mean scores.
 
     Its interval is ``success_interval`` if the score of an episode is its success, as that of push;
-    else ``stratified_mean_interval``.
-
-    scores: Scores of the episodes of each robot, shape (k,).
-    successes: Whether each of these episodes was a success, shape (k,).
+    else ``stratified_mean_interval``. Scores and successes of a robot have the shape (episodes,).
     """
     if not relative and all(map(np.array_equal, scores, successes)):
         tables = [_table(each, 1) for each in successes]
@@ -103,11 +112,9 @@ def episode_interval(
 
 
 def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
-    """Return the interquartile mean of all scores, with a stratified bootstrap over seeds.
+    """Return the interquartile mean of scores (seeds, robots), with a bootstrap over the seeds.
 
     Robots are the strata: every resample has as many scores of each robot as the original.
-
-    scores: Scores of every seed on every robot, shape (seeds, robots).
     """
     table = _table(scores, 2)
     iqm = float(trim_mean(table.ravel(), TRIM))
@@ -154,8 +161,55 @@ def _table(values: ArrayLike, axes: int) -> NDArray[np.float64]:
     return table
 
 
-_SUCCESS_ENDS = ("success_low", "success_high")
-"""Ends of the 95% Wilson interval of ``success``, which follow from the fields of a score."""
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
+
+
+class RobotOutcomes(Record, frozen=True):
+    """The episodes of one robot."""
+
+    robot: Name
+    side: Side
+    task: Name
+    body: Name
+    """Hash of the robot in the split."""
+    goal_set: Name
+    """Key of the robot's goal set: a hash of all that goals and starts follow from."""
+    success: tuple[bool, ...]
+    score: tuple[FiniteNumber, ...]
+    """Score of each episode, not relative to the random policy."""
+    distance: tuple[FiniteNumber, ...]
+    """Distance from success at the end of each episode [m]."""
+    steps: tuple[Count, ...]
+    """Length of each episode [control steps]."""
+    diverged: tuple[bool, ...]
+    """Whether each episode ended because the simulation diverged."""
+    random_score: tuple[FiniteNumber, ...]
+    """Score of each episode of the random policy with the same starts and goals."""
+    random_success: tuple[bool, ...]
+
+
+RandomScores = Mapping[tuple[Side, str], Sequence[float]]
+"""Scores of the random policy's episodes, by side and name of the robot."""
+
+
+def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None) -> Array:
+    """Return the score of each episode, relative to the random policy where the task wants it."""
+    scores = np.array(outcomes.score)
+    if not TASKS[outcomes.task].relative_to_random:
+        return scores
+    if random is None:
+        random = {(outcomes.side, outcomes.robot): outcomes.random_score}
+    if (outcomes.side, outcomes.robot) not in random:
+        raise BenchmarkError(
+            f"{outcomes.side} robot {outcomes.robot}: the release has no episodes of the random "
+            "policy; leave the robots of this side out"
+        )
+    own = np.array(random[outcomes.side, outcomes.robot])
+    if len(scores) % len(own):  # of another run: some episodes would count more often than others
+        own = np.array([own.mean()])
+    relative: Array = scores - np.resize(own, len(scores))
+    return relative
 
 
 @dataclass(frozen=True)
@@ -190,14 +244,18 @@ class Score:
     """Mean distance from success at the end of an episode [m]."""
     relative_distance: float
     """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
-    unstable: int = 0
+    unstable: int
     """Number of episodes that ended because the simulation diverged."""
-    angle: float = math.nan
+    angle: float
     """Mean angle from success at the end of an episode [rad]; nan without orientation."""
+    outcomes: RobotOutcomes = field(repr=False, compare=False)
+    """The episodes, for submissions; tables leave them out."""
 
 
-SCORE_KEYS = (*(field.name for field in fields(Score)), *_SUCCESS_ENDS)
-"""Keys of a score in JSON, and columns of CSV."""
+_FIELDS = tuple(each.name for each in fields(Score) if each.name != "outcomes")
+SCORE_KEYS = (*_FIELDS, "success_low", "success_high")
+"""Keys of a score in JSON, and columns of CSV; the last two are the ends of the 95% Wilson interval
+of ``success``."""
 
 
 def success_of(scores: Sequence[Score]) -> Interval:
@@ -210,8 +268,8 @@ def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:
     table = []
     for score in scores:
         success = success_of([score])
-        ends = dict(zip(_SUCCESS_ENDS, (success.low, success.high), strict=True))
-        table.append(finite_or_none(asdict(score) | ends))
+        row = [*(getattr(score, name) for name in _FIELDS), success.low, success.high]
+        table.append(dict(zip(SCORE_KEYS, finite_or_none(row), strict=True)))
     return table
 
 
@@ -222,6 +280,15 @@ def finite_or_none(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, (tuple, list)):
         return [finite_or_none(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def dotted_values(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values in nested dictionaries by their dotted names."""
+    values: dict[str, Any] = {}
+    for name, value in data.items():
+        is_nested = isinstance(value, dict) and value
+        values |= dotted_values(value, f"{prefix}{name}.") if is_nested else {prefix + name: value}
+    return values
 
 
 def score_decimals(scores: Iterable[float]) -> int:
@@ -291,14 +358,14 @@ def write_scores(path: Path, scores_by_mode: Scores) -> None:
 
 def _row(mode: str, score: Score) -> tuple[str, ...]:
     angle = "" if math.isnan(score.angle) else f", {math.degrees(score.angle):.1f} deg"
-    interval = "" if math.isnan(score.low) else f"{score.low:.2f} to {score.high:.2f}"
+    interval = Interval(score.score, score.low, score.high)
     return (
         score.robot,
         score.side,
         score.task,
         mode,
         f"{score.score:.2f}",
-        interval,
+        interval.ends(".2f"),
         success_of([score]).as_percent(),
         f"{score.raw:.2f}",
         f"{score.random:.2f}",

@@ -22,11 +22,7 @@ from morphgen.processes import ray_cluster, require_ray
 from morphgen.progress import stage
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.evaluation import (
-    EvalConfig,
-    evaluate_baseline,
-    evaluate_run,
-)
+from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_run
 from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
@@ -44,7 +40,8 @@ from morphgen.rl.scores.episode_table import (
     name_of,
     read_table,
 )
-from morphgen.rl.scores.submission import Submission, SubmissionRecorder, Training
+from morphgen.rl.scores.scores import Score
+from morphgen.rl.scores.submission import Submission, Training, make_submission
 from morphgen.tasks.goals.eval_protocol import rules_data
 from morphgen.tasks.registry import evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig
@@ -148,11 +145,8 @@ def stored_results(cell: Cell) -> dict[str, Submission]:
     path = cell.study / EPISODES
     results: dict[str, Submission] = {}
     for each in read_table(path) if path.is_file() else ():
-        if (each.split.name, each.method, each.training_seed) == (
-            cell.split,
-            cell.agent,
-            cell.seed,
-        ):
+        run = each.split.name, each.method, each.training_seed
+        if run == (cell.split, cell.agent, cell.seed):
             _require_same(each, cell, f"{path}: {name_of(each)}")
             results[mode_of(each) or cell.agent] = each
     return results
@@ -206,19 +200,12 @@ def do_cell(
         return
 
     def learn(folder: Path, config: RunConfig) -> None:
-        train(
-            folder,
-            config,
-            resume=True,
-            execution=execution,
-            show=show,
-            hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
-        )
+        hold = lambda folder: nullcontext()  # noqa: E731  # the caller has locked the cell's folder
+        train(folder, config, resume=True, execution=execution, show=show, hold=hold)
 
     if cell.config is not None:
         learn(cell.folder, cell.config)
     eval_config = replace(cell.eval_config, workers=execution.workers)
-    split = split_of(cell.source)
     for name, (mode, steps) in cell.modes.items():
         if name in done:
             continue
@@ -227,18 +214,16 @@ def do_cell(
             folder, sides = folder / FINETUNED / str(steps), ("test",)
             config = finetuning_run(cell, config, steps)
             learn(folder, config)
-        recorder = SubmissionRecorder(split)
+        scores: list[Score] = []
         for side in sides:
-            title = f"{cell.agent}{f' {name}' if mode else ''} on {side}"
-            if config is not None and mode is not None:
-                with stage(title):
-                    evaluate_run(folder, side, eval_config, mode, record=recorder)
-            # A baseline is not evaluated on a side without a robot for it.
-            elif BASELINES[cell.agent].suits(tasks_of(other_side(cell.source, side))):
-                source = other_side(cell.source, side)
-                with stage(title):
-                    evaluate_baseline(cell.agent, source, eval_config, record=recorder)
-        append_submission(cell.study / EPISODES, _submission(cell, name, split, recorder))
+            source = other_side(cell.source, side)
+            with stage(f"{cell.agent}{f' {name}' if mode else ''} on {side}"):
+                if mode is not None:
+                    scores += evaluate_run(folder, side, eval_config, mode)
+                # A baseline is not evaluated on a side without a robot for it.
+                elif BASELINES[cell.agent].suits(tasks_of(source)):
+                    scores += evaluate_baseline(cell.agent, source, eval_config)
+        append_submission(cell.study / EPISODES, _submission(cell, name, scores))
 
 
 def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
@@ -252,15 +237,22 @@ def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
     return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
 
 
-def _submission(cell: Cell, name: str, split: Split, recorder: SubmissionRecorder) -> Submission:
+def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> Submission:
     """Return the episodes of one of the modes of a cell."""
-    config, (mode, steps) = cell.config, cell.modes[name]
+    config, (mode, steps), split = cell.config, cell.modes[name], split_of(cell.source)
     training = data = None
     if config is not None:
         training = Training(config.sim, config.ppo.total_timesteps, steps)
         data = msgspec.to_builtins(_without_split(config).as_data())
-    return recorder.submission(
-        cell.agent, mode or "", cell.seed, _rules(cell, split), training, data
+    return make_submission(
+        split,
+        scores,
+        method=cell.agent,
+        mode=mode or "",
+        training_seed=cell.seed,
+        evaluation=_rules(cell, split),
+        training=training,
+        config=data,
     )
 
 
@@ -276,10 +268,6 @@ class Outcome:
     """The finished or failed cell."""
     error: str = ""
     """Error message; empty after success."""
-
-
-Work = Callable[[Sequence[Cell], ExecutionConfig], Iterator[Outcome]]
-"""Function that trains and evaluates cells, and yields their outcomes as they finish."""
 
 
 def run_cells(
@@ -308,29 +296,28 @@ def run_cells(
             skipped = 0
 
 
-def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
-    """Return a function that does cells as tasks of a Ray cluster.
+def run_cells_on_ray(
+    cells: Sequence[Cell], execution: ExecutionConfig, address: str | None, *, gpus: float = 0.0
+) -> Iterator[Outcome]:
+    """Train and evaluate cells as tasks of a Ray cluster, and yield their outcomes.
 
     Its machines have morphgen installed and share the study's folder.
     """
     ray = require_ray()
-
-    def work(cells: Sequence[Cell], execution: ExecutionConfig) -> Iterator[Outcome]:
-        with ray_cluster(address):
-            remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
-            running = {
-                remote.remote(replace(cell, study=cell.study.resolve()), execution): cell
-                for cell in cells
-            }
-            while running:
-                (done, *_), _ = ray.wait(list(running))
-                cell = running.pop(done)
-                try:
-                    yield Outcome(cell, ray.get(done))
-                except ray.exceptions.RayError as error:
-                    yield Outcome(cell, f"its Ray task failed: {type(error).__name__}: {error}")
-
-    return work
+    with ray_cluster(address):
+        remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
+        # Workers of a cluster have another current folder.
+        running = {
+            remote.remote(replace(cell, study=cell.study.resolve()), execution): cell
+            for cell in cells
+        }
+        while running:
+            (done, *_), _ = ray.wait(list(running))
+            cell = running.pop(done)
+            try:
+                yield Outcome(cell, ray.get(done))
+            except ray.exceptions.RayError as error:
+                yield Outcome(cell, f"its Ray task failed: {type(error).__name__}: {error}")
 
 
 def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:

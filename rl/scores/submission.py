@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,20 +18,17 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from morphgen.benchmark.split import Side, Split, split_id
+from morphgen.benchmark.split import Split, split_id
 from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
-from morphgen.formats.records import FiniteNumber, Record, read_record
-from morphgen.rl.rollouts import Episode
+from morphgen.formats.records import Record, read_record
+from morphgen.rl.scores.scores import Count, Name, RobotOutcomes, Score, dotted_values
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, ExpectedRobot
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.task import EnvSpec
 
 FORMAT = 1
 KIND = "morphgen submission"
-Name = Annotated[str, Meta(min_length=1, max_length=200)]
-Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
@@ -40,30 +38,6 @@ class SplitName(Record, frozen=True):
     name: Name
     id: Name
     """Id of the split, see ``morphgen.benchmark.split.split_id``."""
-
-
-class RobotOutcomes(Record, frozen=True):
-    """The episodes of one robot."""
-
-    robot: Name
-    side: Side
-    task: Name
-    body: Name
-    """Hash of the robot in the split."""
-    goal_set: Name
-    """Key of the robot's goal set: a hash of all that goals and starts follow from."""
-    success: tuple[bool, ...]
-    score: tuple[FiniteNumber, ...]
-    """Score of each episode, not relative to the random policy."""
-    distance: tuple[FiniteNumber, ...]
-    """Distance from success at the end of each episode [m]."""
-    steps: tuple[Count, ...]
-    """Length of each episode [control steps]."""
-    diverged: tuple[bool, ...]
-    """Whether each episode ended because the simulation diverged."""
-    random_score: tuple[FiniteNumber, ...]
-    """Score of each episode of the random policy with the same starts and goals."""
-    random_success: tuple[bool, ...]
 
 
 class Training(Record, frozen=True):
@@ -109,65 +83,32 @@ class Submission(Record, frozen=True):
             raise ValueError(f"method {self.method!r}; expected printable characters")
 
 
-class SubmissionRecorder:
-    """Collects the episodes of an evaluation; an instance is its ``record`` callback."""
-
-    def __init__(self, split: Split) -> None:
-        self._split = split
-        self.robots: list[RobotOutcomes] = []
-        """Outcomes of the robots so far."""
-
-    def __call__(
-        self,
-        spec: EnvSpec,
-        side: Side,
-        episodes: Sequence[Episode],
-        random_episodes: Sequence[Episode],
-    ) -> None:
-        """Add a robot."""
-        name = spec.robot.name
-        member = next(each for each in self._split.side(side) if each.name == name)
-        self.robots.append(
-            RobotOutcomes(
-                robot=name,
-                side=side,
-                task=spec.task,
-                body=member.robot_hash,
-                goal_set=spec.goals.key,
-                success=tuple(each.success for each in episodes),
-                score=tuple(each.score for each in episodes),
-                distance=tuple(each.distance for each in episodes),
-                steps=tuple(each.steps for each in episodes),
-                diverged=tuple(each.unstable for each in episodes),
-                random_score=tuple(each.score for each in random_episodes),
-                random_success=tuple(each.success for each in random_episodes),
-            )
-        )
-
-    def submission(
-        self,
-        method: str,
-        mode: str,
-        training_seed: int | None,
-        evaluation: dict[str, Any],
-        training: Training | None = None,
-        config: dict[str, Any] | None = None,
-    ) -> Submission:
-        """Return the submission of the recorded episodes; for the arguments see ``Submission``."""
-        data = {
-            "kind": KIND,
-            "format": FORMAT,
-            "method": method,
-            "mode": mode,
-            "training_seed": training_seed,
-            "morphgen": version("morphgen"),
-            "split": {"name": self._split.name, "id": split_id(self._split)},
-            "evaluation": evaluation,
-            "training": msgspec.to_builtins(training),
-            "config": config,
-            "robots": msgspec.to_builtins(self.robots),
-        }
-        return read_record(data, Submission, "submission", BenchmarkError)
+def make_submission(
+    split: Split,
+    scores: Iterable[Score],
+    *,
+    method: str,
+    mode: str,
+    training_seed: int | None,
+    evaluation: dict[str, Any],
+    training: Training | None = None,
+    config: dict[str, Any] | None = None,
+) -> Submission:
+    """Return the episodes of evaluated robots as a submission; see ``Submission``."""
+    data = {
+        "kind": KIND,
+        "format": FORMAT,
+        "method": method,
+        "mode": mode,
+        "training_seed": training_seed,
+        "morphgen": version("morphgen"),
+        "split": {"name": split.name, "id": split_id(split)},
+        "evaluation": evaluation,
+        "training": msgspec.to_builtins(training),
+        "config": config,
+        "robots": [msgspec.to_builtins(score.outcomes) for score in scores],
+    }
+    return read_record(data, Submission, "submission", BenchmarkError)
 
 
 def submission_text(submission: Submission) -> str:
@@ -248,8 +189,20 @@ def check_submission(
     expected: Sequence[ExpectedRobot],
     version: str,
 ) -> None:
-    """Check all that a submission claims."""
-    _check_head(submission, where, split, protocol, version)
+    """Check all that a submission claims; its scores compare with those of ``version``."""
+    if submission.split.id != split_id(split):
+        raise BenchmarkError(
+            f"{where}: split.id: {submission.split.id} ({submission.split.name}); expected "
+            f"{split_id(split)} ({split.name})"
+        )
+    # Episodes may change with the second number of a version, never with the third.
+    theirs, series = (".".join(each.split(".")[:2]) for each in (submission.morphgen, version))
+    if theirs != series:
+        raise BenchmarkError(
+            f"{where}: morphgen: {submission.morphgen}; scores are compared with those of version "
+            f"{series}"
+        )
+    require_rules(submission.evaluation, protocol.as_data(split), where)
     wanted = {(each.side, each.member.name): each for each in expected}
     require_each_once(submission, where)
     for outcomes in submission.robots:
@@ -259,7 +212,7 @@ def check_submission(
             raise BenchmarkError(f"{at}: the split has no such robot")
         _check_robot(outcomes, at, wanted[key], protocol)
     seen = {(outcomes.side, outcomes.robot) for outcomes in submission.robots}
-    sides = {side for side, _ in seen} | {"test"}
+    sides = {side for side, _ in seen} | {"test"}  # the train side may be left out as a whole
     for side, name in wanted:
         if side in sides and (side, name) not in seen:
             raise BenchmarkError(
@@ -269,12 +222,10 @@ def check_submission(
 
 def require_each_once(submission: Submission, where: str) -> None:
     """Require that a submission has no robot of a side twice."""
-    seen: set[tuple[str, str]] = set()
-    for outcomes in submission.robots:
-        if (outcomes.side, outcomes.robot) in seen:
-            at = f"{where}: {outcomes.side} robot {outcomes.robot}"
-            raise BenchmarkError(f"{at}: is there twice; expected once")
-        seen.add((outcomes.side, outcomes.robot))
+    counts = Counter((outcomes.side, outcomes.robot) for outcomes in submission.robots)
+    for (side, robot), count in counts.items():
+        if count > 1:
+            raise BenchmarkError(f"{where}: {side} robot {robot}: is there twice; expected once")
 
 
 def require_comparable(submissions: Mapping[str, Submission]) -> None:
@@ -285,22 +236,13 @@ def require_comparable(submissions: Mapping[str, Submission]) -> None:
             raise BenchmarkError(
                 f"{where}: split.id {each.split.id}; expected {other.split.id}, as in {first}"
             )
-        found, expected = (dict(_values("evaluation", x.evaluation)) for x in (each, other))
+        found, expected = (dotted_values({"evaluation": x.evaluation}) for x in (each, other))
         for key in expected | found:
             if found.get(key) != expected.get(key):
                 raise BenchmarkError(
                     f"{where}: {key} {found.get(key)!r}; expected {expected.get(key)!r}, as in "
                     f"{first}; scores of different evaluations do not compare"
                 )
-
-
-def _values(name: str, value: object) -> Iterator[tuple[str, object]]:
-    """Yield the values in nested dictionaries by their dotted names."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _values(f"{name}.{key}", item)
-    else:
-        yield name, value
 
 
 def require_same_random(submissions: Sequence[tuple[str, Submission]]) -> None:
@@ -339,52 +281,18 @@ def _random_tolerance(outcomes: RobotOutcomes, other: RobotOutcomes) -> float:
 
 def require_rules(found: Mapping[str, Any], rules: Mapping[str, Any], where: str) -> None:
     """Require that an evaluation followed the rules of a protocol."""
-    for key in ("simulator", "seed", "goal_seed"):
-        if found.get(key) != rules[key]:
+    given = dotted_values(found)
+    fixed = {key: rules[key] for key in ("simulator", "seed", "goal_seed", "constants")}
+    for key, value in dotted_values(fixed).items():
+        if given.get(key) != value:
             raise BenchmarkError(
-                f"{where}: evaluation.{key}: {found.get(key)!r}; expected {rules[key]!r}"
+                f"{where}: evaluation.{key}: {given.get(key)!r}; expected {value!r}"
             )
-    constants = found.get("constants")
-    for task, values in rules["constants"].items():
-        own = constants.get(task) if isinstance(constants, Mapping) else None
-        for name, value in values.items():
-            given = own.get(name) if isinstance(own, Mapping) else None
-            if given != value:
-                raise BenchmarkError(
-                    f"{where}: evaluation.constants.{task}.{name}: {given!r}; expected {value!r}"
-                )
     episodes = found.get("episodes")
-    if type(episodes) is not int or episodes < rules["episodes"]:
+    if type(episodes) is not int or episodes < rules["episodes"]:  # True is an int, too
         raise BenchmarkError(
             f"{where}: evaluation.episodes: {episodes!r}; expected {rules['episodes']} or more"
         )
-
-
-def _check_head(
-    submission: Submission, where: str, split: Split, protocol: EvalProtocol, version: str
-) -> None:
-    expected_id = split_id(split)
-    if submission.split.id != expected_id:
-        raise BenchmarkError(
-            f"{where}: split.id: {submission.split.id} ({submission.split.name}); expected "
-            f"{expected_id} ({split.name})"
-        )
-    require_series(submission.morphgen, version, where)
-    require_rules(submission.evaluation, protocol.as_data(split), where)
-
-
-def require_series(found: str, expected: str, where: str) -> None:
-    """Require two versions of morphgen whose scores compare: their first numbers are equal."""
-    if _series(found) != _series(expected):
-        raise BenchmarkError(
-            f"{where}: morphgen: {found}; scores are compared with those of version "
-            f"{_series(expected)}"
-        )
-
-
-def _series(version: str) -> str:
-    """Return the first two numbers of a version."""
-    return ".".join(version.split(".")[:2])
 
 
 def _check_robot(
@@ -403,17 +311,11 @@ def _check_robot(
         raise BenchmarkError(
             f"{at}: score: {count} episodes; expected {protocol.episodes} to {MAX_EPISODES}"
         )
-    require_full_lists(outcomes, at)
-    random_count = len(outcomes.random_score)
-    if random_count < protocol.episodes:
-        raise BenchmarkError(
-            f"{at}: random_score: {random_count} episodes, random_success: "
-            f"{len(outcomes.random_success)}; expected {protocol.episodes} or more, as many of both"
-        )
+    require_full_lists(outcomes, at, protocol.episodes)
     _check_episodes(outcomes, at, expected, protocol)
 
 
-def require_full_lists(outcomes: RobotOutcomes, at: str) -> None:
+def require_full_lists(outcomes: RobotOutcomes, at: str, least_random: int = 0) -> None:
     """Require an entry for every episode in the lists of a robot, and one episode or more."""
     count, random_count = len(outcomes.score), len(outcomes.random_score)
     if not count:
@@ -424,10 +326,11 @@ def require_full_lists(outcomes: RobotOutcomes, at: str) -> None:
                 f"{at}: {name}: {len(getattr(outcomes, name))} episodes; expected {count}, as in "
                 "score"
             )
-    if len(outcomes.random_success) != random_count:
+    if len(outcomes.random_success) != random_count or random_count < least_random:
+        least = f"{least_random} or more, " if least_random else ""
         raise BenchmarkError(
             f"{at}: random_score: {random_count} episodes, random_success: "
-            f"{len(outcomes.random_success)}; expected as many of both"
+            f"{len(outcomes.random_success)}; expected {least}as many of both"
         )
     if not random_count and TASKS[outcomes.task].relative_to_random:
         raise BenchmarkError(f"{at}: random_score: no episodes; expected one or more")

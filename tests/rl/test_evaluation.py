@@ -107,7 +107,7 @@ def test_evaluation_in_several_batches_has_the_same_episodes(run, monkeypatch):
 
     monkeypatch.setattr(evaluation, "batch_from_specs", noted)
     at_most(4, monkeypatch)
-    evaluation._random_cache.clear()
+    evaluation._random_episodes.cache_clear()
     parts = evaluate_run(run, "train", config, "deterministic")
     assert made[:3] == [(0, 4), (4, 4), (8, 2)]
     assert [each.raw for each in parts] == pytest.approx([each.raw for each in whole])

@@ -27,14 +27,7 @@ from morphgen.rl.runs.checkpoint import (
     unpacked,
     write_checkpoint,
 )
-from morphgen.rl.runs.recorders import (
-    METRICS,
-    Metrics,
-    TensorBoard,
-    read_metrics,
-    recording,
-    require_wandb,
-)
+from morphgen.rl.runs.recorders import METRICS, read_metrics, recording
 from morphgen.rl.runs.robot_source import robot_source, specs_of
 from morphgen.rl.runs.training import ROBOTS, state_of
 from morphgen.tasks.scenes.env_specs import GoalConfig
@@ -201,32 +194,41 @@ def test_files_that_are_not_checkpoints_are_rejected(tmp_path):
         read_checkpoint(tmp_path / "none.pt")
 
 
+def record(folder, *reports, after=0, tensorboard=False, wandb=False):
+    """Record metrics of a run that continues after an update."""
+    options = {"tensorboard": tensorboard, "wandb": wandb}
+    with recording(folder, small_config(), after, **options) as recorder:
+        for each in reports:
+            recorder(each)
+
+
 def test_resumed_metrics_drop_lines_after_the_checkpoint(tmp_path):
-    kept = Metrics(tmp_path, 0)
-    for update in (1, 2, 3):
-        kept.record(report(update, success=math.nan if update == 1 else 0.5))
-    kept.close()
+    record(tmp_path, report(1, success=math.nan), report(2), report(3))
     with (tmp_path / METRICS).open("a") as file:
         file.write('{"update": 4, "tran')
     assert [each["update"] for each in read_metrics(tmp_path)] == [1, 2, 3]
-    again = Metrics(tmp_path, 2)
-    again.record(report(3, success=0.75))
-    again.close()
+    record(tmp_path, report(3, success=0.75), after=2)
     found = read_metrics(tmp_path)
     assert [each["update"] for each in found] == [1, 2, 3]
     assert [each["success"] for each in found] == [None, 0.5, 0.75]
     assert found[0]["scores"] == [1.0, None]
-    assert found[0]["terms"] == {"distance": -0.5}
     assert found[1] == json.loads(json.dumps(asdict(report(2)) | {"scores": [1.0, None]}))
+
+
+def test_an_invalid_metrics_line_is_named(tmp_path):
+    record(tmp_path, report(1))
+    first = (tmp_path / METRICS).read_text()
+    for broken in ("\0\0\0", "[]", "{}"):
+        (tmp_path / METRICS).write_text(f"{first}{broken}\n")
+        with pytest.raises(FormatError, match=r"metrics\.jsonl, line 2: not the report"):
+            read_metrics(tmp_path)
 
 
 def test_tensorboard_reads_the_events(tmp_path):
     accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    for begins in (0, 2):
-        board = TensorBoard(tmp_path, begins)
-        for update in range(begins + 1, 4):
-            board.record(report(update, success=math.nan if update == 1 else 0.1 * begins))
-        board.close()
+    first, second, third = report(1, success=math.nan), report(2, success=0.0), report(3)
+    record(tmp_path, first, second, third, tensorboard=True)
+    record(tmp_path, report(3, success=0.2), after=2, tensorboard=True)
     shown = accumulators.EventAccumulator(str(tmp_path / "events")).Reload()
     points = [(each.step, each.value) for each in shown.Scalars("success")]
     assert points == [(2, 0.0), (3, pytest.approx(0.2))]
@@ -235,73 +237,37 @@ def test_tensorboard_reads_the_events(tmp_path):
 
 def test_a_missing_recorder_names_its_package_or_option(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(MissingDependencyError, match="pip install wandb"):
-        require_wandb()
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MissingDependencyError, match="pip install wandb"):
+        record(tmp_path, wandb=True)
     with pytest.raises(MissingDependencyError, match="--no-tensorboard"):
-        TensorBoard(tmp_path, 0)
-    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=False) as kept:
-        assert len(kept) == 1
+        record(tmp_path, tensorboard=True)
 
 
 class UsageError(Exception):
     """Stands for the error of wandb without a login."""
 
 
-wandb_errors = SimpleNamespace(Error=UsageError)
-
-
-def test_a_wandb_error_is_one_line(tmp_path, monkeypatch):
-    class Wandb:
-        errors = wandb_errors
-
-        @staticmethod
-        def init(**options):
-            raise UsageError("api_key not configured (no-tty)")
-
-    monkeypatch.setitem(sys.modules, "wandb", Wandb)
-    with (
-        pytest.raises(TaskError, match="--wandb: api_key not configured"),
-        recording(tmp_path, small_config(), 0, tensorboard=False, wandb=True),
-    ):
-        pass
-
-
-def test_an_invalid_metrics_line_is_named(tmp_path):
-    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=False) as kept:
-        kept[0].record(report(1))
-        kept[0].record(report(2))
-    path = tmp_path / METRICS
-    for broken in ("\0\0\0", "[]", "{}"):
-        path.write_text(path.read_text().splitlines()[0] + f"\n{broken}\n")
-        with pytest.raises(FormatError, match=r"metrics\.jsonl, line 2: not the report"):
-            read_metrics(tmp_path)
-
-
-def test_wandb_gets_scalars(tmp_path, monkeypatch):
+def test_wandb_gets_scalars_and_its_error_is_one_line(tmp_path, monkeypatch):
     sent = []
+    run = SimpleNamespace(
+        log=lambda data, step: sent.append((step, data)), finish=lambda: sent.append("finished")
+    )
 
-    class Run:
-        def log(self, data, step):
-            sent.append((step, data))
+    def init(resume, dir, **options):
+        assert resume == "allow"
+        if not dir.is_dir():
+            raise UsageError("api_key not configured (no-tty)")
+        return run
 
-        def finish(self):
-            sent.append("finished")
-
-    class Wandb:
-        errors = wandb_errors
-
-        @staticmethod
-        def init(**options):
-            assert options["resume"] == "allow"
-            return Run()
-
-    monkeypatch.setitem(sys.modules, "wandb", Wandb)
-    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=True) as kept:
-        for each in kept:
-            each.record(report(1))
+    wandb = SimpleNamespace(errors=SimpleNamespace(Error=UsageError), init=init)
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    record(tmp_path, report(1), wandb=True)
     (step, data), end = sent
     assert (step, data["score"], data["terms/distance"], end) == (1, 0.25, -0.5, "finished")
+    wandb.init = lambda **options: init("allow", tmp_path / "none")
+    with pytest.raises(TaskError, match="--wandb: api_key not configured"):
+        record(tmp_path, wandb=True)
 
 
 def test_a_source_needs_a_split_or_a_robot_with_a_task():

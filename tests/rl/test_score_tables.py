@@ -114,13 +114,21 @@ def test_small_scores_have_two_decimals():
         assert line.split()[4] == shown
 
 
+def test_a_run_that_two_studies_have_counts_once():
+    one = result_rows(read(a=data(), c=floor()))
+    assert result_rows(read(a=data(), b=data(), c=floor(), d=floor())) == one
+
+
 SHIPPED = read_split("interpolation/arm3/reach")
 
 
 @pytest.mark.parametrize(
     ("files", "why"),
     [
-        ({"a": data(), "b": data()}, "b: the same run, seed and mode as a"),
+        (
+            {"a": data(), "b": data(near=140.0)},
+            "b: the same run, seed and mode as a with other episodes; name one of the two files",
+        ),
         (
             {"a": data(), "b": data("other") | {"split": {"name": SPLIT.name, "id": "x"}}},
             "b: split.id x; expected",

@@ -26,9 +26,8 @@ from morphgen.rl.runs.training import subruns_of
 from morphgen.rl.scores import study
 from morphgen.rl.scores import study as study_work
 from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
-from morphgen.rl.scores.leaderboard import relative_scores
 from morphgen.rl.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables
-from morphgen.rl.scores.scores import UNSTABLE, iqm_interval
+from morphgen.rl.scores.scores import UNSTABLE, iqm_interval, relative_scores
 from morphgen.rl.scores.study import (
     agent_cell,
     baseline_cells,
@@ -325,7 +324,7 @@ def test_ray_gives_the_same_scores(whole, tmp_path):
     pytest.importorskip("ray")
     cells = cells_in(tmp_path, seeds=(0,))
     for _ in range(2):
-        outcomes = list(run_cells_on_ray(None)(cells, QUIET))
+        outcomes = list(run_cells_on_ray(cells, QUIET, None))
         assert sorted(each.cell.agent for each in outcomes) == sorted(c.agent for c in cells)
         assert all(each.error == "" for each in outcomes)
     same = [cell for cell in whole if cell.seed != 1]
