@@ -42,7 +42,7 @@ _NAME_RULE = "use letters, digits, '-', '_' and '.', in words parted by '/'"
 _Text = Annotated[str, Meta(min_length=1)]
 
 
-class _Robot(Record, frozen=True):
+class MemberRecord(Record, frozen=True):
     """An entry of ``train`` or ``test``."""
 
     name: _Text
@@ -73,8 +73,8 @@ class _Content(Record, frozen=True):
     id: _Text
     regime: Regime
     summary: _Text
-    train: Annotated[tuple[_Robot, ...], Meta(min_length=1)]
-    test: Annotated[tuple[_Robot, ...], Meta(min_length=1)]
+    train: Annotated[tuple[MemberRecord, ...], Meta(min_length=1)]
+    test: Annotated[tuple[MemberRecord, ...], Meta(min_length=1)]
     provenance: dict[str, Any] = msgspec.field(name="made", default_factory=dict)
     accepted: dict[str, _Text] = msgspec.field(default_factory=dict)
     reference: str = ""

@@ -129,7 +129,7 @@ class Network(encoder.Network):
     def _encoded(
         self, observation: Observation, links: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return encoded descriptions and states of the joints of links (n, K), (n, K, features)."""
+        """Return encoded descriptions and states (n, K, features) of the joints of links (n, K)."""
         extra = [observation[name][..., None] for name in self.channels]
         extra += [observation[name] for name in self.vectors]
         tokens = observation["tokens"]

@@ -11,28 +11,35 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from morphgen.benchmark.generate import RobotFactory, SampledRecipe, numbered_name
 from morphgen.benchmark.generate import members as factory_members
 from morphgen.benchmark.robot_hash import digest, robot_hash
 from morphgen.benchmark.split import Member, Side, Split, compose_member, split_id
-from morphgen.benchmark.split_file import parse_split, read_split, split_names, split_text
+from morphgen.benchmark.split_file import (
+    MemberRecord,
+    parse_split,
+    read_split,
+    split_names,
+    split_text,
+)
 from morphgen.benchmark.tokens import LARGEST_MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
+from morphgen.formats.records import read_record
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.processes import parallel_map
 from morphgen.progress import own_progress, show_progress
-from morphgen.rl.config import read_fields
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.task import EnvSpec, GoalSet
@@ -323,10 +330,9 @@ def draw(source: RobotSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobo
     """
     key = replace(source, drawn_hash=""), config
     if key not in _drawn:
-        robots = _draw_all(*key, jobs)
-        while len(_drawn) >= _MAX_DRAWN:
-            del _drawn[next(iter(_drawn))]
-        _drawn[key] = robots
+        _drawn[key] = _draw_all(*key, jobs)  # not lru_cache: robots do not depend on the jobs
+        if len(_drawn) > _MAX_DRAWN:
+            del _drawn[next(iter(_drawn))]  # the oldest
     robots = _drawn[key]
     if source.drawn_hash not in ("", robots.hash):
         raise TaskError(
@@ -343,17 +349,11 @@ _MAX_DRAWN = 8
 
 
 def fresh_source(
-    folder: Path,
-    source: RobotSource,
-    config: GoalConfig,
-    seed: int,
-    *,
-    jobs: int = 1,
+    folder: Path, source: RobotSource, config: GoalConfig, seed: int, *, jobs: int = 1
 ) -> tuple[RobotSource, str]:
     """Draw robots to evaluate a run of drawn robots on, other ones than it was trained on.
 
-    Returns:
-        The robots as the test side of a split, and a line that describes them.
+    They are the test side of a split; the second result is a line that describes them.
     """
     trained = read_drawn(folder)
     draw_seed = int(np.random.SeedSequence([_FRESH, source.draw_seed, seed]).generate_state(1)[0])
@@ -364,14 +364,8 @@ def fresh_source(
     request = ",".join(f"{Path(name).stem}:{count}" for name, count in counts)
     line = f"fresh robots {request}, drawn with seed {draw_seed}, hash {robots.hash}"
     split = Split("fresh", "interpolation", line, trained, robots.members)
-    text = split_text(split)
-    return RobotSource(
-        "fresh",
-        text,
-        side="test",
-        goal_seed=source.goal_seed,
-        library=source.library,
-    ), line
+    test = split_source(split, side="test", goal_seed=source.goal_seed)
+    return replace(test, library=source.library), line
 
 
 def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
@@ -397,15 +391,10 @@ def read_drawn(folder: Path) -> tuple[Member, ...]:
         data = read_json(path)
     except (OSError, FormatError) as error:
         raise TaskError(f"{path}: no list of drawn robots: {error}") from error
-    if not isinstance(data, dict) or not isinstance(data.get("drawn"), list):
+    if not isinstance(data, dict) or "drawn" not in data:
         raise TaskError(f"{path}: no list of drawn robots; expected the key 'drawn'")
-    drawn = []
-    for number, entry in enumerate(data["drawn"]):
-        named = entry
-        if isinstance(entry, dict):
-            named = {"robot_hash" if key == "body" else key: entry[key] for key in entry}
-        drawn.append(Member(**read_fields(named, Member, f"{path}: drawn: {number}")))
-    return tuple(drawn)
+    robots = read_record(data["drawn"], tuple[MemberRecord, ...], f"{path}: drawn", TaskError)
+    return tuple(Member(**msgspec.structs.asdict(robot)) for robot in robots)
 
 
 def trained_on(folder: Path, source: RobotSource) -> list[str]:
@@ -440,22 +429,14 @@ def _held_out(source: RobotSource) -> tuple[str, ...]:
 
 
 def _draw_all(
-    source: RobotSource,
-    config: GoalConfig,
-    jobs: int,
-    others: frozenset[str] = frozenset(),
+    source: RobotSource, config: GoalConfig, jobs: int, others: frozenset[str] = frozenset()
 ) -> DrawnRobots:
     """Draw the robots of a source, without those of test sides and those with other hashes."""
     library = default_library(tuple(map(Path, source.library)))
     held_out, total = _held_out(source), num_drawn(source)
-    drawer = _Drawer(
-        library.folders,
-        replace(config, seed=source.goal_seed),
-        str(source.task),
-        source.obstacles,
-        others | frozenset(held_out),
-    )
-    kept: dict[str, _Draw] = {}
+    goals = replace(config, seed=source.goal_seed)
+    draw_one = partial(_draw_one, source, goals, library.folders, others | frozenset(held_out))
+    kept: dict[str, tuple[Member, EnvSpec]] = {}
     skipped: Counter[str] = Counter()
     fault = ""
     with own_progress() as show:
@@ -474,55 +455,40 @@ def _draw_all(
                     SampledRecipe(grammar, i, source.draw_seed, numbered_name(grammar.name, i))
                     for i in numbers
                 ]
-                for result in parallel_map(drawer, recipes, jobs, chunk=ROBOTS_PER_JOB):
-                    reason = DRAWN_BEFORE if result.member.robot_hash in kept else result.skipped
-                    if reason:
+                for member, spec, reason, error in parallel_map(
+                    draw_one, recipes, jobs, chunk=ROBOTS_PER_JOB
+                ):
+                    if member.robot_hash in kept:
+                        reason = DRAWN_BEFORE
+                    if reason or spec is None:
                         skipped[reason] += 1
-                        fault = f"; {result.member.name}: {result.fault or reason}"
+                        fault = f"; {member.name}: {error or reason}"
                     else:
-                        kept[result.member.robot_hash] = result
+                        kept[member.robot_hash] = member, spec
                         show(len(kept), total)
-    specs = tuple(result.spec for result in kept.values() if result.spec is not None)
-    robots = tuple(result.member for result in kept.values())
-    return DrawnRobots(robots, specs, dict(sorted(skipped.items())), held_out)
+    members, specs = zip(*kept.values(), strict=True)
+    return DrawnRobots(members, specs, dict(sorted(skipped.items())), held_out)
 
 
-@dataclass(frozen=True, eq=False)
-class _Draw:
-    """A robot that was drawn."""
+def _draw_one(
+    source: RobotSource,
+    config: GoalConfig,
+    folders: tuple[Path, ...],
+    held_out: frozenset[str],
+    recipe: SampledRecipe,
+) -> tuple[Member, EnvSpec | None, str, str]:
+    """Return a robot with its environments, or the reason for skipping it and its error."""
+    factory = _factory(folders)
+    (member,) = factory_members((factory(recipe),), (str(source.task),), source.obstacles)
+    if member.robot_hash in held_out:
+        return member, None, HELD_OUT, ""
+    try:
+        return member, member_spec(member, factory.library, config), "", ""
+    except MorphgenError as error:
+        return member, None, UNFIT, str(error)
 
-    member: Member
-    """The robot and its task."""
-    spec: EnvSpec | None = None
-    """Its environments; None if it is skipped."""
-    skipped: str = ""
-    """Reason for skipping it."""
-    fault: str = ""
-    """Error of a robot that cannot do the task."""
 
-
-@dataclass(frozen=True, eq=False)
-class _Drawer:
-    """Draws robots and samples their goal sets; it is sent to processes."""
-
-    folders: tuple[Path, ...]
-    config: GoalConfig
-    task: str
-    obstacles: bool
-    held_out: frozenset[str]
-    """Hashes of robots to skip."""
-
-    @cached_property
-    def _factory(self) -> RobotFactory:
-        return RobotFactory(Library(self.folders), max_links=LARGEST_MAX_LINKS)
-
-    def __call__(self, recipe: SampledRecipe) -> _Draw:
-        """Draw a robot."""
-        candidate = self._factory(recipe)
-        (member,) = factory_members((candidate,), (self.task,), self.obstacles)
-        if member.robot_hash in self.held_out:
-            return _Draw(member, skipped=HELD_OUT)
-        try:
-            return _Draw(member, member_spec(member, self._factory.library, self.config))
-        except MorphgenError as error:
-            return _Draw(member, skipped=UNFIT, fault=str(error))
+@lru_cache(maxsize=2)
+def _factory(folders: tuple[Path, ...]) -> RobotFactory:
+    """Return the factory of a process, which keeps the parts that it has read."""
+    return RobotFactory(Library(folders), max_links=LARGEST_MAX_LINKS)

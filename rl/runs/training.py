@@ -39,7 +39,6 @@ from morphgen.rl.runs.checkpoint import (
 )
 from morphgen.rl.runs.recorders import Recorder, recording, require_wandb
 from morphgen.rl.runs.robot_source import (
-    DrawnRobots,
     RobotSource,
     draw,
     members,
@@ -203,13 +202,7 @@ def num_actuated(robot: Robot, task: str) -> int:
 
 
 class TrainingBatches:
-    """Makes the batches of a run; batches and their seeds depend on the config only.
-
-    Attributes:
-        drawn: The robots drawn from grammars; None for other sources.
-        most_links: Number of links of the largest robot.
-        tasks: Names of the tasks of all robots.
-    """
+    """Makes the batches of a run; batches and their seeds depend on the config only."""
 
     def __init__(
         self,
@@ -225,9 +218,8 @@ class TrainingBatches:
         self._device = batch_device(config.sim, device or config.device)
         goals = GoalConfig(tasks=config.tasks)
         self._batch: TaskBatch | None = None
-        self.drawn: DrawnRobots | None = None
-        if config.source.grammars:
-            self.drawn = draw(config.source, goals)
+        is_drawn = bool(config.source.grammars)
+        self.drawn = draw(config.source, goals) if is_drawn else None
         self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals)
         for spec in self._specs:
             links = len(spec.robot.links)
@@ -240,10 +232,7 @@ class TrainingBatches:
             self._channels = replace(self._channels, tree_joints=joints)
 
     def make(self, update: int) -> TaskBatch:
-        """Return a new batch, with which the run continues after so many updates.
-
-        The last batch is closed.
-        """
+        """Close the last batch, and return the one that the run continues with after updates."""
         self.close()
         config, interface = self._config, self._config.interface
         robots, seed = self._robots_at(update), config.seed
@@ -414,9 +403,8 @@ def train(
     the same weights as an uninterrupted one; one that was stopped does not, since all its episodes
     begin anew at another update. Nothing is written before all robots and networks are built.
 
-    Returns:
-        The parts, of which the last are unfinished or not begun after ``minutes``; none in
-        processes of ``torchrun`` other than the first, which alone writes files.
+    Returns the parts, of which the last are unfinished or not begun after ``minutes``; none in
+    processes of ``torchrun`` other than the first, which alone writes files.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
@@ -555,11 +543,7 @@ def _learn(
     show: ShowMetrics | None,
     stop: _StopRequest,
 ) -> bool:
-    """Make the remaining updates of a part; record their metrics and write its checkpoints.
-
-    Returns:
-        Whether it has stopped early.
-    """
+    """Make the remaining updates of a part, and record them; return whether it stopped early."""
     is_stopped = False
     interval = updates_between(part.config)
     with ExitStack() as stack:

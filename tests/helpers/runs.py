@@ -7,6 +7,7 @@ from morphgen.rl.agents import AGENTS, mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.evaluation import EvalConfig
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
+from morphgen.rl.runs.recorders import read_metrics
 from morphgen.rl.runs.robot_source import robot_source, split_source
 from morphgen.rl.runs.training import ExecutionConfig
 
@@ -36,6 +37,30 @@ def small_config(source=None, *, agent="me-mlp", seed=0, **ppo):
     policy = replace(POLICY, agent=agent, network=small)
     source = source or robot_source("planar-cube", "reach")
     return RunConfig(source, policy, replace(PPO, **ppo), seed=seed, sim="mujoco", num_envs=4)
+
+
+class StoppedError(Exception):
+    """Stands for Ctrl-C after a recorded update."""
+
+
+def after(update, act):
+    """Return a callback of training that calls a function after an update."""
+    return lambda part: lambda report, updates: act() if report.update == update else None
+
+
+def stop_after(update):
+    """Return a callback of training that stops after an update."""
+
+    def stop():
+        raise StoppedError
+
+    return after(update, stop)
+
+
+def untimed(folder):
+    """Return the recorded metrics of a run without its timings."""
+    timed = ("collect_seconds", "learn_seconds", "steps_per_second")
+    return [{k: v for k, v in each.items() if k not in timed} for each in read_metrics(folder)]
 
 
 def weights(folder):

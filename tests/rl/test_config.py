@@ -5,7 +5,7 @@ import math
 import pytest
 
 from morphgen.errors import TaskError
-from morphgen.rl.agents import mlp, transformer
+from morphgen.rl.agents import graph, mlp, transformer
 from morphgen.rl.config import PolicyConfig, PPOConfig
 
 
@@ -19,6 +19,7 @@ def test_transitions_are_rounded_up_to_whole_updates():
     [
         (lambda: PolicyConfig(agent="me-tff"), "unknown agent 'me-tff'; did you mean 'me-tf'"),
         (lambda: transformer.Config(features=30), "features 30: expected a multiple of heads 4"),
+        (lambda: graph.Config(graph_features=30), "graph_features 30: expected a multiple"),
         (lambda: mlp.Config(mlp_width=0), "mlp_width 0: expected 1 or more"),
         (lambda: transformer.Config(logit_scale=0.0), "logit_scale 0: expected more than 0"),
         (lambda: PPOConfig(num_steps=0), "num_steps 0: expected 1 or more"),

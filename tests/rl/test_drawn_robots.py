@@ -225,9 +225,9 @@ def test_robots_that_were_trained_on_are_named(tmp_path):
         (None, "no list of drawn robots"),
         ("{", "no list of drawn robots"),
         ("[]", "expected the key 'drawn'"),
-        ('{"drawn": [7]}', "drawn: 0: invalid value 7"),
-        ('{"drawn": [{"name": "a"}]}', "drawn: 0: missing key 'category'"),
-        ('{"drawn": [{"name": "a", "body": 7}]}', "robot_hash: invalid value 7"),
+        ('{"drawn": [7]}', r"drawn: \[0\]: invalid value 7"),
+        ('{"drawn": [{"name": "a"}]}', r"drawn: \[0\]: missing key 'category'"),
+        ('{"drawn": [{"name": "a", "body": 7}]}', r"drawn: \[0\]\.body: invalid value 7"),
     ],
 )
 def test_malformed_lists_are_refused(tmp_path, content, error):

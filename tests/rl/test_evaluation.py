@@ -68,30 +68,22 @@ def test_the_seed_determines_the_episodes():
     assert scores[0][0].distance != scores[2][0].distance
 
 
-def test_evaluations_are_repeatable_in_both_modes(run):
+def test_evaluations_are_repeatable_in_both_modes_by_any_workers(run):
     modes = ("deterministic", "deterministic", "stochastic", "stochastic")
-    found = [evaluate_run(run, "train", EVAL, mode) for mode in modes]
+    configs = (EVAL, replace(EVAL, workers=2)) * 2
+    found = [
+        evaluate_run(run, "train", config, mode)
+        for config, mode in zip(configs, modes, strict=True)
+    ]
     data = [scores_to_json(scores) for scores in found]
     assert data[0] == data[1] != data[2] == data[3]
     assert found[0][0].random == found[2][0].random
-
-
-def test_the_number_of_workers_does_not_change_scores(run):
-    one, two = (evaluate_run(run, "test", replace(EVAL, workers=n), "stochastic") for n in (1, 2))
-    assert scores_to_json(one) == scores_to_json(two)
 
 
 def at_most(count, monkeypatch):
     """Limit the number of parallel environments of MuJoCo."""
     fewer = replace(SIMULATORS["mujoco"], max_envs=count)
     monkeypatch.setitem(SIMULATORS._loaded, "mujoco", fewer)
-
-
-def test_more_episodes_than_environments_run_in_rounds():
-    config = replace(EVAL, episodes=35)
-    (score,) = evaluate_baseline("zero", robot_source("planar-cube", "reach"), config)
-    assert score.episodes == 36
-    assert score.steps == 36 * 300
 
 
 def test_evaluation_in_several_batches_has_the_same_episodes(run, monkeypatch):
@@ -146,8 +138,11 @@ def test_se_policies_are_scored_on_their_own_robot_and_together_on_others(tmp_pa
     names = [part.config.source.member for part in subruns_of(tmp_path, config)]
     assert sorted(each.robot for each in own) == sorted(names)
     assert [each.episodes for each in own] == [2, 2]
-    (test,) = evaluate_run(tmp_path, "test", EVAL, "deterministic")
+    seen = []
+    with show_progress(lambda *now: seen.append(now)):
+        (test,) = evaluate_run(tmp_path, "test", EVAL, "deterministic")
     assert (test.side, test.episodes) == ("test", 4)
+    assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
     files = list(checkpoint_files(tmp_path))
     again = evaluate_checkpoints(files, small_source(), EVAL, "deterministic")
     assert scores_to_json(again) == scores_to_json(own)
@@ -186,14 +181,6 @@ def test_progress_counts_finished_and_partial_episodes(monkeypatch, limit, value
     assert parts[-1] == whole
 
 
-def test_progress_of_se_policies_covers_all_policies(tmp_path):
-    train(tmp_path, small_config(small_source(), agent="se", total_timesteps=64), execution=QUIET)
-    seen = []
-    with show_progress(lambda *now: seen.append(now)):
-        evaluate_run(tmp_path, "test", EVAL, "deterministic")
-    assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
-
-
 def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp_path):
     config, learner = read_checkpoint(run)
     learner["layout"]["obstacles"] = 0
@@ -204,23 +191,24 @@ def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp
     evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
-def test_policies_with_different_interfaces_are_not_evaluated_together(run, tmp_path):
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ({"max_links": 30}, "max_links 30, not 23"),
+        ({"discrete": False}, "kind continuous, not discrete"),
+        ({"tool_position": True}, "tool True, not False"),
+    ],
+)
+def test_policies_with_different_interfaces_are_not_evaluated_together(
+    run, tmp_path, change, difference
+):
     config, learner = read_checkpoint(run)
-    for name, changed in {
-        "wider": replace(config, max_links=30),
-        "continuous": replace(config, policy=replace(config.policy, discrete=False)),
-        "tool": replace(config, policy=replace(config.policy, tool_position=True)),
-    }.items():
-        write_checkpoint(tmp_path, changed, learner)
-        other = (tmp_path / "checkpoint.pt").rename(tmp_path / f"{name}.pt")
-        difference = {
-            "wider": "max_links 30, not 23",
-            "continuous": "kind continuous, not discrete",
-            "tool": "tool True, not False",
-        }
-        message = rf"^{other}: its policy .* than that of {run}: {difference[name]}; evaluate it on"
-        with pytest.raises(TaskError, match=message):
-            evaluate_checkpoints([run, other], small_source(), EVAL, "deterministic")
+    policy = {} if "max_links" in change else {"policy": replace(config.policy, **change)}
+    write_checkpoint(tmp_path, replace(config, **(policy or change)), learner)
+    other = tmp_path / "checkpoint.pt"
+    message = rf"^{other}: its policy .* than that of {run}: {difference}; evaluate it on"
+    with pytest.raises(TaskError, match=message):
+        evaluate_checkpoints([run, other], small_source(), EVAL, "deterministic")
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "se"])
@@ -242,20 +230,15 @@ def test_obstacles_may_surround_only_some_robots(agent, tmp_path):
             assert len(evaluate_run(folder, side, EVAL, "deterministic")) == count
 
 
-def test_one_robot_has_no_other_side(tmp_path):
-    train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
-    assert len(evaluate_run(tmp_path, "train", EVAL, "deterministic")) == 1
-    with pytest.raises(TaskError, match="has no test robots"):
-        evaluate_run(tmp_path, "test", EVAL, "deterministic")
-
-
-def test_runs_without_contacts_are_evaluated_with_them(tmp_path):
+def test_one_robot_has_no_other_side_and_is_evaluated_with_contacts(tmp_path):
     run_config = replace(small_config(total_timesteps=32), sim="kinematic")
     train(tmp_path, run_config, execution=QUIET)
-    config = eval_config_of(run_config, 1)
+    config = eval_config_of(run_config, 35)
     assert config.sim == "mujoco"
     (score,) = evaluate_run(tmp_path, "train", config, "deterministic")
-    assert score.episodes == 1
+    assert (score.episodes, score.steps) == (36, 36 * 300)  # in rounds: there are 34 environments
+    with pytest.raises(TaskError, match="has no test robots"):
+        evaluate_run(tmp_path, "test", config, "deterministic")
 
 
 def test_eval_config_has_the_simulator_and_tasks_of_the_run(run):

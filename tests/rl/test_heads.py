@@ -34,28 +34,31 @@ def discrete(mask=MASK):
     return MaskedMultiDiscrete(2 * torch.randn(3, 4, len(BINS), generator=seeded()), mask)
 
 
-def test_gaussian_matches_torch_over_the_movable_links():
-    head = gaussian()
+def torch_gaussian(head, row, mask):
+    return Normal(head.mean[row, mask], head.log_std[mask].exp())
+
+
+def torch_discrete(head, row, mask):
+    return Categorical(logits=head.logits[row, mask])
+
+
+@pytest.mark.parametrize(
+    ("head", "theirs", "rest"),
+    [(gaussian(), torch_gaussian, 0.0), (discrete(), torch_discrete, REST)],
+    ids=["gaussian", "discrete"],
+)
+def test_heads_match_torch_over_the_movable_links(head, theirs, rest):
     actions = head.sample(seeded(1))
+    assert actions.equal(head.sample(seeded(1)))
+    assert not actions.equal(head.sample(seeded(2)))
     for row, mask in enumerate(MASK[:2]):
-        theirs = Independent(Normal(head.mean[row, mask], head.log_std[mask].exp()), 1)
-        assert head.log_prob(actions)[row] == pytest.approx(theirs.log_prob(actions[row, mask]))
-        assert head.entropy()[row] == pytest.approx(theirs.entropy())
-
-
-def test_multi_discrete_matches_torch_over_the_movable_links():
-    head = discrete()
-    actions = head.sample(seeded(1))
-    for row, mask in enumerate(MASK[:2]):
-        theirs = Independent(Categorical(logits=head.logits[row, mask]), 1)
-        assert head.log_prob(actions)[row] == pytest.approx(theirs.log_prob(actions[row, mask]))
-        assert head.entropy()[row] == pytest.approx(theirs.entropy())
-
-
-@pytest.mark.parametrize("head", [gaussian(), discrete()], ids=["gaussian", "discrete"])
-def test_immovable_links_add_nothing_to_log_prob_and_entropy(head):
-    assert head.log_prob(head.sample(seeded()))[2] == 0
-    assert head.entropy()[2] == 0
+        other = Independent(theirs(head, row, mask), 1)
+        assert head.log_prob(actions)[row] == pytest.approx(other.log_prob(actions[row, mask]))
+        assert head.entropy()[row] == pytest.approx(other.entropy())
+    assert (head.log_prob(actions)[2], head.entropy()[2]) == (0, 0)  # nothing moves
+    assert BINS[REST] == 0
+    for own in (actions, head.mode()):
+        assert set(own[~MASK].tolist()) == {rest}
 
 
 def test_gaussian_samples_have_its_mean_and_std():
@@ -90,20 +93,6 @@ def test_the_mode_of_a_certain_bin_is_that_bin(chosen):
     logits = 50.0 * functional.one_hot(torch.tensor(chosen), len(BINS)).float()
     bins = MaskedMultiDiscrete(logits.expand(*MASK.shape, len(BINS)), MASK)
     assert set(bins.mode()[MASK].tolist()) == {chosen}
-
-
-def test_immovable_links_get_the_resting_action():
-    assert BINS[REST] == 0
-    for actions in (discrete().sample(seeded()), discrete().mode()):
-        assert set(actions[~MASK].tolist()) == {REST}
-    for actions in (gaussian().sample(seeded()), gaussian().mode()):
-        assert set(actions[~MASK].tolist()) == {0.0}
-
-
-def test_samples_depend_only_on_the_generator():
-    for head in (gaussian(), discrete()):
-        assert head.sample(seeded(3)).equal(head.sample(seeded(3)))
-        assert not head.sample(seeded(3)).equal(head.sample(seeded(4)))
 
 
 @pytest.mark.parametrize("garbage", [1e30, math.inf, math.nan])

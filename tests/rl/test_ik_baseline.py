@@ -8,14 +8,12 @@ import pytest
 import torch
 
 from helpers.scenes import robot
-from morphgen.rl.baselines.ik import STARTS, InverseKinematics, random_starts
+from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.path_planner import PathFollower
-from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 REACH, PUSH = ReachConfig(num_goals=10), PushConfig(num_goals=4)
 CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"
@@ -34,18 +32,6 @@ def made(tmp_path):
     yield make
     for batch in opened:
         batch.close()
-
-
-def test_random_starts_do_not_move_fingers(made):
-    batch = made(CLAW, 6)
-    near = batch.targets.clone()
-    starts = random_starts(batch, torch.arange(6), torch.Generator().manual_seed(0))
-    assert len(starts) == STARTS
-    assert torch.equal(starts[0], near)
-    assert (starts[1:] != near).any()
-    idle = ~batch.robot_tables.moves_tool[0]
-    assert idle.any()
-    assert torch.equal(starts[..., idle], near[:, idle].expand(STARTS, -1, -1))
 
 
 def test_joints_of_two_turns_take_the_shorter_way(made):
@@ -79,16 +65,6 @@ def test_poses_are_reached(made, words):
     batch = made(words, 8, configs=(replace(REACH, goal="pose"),))
     episodes = run_episodes(batch, InverseKinematics(0), 1)
     assert sum(episode.success for episode in episodes) >= 7
-
-
-@pytest.mark.slow
-def test_a_push_episode_scores_its_success_and_counts_its_steps(made):
-    batch = made("prims", 3, "push")
-    episodes = run_episodes(batch, ScriptedPush(0), 1)
-    assert any(episode.success for episode in episodes)
-    for episode in episodes:
-        assert episode.score == float(episode.success)
-        assert episode.seconds == pytest.approx(episode.steps * CONTROL_PERIOD)
 
 
 def test_a_reach_episode_scores_the_mean_of_its_steps(made):

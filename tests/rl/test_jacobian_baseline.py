@@ -7,10 +7,9 @@ import torch
 
 from helpers.scenes import robot
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.baselines import baselines_for
 from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.actions import BINS
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch
 
@@ -62,6 +61,8 @@ def test_a_slide_moves_by_a_share_of_the_error_along_its_axis(made):
 
 
 def test_different_robots_reach_in_one_batch(made):
+    assert baselines_for("reach") == ("ik", "jacobian", "zero", "random")
+    assert baselines_for("push") == ("scripted", "zero", "random")
     batch = made(["prims", "arm=ur5 ee=stick"], 16)
     episodes = run_episodes(batch, JacobianColumns(), 1)
     success = [[e.success for e in episodes if e.robot_index == i] for i in range(2)]
@@ -88,17 +89,3 @@ class PositionOnly(JacobianColumns):
         actions = super().act(task)
         envs.needs_tool_rotation = True
         return actions
-
-
-def test_discrete_actions_are_bins(made):
-    batch = made(["prims"], 2, kind="discrete")
-    actions = JacobianColumns().act(batch)
-    assert not actions.is_floating_point()
-    assert ((actions >= 0) & (actions < len(BINS))).all()
-    batch.step(actions)
-
-
-def test_it_is_a_baseline_of_reach_only():
-    assert baselines_for("reach") == ("ik", "jacobian", "zero", "random")
-    assert baselines_for("push") == ("scripted", "zero", "random")
-    assert isinstance(BASELINES["jacobian"].make(0), JacobianColumns)

@@ -8,7 +8,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import Policy
-from morphgen.rl.observation_layout import Layout, layout_of
+from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.ppo import Learner
 from morphgen.rl.runs.checkpoint import require_learner
 from morphgen.rl.runs.training import state_of
@@ -51,7 +51,10 @@ CONFIG = PPOConfig(total_timesteps=64, num_steps=8, epochs=1, minibatches=2)
 @pytest.mark.parametrize("agent", list(AGENTS))
 def test_a_declared_field_reaches_the_networks_and_the_checkpoint(windy, agent):
     learner = Learner(WindyLine(8, tree=agent == "me-graph"), PolicyConfig(agent), CONFIG)
-    assert learner.layout.fields == (("wind", 3, "goal_mask"),)
+    assert (
+        learner.layout.fields == learner.layout.as_data()["fields"] == (("wind", 3, "goal_mask"),)
+    )
+    assert "fields" not in layout_of(OnALine(2).observe()).as_data()
     learner.iterate()
     state = state_of(learner)
     require_learner(state, "checkpoint")
@@ -68,14 +71,6 @@ def test_a_declared_field_reaches_the_networks_and_the_checkpoint(windy, agent):
     del observation["wind"]
     with pytest.raises(TaskError, match="is for other observations: fields"):
         policy.act(observation)
-
-
-def test_layouts_without_declared_fields_are_stored_without_the_key(windy):
-    layout = layout_of(OnALine(2).observe())
-    assert layout.fields == ()
-    assert "fields" not in layout.as_data()
-    assert layout_of(WindyLine(2).observe()).as_data()["fields"] == (("wind", 3, "goal_mask"),)
-    assert isinstance(layout, Layout)
 
 
 def test_training_rejects_an_undeclared_field():

@@ -15,7 +15,6 @@ from morphgen.rl.baselines.path_planner import (
     PathFollower,
     PathPlanner,
     fractions_towards,
-    rrt_connect,
 )
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.free_space import RESOLUTION, FreeSpace
@@ -120,16 +119,6 @@ def test_a_tree_stays_on_its_side_of_a_wall():
     assert not np.array_equal(nodes(), nodes(attempt=1))
 
 
-def test_a_tree_that_cannot_grow_is_its_start():
-    limits, rng = np.array([[0.0, 1.0]]), np.random.default_rng(0)
-    path, tree = rrt_connect(
-        np.array([0.5]), np.zeros((0, 1)), limits, np.array([0.1]), lambda a, b: 0.0, rng, 3
-    )
-    assert path is None
-    assert np.array(tree.nodes).tolist() == [[0.5]]
-    assert tree.to_root(0) == [0.5]
-
-
 def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
     """A wall without a gap hides the cheaper one of two goals, so the path leads to the other."""
     walls = (
@@ -155,33 +144,26 @@ def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
     assert plan(NO_GOALS, np.zeros(0)) is None
 
 
-def test_the_cheapest_path_along_a_tree_is_taken():
-    """The cheapest goal is far, so that the path to another goal is cheaper."""
+@pytest.mark.parametrize(
+    ("with_tree", "goals", "goal_cost", "deadline", "goal"),
+    [
+        (True, [[1.8, 1.8], [0.3, 0.0]], [0.0, 40.0], np.inf, 1),
+        (True, [[1.8, 1.8], [0.3, 0.0]], [0.0, 120.0], np.inf, 0),
+        (True, [[1.8, 1.8], [0.3, 0.0]], [0.0, 120.0], 70.0, 1),  # the other path would be late
+        (False, [[1.0, 0.0], [0.3, 0.0]], [0.0, 100.0], np.inf, 0),
+        (False, [[1.0, 0.0], [0.3, 0.0]], [0.0, 100.0], [51.0, 0.0], 0),
+        (False, [[1.0, 0.0], [0.3, 0.0]], [0.0, 100.0], 40.0, 1),
+        (False, [[1.0, 0.0], [0.3, 0.0]], [0.0, 100.0], -30.0, 0),  # both are far too late
+    ],
+)
+def test_the_cheapest_path_is_taken(with_tree, goals, goal_cost, deadline, goal):
     planner, start = planner_of(), np.array([0.0, 0.0])
-    _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
-    goals, goal_cost = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])
-
-    def goal(goal_cost, deadline):
-        cost = PathCost(goal_cost, deadline)
-        return planner.plan_straight(start, goals, cost=cost, block=FAR_AWAY, tree=tree).goal
-
-    assert goal(goal_cost, NO_DEADLINE) == 1
-    assert goal(3 * goal_cost, NO_DEADLINE) == 0
-    assert goal(3 * goal_cost, np.array([70.0, 70.0])) == 1, "the other path would be late"
-
-
-def test_late_paths_come_last():
-    planner = planner_of()
-    start, goals = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [0.3, 0.0]])
-
-    def goal(deadline):
-        cost = PathCost(np.array([0.0, 100.0]), np.array(deadline))
-        return planner.plan_straight(start, goals, cost=cost, block=FAR_AWAY).goal
-
-    assert goal([np.inf, np.inf]) == 0
-    assert goal([51.0, 0.0]) == 0
-    assert goal([40.0, 40.0]) == 1
-    assert goal([-30.0, -30.0]) == 0, "both are far too late"
+    tree = None
+    if with_tree:
+        _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
+    cost = PathCost(np.array(goal_cost), np.broadcast_to(deadline, 2))
+    options = {"cost": cost, "block": FAR_AWAY, "tree": tree}
+    assert planner.plan_straight(start, np.array(goals), **options).goal == goal
 
 
 @pytest.mark.parametrize("far", [0.0, 0.03, 0.0501, 0.0999, 0.1499, 0.52, 0.999])

@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pytest
 
 from morphgen.errors import TaskError
-from morphgen.rl.agents import AGENTS, FAST, PAPER, PRESETS, network_fields, preset_of
+from morphgen.rl.agents import FAST, PAPER, PRESETS, network_fields, preset_of
 from morphgen.rl.config import NUMBERS, PPOConfig
 from morphgen.rl.ppo import normalized_advantages
 from morphgen.rl.runs.agent_spec import SWITCHES, configs_of, parse_agent
@@ -31,10 +31,6 @@ def test_the_preset_of_the_paper_changes_nothing():
     _, ppo = configs_of(parse_agent("me-tf"), ["reach"], PAPER.constants, 1000)
     assert asdict(ppo) == asdict(PPOConfig(total_timesteps=1000))
     assert not PAPER.switches
-
-
-def test_every_agent_is_in_the_registry_with_its_channels():
-    assert AGENTS["me-graph"].channels == ("tree",)
 
 
 def test_advantages_are_normalized_robot_by_robot():

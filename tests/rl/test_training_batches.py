@@ -9,14 +9,21 @@ import pytest
 from helpers.commands import tree
 from helpers.learners import learner
 from helpers.line_batch import OnALine
-from helpers.runs import QUIET, equal, small_config, weights
+from helpers.runs import (
+    QUIET,
+    StoppedError,
+    equal,
+    small_config,
+    stop_after,
+    untimed,
+    weights,
+)
 from helpers.splits import member, split
 from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.progress import show_progress
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.runs.recorders import read_metrics
 from morphgen.rl.runs.robot_source import FILE, draw, drawn_source, specs_of, split_source
 from morphgen.rl.runs.training import (
     TrainingBatches,
@@ -36,10 +43,6 @@ from morphgen.tasks.scenes.robot_tables import build_robot_tables
 CONFIGS = (ReachConfig(num_goals=3), PushConfig())
 
 
-class StoppedError(Exception):
-    """Stands for Ctrl-C after a recorded update."""
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
@@ -54,20 +57,8 @@ def drawn_config(request="cubes:4,stick:2", *, updates=24, slice_updates=4, **mo
     return replace(config, tasks=CONFIGS, slice_updates=slice_updates)
 
 
-def run(folder, config, stop=None):
-    def show(part):
-        def stop_here(report, updates):
-            if report.update == stop:
-                raise StoppedError
-
-        return stop_here
-
-    return train(folder, config, resume=True, execution=QUIET, show=show)
-
-
-def untimed(folder):
-    timed = ("collect_seconds", "learn_seconds", "steps_per_second")
-    return [{k: v for k, v in each.items() if k not in timed} for each in read_metrics(folder)]
+def run(folder, config, stop=0):
+    return train(folder, config, resume=True, execution=QUIET, show=stop_after(stop))
 
 
 @pytest.mark.parametrize(("robots", "size"), [(6, 4), (5, 5), (7, 2), (1000, 128)])
@@ -160,15 +151,6 @@ def test_actuated_joints_are_counted_as_batches_do(task):
     assert [num_actuated(robot, task) for robot in robots] == mask.sum(dim=1).tolist()
 
 
-def test_the_order_of_robots_changes_the_weights(tmp_path):
-    run(tmp_path / "a", drawn_config(updates=8))
-    run(tmp_path / "b", drawn_config(updates=8, slice_updates=2))
-    run(tmp_path / "c", replace(drawn_config(updates=8), seed=1))
-    a, b, c = (weights(tmp_path / name) for name in "abc")
-    assert not equal(a, b)
-    assert not equal(a, c)
-
-
 def test_a_run_with_an_environment_for_every_robot_has_one_batch(tmp_path):
     config = drawn_config("cubes:2,stick:1", updates=6, slice_updates=0)
     run(tmp_path / "run", config)
@@ -236,17 +218,10 @@ def test_a_batch_that_does_not_fit_is_refused():
 
 
 def test_goal_sets_are_reported_robot_by_robot():
-    reports = []
-
-    def report(done, total):
-        reports.append((done, total))
-
     source = split_source(read_split("extrapolation/primitives/reach"), side="test")
-    with show_progress(report):
-        specs = specs_of(source, GoalConfig())
-    assert reports == [(0, 2), (1, 2), (2, 2)]
-    reports.clear()
-    with show_progress(report):
-        TrainingBatches(replace(small_config(), source=source))
-    assert reports == [(0, 2), (1, 2), (2, 2)]
-    assert [spec.robot.name for spec in specs] == ["chain-000000", "chain-000001"]
+    config = replace(small_config(), source=source)
+    for work in (lambda: specs_of(source, GoalConfig()), lambda: TrainingBatches(config)):
+        reports = []
+        with show_progress(lambda *now: reports.append(now)):  # noqa: B023
+            work()
+        assert reports == [(0, 2), (1, 2), (2, 2)]
