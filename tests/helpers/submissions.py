@@ -1,17 +1,25 @@
 """Submissions of a small split that tests write without running episodes."""
 
+import copy
+
 import msgspec
 
 from helpers.runs import small_split
 from morphgen.benchmark.split import split_id
+from morphgen.errors import BenchmarkError
+from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores.submission import FORMAT, KIND
+from morphgen.rl.scores.submission import FORMAT, KIND, Submission
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 SPLIT = small_split()
 PROTOCOL = EvalProtocol(episodes=4)
 EXPECTED = expected_robots(SPLIT, PROTOCOL, default_library())
 VERSION = "0.7.1"
+BASELINE = {"mode": "", "training_seed": None}
+"""Changes of the data of a baseline."""
+TEST = -1
+"""Index of the test robot."""
 
 
 def outcomes(expected, successes=3, episodes=4, near=150.0):
@@ -46,3 +54,17 @@ def data(method="ours", split=SPLIT, expected=EXPECTED, protocol=PROTOCOL, **mor
         "evaluation": msgspec.to_builtins(protocol.as_data(split)),
         "robots": [outcomes(each, **more) for each in expected],
     }
+
+
+def submission(values=None, **more):
+    return read_record(values or data(**more), Submission, "s.json", BenchmarkError)
+
+
+def changed(*keys, value, **more):
+    """Return the data of a submission with another value at a path of keys."""
+    values = copy.deepcopy(data(**more))
+    entry = values
+    for key in keys[:-1]:
+        entry = entry[key]
+    entry[keys[-1]] = value
+    return values

@@ -17,8 +17,12 @@ from morphgen.rl.ppo import (
     KL_FACTOR,
     MIN_ACTOR_LR_SCALE,
     Learner,
+    gae,
+    half_square,
+    matching_loss,
     next_actor_lr_scale,
     policy_loss,
+    symexp,
     symlog,
 )
 
@@ -298,3 +302,75 @@ def test_one_policy_learns_two_robots_and_two_tasks(agent, discrete, options):
     assert reports[-1].success > 0.85
     assert min(reports[-1].scores) > max(reports[0].scores) + 0.2
     assert reports[-1].explained_variance > 0.5
+
+
+def column(*numbers):
+    return torch.tensor(numbers)[:, None]
+
+
+NEVER, MIDDLE = (False, False, False), (False, True, False)
+
+
+@pytest.mark.parametrize(
+    ("terminated", "truncated", "ahead", "wanted"),
+    [
+        # delta: 1 + 18 - 10 = 9; 2 + 27 - 20 = 9; 3 + 36 - 30 = 9. Each passes on 0.45 of the next.
+        (NEVER, NEVER, 30.0, [9 + 0.45 * (9 + 0.45 * 9), 9 + 0.45 * 9, 9.0]),
+        # The middle delta loses its 27, and nothing of the last step passes on to it.
+        (MIDDLE, NEVER, 30.0, [9 + 0.45 * (2 - 20), 2.0 - 20, 9.0]),
+        # 50 is the value of the episode's last observation: 2 + 45 - 20 = 27.
+        (NEVER, MIDDLE, 50.0, [9 + 0.45 * 27, 27.0, 9.0]),
+        (MIDDLE, MIDDLE, 50.0, [9 + 0.45 * (2 - 20), 2.0 - 20, 9.0]),
+    ],
+    ids=["unfinished", "terminated", "truncated", "both"],
+)
+def test_advantages_by_hand(terminated, truncated, ahead, wanted):
+    rewards, values = column(1.0, 2.0, 3.0), column(10.0, 20.0, 30.0)
+    ends = column(*terminated), column(*truncated)
+    found = gae(rewards, values, column(20.0, ahead, 40.0), *ends, gamma=0.9, gae_lambda=0.5)
+    torch.testing.assert_close(found[:, 0], torch.tensor(wanted))
+
+
+def test_environments_are_independent():
+    rewards = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    values, ahead = rewards.flip(0), rewards.roll(1, 0)
+    over = torch.zeros(5, 3, dtype=torch.bool)
+    over[2, 1] = True
+    inputs = (rewards, values, ahead, over, torch.zeros_like(over))
+    whole = gae(*inputs, gamma=0.9, gae_lambda=0.5)
+    for i in range(3):
+        one = gae(*(each[:, i : i + 1] for each in inputs), gamma=0.9, gae_lambda=0.5)
+        torch.testing.assert_close(whole[:, i : i + 1], one)
+
+
+def test_symexp_is_the_inverse_of_symlog_which_is_odd_and_logarithmic():
+    x = torch.tensor([-5e4, -3.0, -1e-6, 0.0, 1e-6, 0.5, 7.0, 1e5])
+    torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-5, atol=0)
+    assert symlog(-x).equal(-symlog(x))
+    torch.testing.assert_close(symlog(torch.tensor(torch.e - 1)), torch.tensor(1.0))
+
+
+def test_the_matching_loss_is_zero_at_the_target_and_its_gradient_the_error():
+    x = torch.linspace(-4, 4, 33).requires_grad_()
+    y = torch.linspace(30, -30, 33)
+    matching_loss(x, y).sum().backward()
+    torch.testing.assert_close(x.grad, symexp(x.detach()) - y)
+    torch.testing.assert_close(matching_loss(symlog(y), y), torch.zeros(33), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("loss", "read"), [(matching_loss, symexp), (half_square, lambda x: x)], ids=["symlog", "plain"]
+)
+def test_the_minimum_of_the_loss_is_the_mean(loss, read):
+    returns = torch.tensor([-3.0, 0.0, 1.0, 20.0])
+    x = torch.zeros((), requires_grad=True)
+    optimiser = torch.optim.LBFGS([x], max_iter=50)
+
+    def closure():
+        optimiser.zero_grad()
+        lost = loss(x.expand(4), returns).mean()
+        lost.backward()
+        return lost
+
+    optimiser.step(closure)
+    assert read(x.detach()).item() == pytest.approx(returns.mean().item(), rel=1e-4)

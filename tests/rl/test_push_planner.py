@@ -1,4 +1,4 @@
-"""Push plans: a collision-free path behind the block, without overhang."""
+"""Push plans: a collision-free path behind the block, and the contacts with it."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -7,16 +7,25 @@ import numpy as np
 import pytest
 
 from helpers.goal_sets import draw_spec
-from helpers.scenes import robot
+from helpers.scenes import ball, robot
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
+from morphgen.model.geometry import Box, Pose, Shape
+from morphgen.model.robot import Link
 from morphgen.rl.baselines import push_planner
-from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics, find_contacts
+from morphgen.rl.baselines.push_planner import (
+    SPEED,
+    PushPlanner,
+    ToolKinematics,
+    find_contacts,
+    overhang,
+)
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import member_spec
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
+from morphgen.tasks.sim.base import Block, Scene
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 
@@ -61,7 +70,7 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
 
     def said(space, configurations, blocks, edge):
         assert blocks.shape == (len(configurations), 7)
-        assert (blocks[:, 1] > block[1]).all()
+        assert (blocks[:, 1] >= block[1]).all()
         return near(configurations).astype(float)
 
     monkeypatch.setattr(push_planner, "overhang", said)
@@ -100,3 +109,47 @@ def test_the_tool_can_turn_around():
     reached = tool.poses(tool.move_towards(q, position, turned, 60))
     assert np.abs(reached[0] - position).max() < 5e-3
     assert np.abs(reached[1] - turned).max() < 0.02
+
+
+def test_contacts_are_found_where_the_robot_touches_the_block():
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
+
+    def found(height):
+        scene = Scene(ball(height), block=Block((0.4, 0.4, 0.4)), ground=None)
+        return find_contacts(FreeSpace(scene), q, block, 0.4)
+
+    low = found(0.2)
+    assert low.q.tolist() == q[:2].tolist()
+    assert low.gap == pytest.approx(0.2, abs=0.002)
+    assert low.offset == pytest.approx([0.0, 0.1], abs=0.05)
+    assert low.width == pytest.approx(0.5, abs=0.12)
+    assert low.overhang.max() == 0
+    assert found(0.35).overhang.min() > 0.5
+
+
+@pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
+def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
+    """A box that touches the block below its middle, and a brim at its upper edge."""
+    foot = Shape(Box((0.2, 0.1, 0.1)))
+    brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
+    wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
+    assert found.overhang[0] == pytest.approx(over, abs=0.0035)
+
+    beyond = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
+    each = overhang(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
+    assert each[0] == found.overhang[0]
+    assert each[1] == 0
+
+
+def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
+    plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
+    wide = ball(0.2).with_links([plate])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.width[0] == 1

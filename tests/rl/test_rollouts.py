@@ -1,4 +1,4 @@
-"""Episodes of a controller do not depend on the number of threads."""
+"""Episodes of controllers: they run in one thread, and may end early."""
 
 from contextlib import closing
 
@@ -45,3 +45,16 @@ def test_played_episodes_run_in_one_thread(two_threads, tmp_path):
     with closing(env):
         list(play(env, controller, 1, 0, lambda episode: None))
     assert controller.threads == {1}
+
+
+def test_an_episode_ends_early_after_successes_in_a_row(tmp_path):
+    spec = read_controller("ik", "reach")
+    env, controller = make_env_and_controller(spec, "arm3-stick", 0, sim="mujoco", cache=tmp_path)
+    with closing(env):
+        early, whole = [], []
+        list(play(env, controller, 2, 0, early.append, max_successes=5))
+        list(play(env, controller, 2, 0, whole.append))
+    assert [episode.steps for episode in whole] == [300, 300]
+    for episode in early:
+        assert episode.success
+        assert 5 <= episode.steps < 300

@@ -1,48 +1,20 @@
 """Submissions: their file, every check, scores, ranking and references."""
 
-import copy
 import json
 import math
 
-import msgspec
-import numpy as np
 import pytest
 
 from helpers.runs import small_source, small_split
-from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, VERSION, data
+from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, TEST, VERSION, changed, data, submission
 from morphgen.benchmark.split import split_id
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.formats.records import read_record
-from morphgen.grammar.library import default_library
-from morphgen.rl.scores import leaderboard as reference_scores
-from morphgen.rl.scores.episode_table import EPISODES, append_submission
-from morphgen.rl.scores.leaderboard import (
-    Row,
-    SideScore,
-    collect_references,
-    random_scores,
-    ranked,
-    ranking_table,
-    read_references,
-    reference_files,
-    score_submission,
-)
-from morphgen.rl.scores.scores import stratified_mean_interval
 from morphgen.rl.scores.submission import (
-    Submission,
     check_submission,
     read_submission,
     submission_text,
 )
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
-
-LIBRARY = default_library()
-TEST = -1
-"""Index of the test robot."""
-
-
-def submission(values=None, **more):
-    return read_record(values or data(**more), Submission, "s.json", BenchmarkError)
 
 
 def check(values):
@@ -63,16 +35,6 @@ def test_a_submission_is_read_as_it_was_written(tmp_path):
     path.write_text(submission_text(submission()))
     assert read_submission(path) == submission()
     assert json.loads(path.read_text()) == data()
-
-
-def changed(*keys, value):
-    """Return the data of a submission with another value at a path of keys."""
-    values = copy.deepcopy(data())
-    entry = values
-    for key in keys[:-1]:
-        entry = entry[key]
-    entry[keys[-1]] = value
-    return values
 
 
 FAULTS = {
@@ -164,135 +126,6 @@ def test_other_files_are_refused(tmp_path, content):
     path.write_text(content)
     with pytest.raises(MorphgenError, match=r"s\.json"):
         read_submission(path)
-
-
-def test_scores_are_computed_from_the_episodes():
-    row = score_submission(submission())
-    assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
-    assert [(each.side, each.task, each.robots) for each in row.sides] == [
-        ("train", "reach", 2),
-        ("test", "reach", 1),
-    ]
-    test = row.group("test", "reach")
-    relative = np.array([150, 151, 152, -1]) + 2
-    assert (test.score, test.success) == (relative.mean(), 0.75)
-    interval = stratified_mean_interval([relative])
-    assert (test.low, test.high) == (interval.low, interval.high)
-    train = row.group("train", "reach")
-    assert train.score == relative.mean()
-    assert test.high - test.low > train.high - train.low > 0
-
-
-def test_the_random_scores_of_a_release_replace_those_of_a_submission():
-    forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
-    check(forged)
-    assert score_submission(submission(forged)).group("test", "reach").score > 600
-    random = random_scores(submission())
-    fair = score_submission(submission(forged), random)
-    assert fair.sides == score_submission(submission()).sides
-
-
-def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
-    random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
-    for episodes in (4, 5, 8):
-        each = submission(data(episodes=episodes))
-        score = score_submission(each, random).group("test", "reach").score
-        assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
-
-
-def row(method, *sides):
-    return Row(method, "submission", "", (), 34, tuple(SideScore(*side) for side in sides))
-
-
-def test_rows_are_ranked_by_the_test_robots():
-    rows = [
-        row("low", ("test", "reach", 1, 10.0, 0.5), ("train", "reach", 9, 99.0, 1.0)),
-        row("high", ("test", "reach", 1, 20.0, 0.1)),
-        row("none", ("train", "reach", 9, 99.0, 1.0)),
-    ]
-    assert [each.method for each in ranked(rows)] == ["high", "low", "none"]
-    mixed = [
-        row("a", ("test", "reach", 1, 90.0, 0.5), ("test", "push", 3, 0.1, 0.1)),
-        row("b", ("test", "reach", 1, 10.0, 0.3), ("test", "push", 3, 0.9, 0.9)),
-    ]
-    assert [each.method for each in ranked(mixed)] == ["b", "a"]
-    # A baseline that can do one task only has a score, but no success rate over all robots.
-    partial = row("ik", ("test", "reach", 1, 200.0, 1.0))
-    assert [each.method for each in ranked([partial, *mixed])] == ["b", "a", "ik"]
-    header, _, first, *_ = ranking_table(rows).splitlines()
-    assert header.split()[:4] == ["rank", "method", "from", "seeds"]
-    assert first.split()[:6] == ["1", "high", "submission", "-", "20.0", "10%"]
-
-
-def test_fine_tuned_policies_are_told_from_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
-    training = {"simulator": "warp", "transitions": 1000}
-    tuned = data() | {"training": training | {"finetuned": 30_000}}
-    for name, values in (("zero-shot", data() | {"training": training}), ("tuned", tuned)):
-        (tmp_path / f"{name}.json").write_text(json.dumps(values))
-    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json")]
-    references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
-    assert set(reference_files(references)) == {
-        *("scores.json", "submissions/ours-seed0.json"),
-        "submissions/ours-fine-tuned-30000-seed0.json",
-    }
-    assert [each.label for each in references.rows()] == ["ours (fine-tuned 30,000)", "ours"]
-    assert "ours (fine-tuned 30,000)" in ranking_table(references.rows())
-
-
-def test_references_are_submissions_and_episodes_of_studies(tmp_path, monkeypatch):
-    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
-    baseline = data("random") | {"mode": "", "training_seed": None}
-    for method, values in (("random", baseline), ("ours", data()), ("other", data("random"))):
-        (tmp_path / f"{method}.json").write_text(json.dumps(values))
-    policy = data("me-mlp") | {"training_seed": 3, "config": {"of": "its study"}}
-    (tmp_path / "study").mkdir()
-    append_submission(tmp_path / "study" / EPISODES, submission(policy))
-    names = ("random.json", "ours.json", "other.json", "study")
-    paths = [tmp_path / name for name in names]
-    files = reference_files(collect_references(paths, SPLIT, PROTOCOL, LIBRARY))
-    assert set(files) == {
-        *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
-        *("submissions/me-mlp-seed3.json", "submissions/random-seed0.json"),  # of this name
-    }
-    again = collect_references(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
-    assert files == reference_files(again)
-    for name, content in files.items():
-        (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "release" / name).write_bytes(content)
-    rows = read_references(tmp_path / "release").rows()
-    assert {(each.method, each.source, each.seeds) for each in rows} == {
-        ("ours", "reference", (0,)),
-        ("random", "reference", ()),
-        ("random", "reference", (0,)),
-        ("me-mlp", "reference", (3,)),
-    }
-    assert json.loads(files["scores.json"])["rows"] == json.loads(
-        json.dumps(msgspec.to_builtins(rows))
-    )
-    assert read_references(tmp_path).rows() == []
-    baseline["robots"] = baseline["robots"][TEST:]
-    (tmp_path / "random.json").write_text(json.dumps(baseline))
-    with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
-        collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
-    with pytest.raises(BenchmarkError, match=r"train robot [a-z-]+: the release has no episodes"):
-        score_submission(submission(), random_scores(submission(baseline)))
-
-
-def test_references_of_other_splits_and_rules_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(reference_scores, "version", lambda name: VERSION)
-    append_submission(tmp_path / EPISODES, submission())
-    other = small_split(task="push")
-    with pytest.raises(BenchmarkError, match=r"no scores of split mine/small, id "):
-        collect_references([tmp_path], other, PROTOCOL, LIBRARY)
-    (tmp_path / "a.json").write_text(json.dumps(data(near=100.0)))
-    with pytest.raises(BenchmarkError, match=r"another submission of ours is there"):
-        collect_references([tmp_path], SPLIT, PROTOCOL, LIBRARY)
-    strict = EvalProtocol(episodes=5)
-    with pytest.raises(BenchmarkError, match=r"evaluation\.episodes: 4; expected 5 or more"):
-        collect_references([tmp_path], SPLIT, strict, LIBRARY)
-    with pytest.raises(BenchmarkError, match="no such file or folder"):
-        collect_references([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
 
 
 def test_the_rules_of_an_evaluation_are_read_as_they_were_written():

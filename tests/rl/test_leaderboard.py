@@ -1,0 +1,275 @@
+"""Scores of submissions, their ranking, and the reference scores of releases and studies."""
+
+import json
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from helpers.runs import small_split
+from helpers.submissions import (
+    BASELINE,
+    EXPECTED,
+    PROTOCOL,
+    SPLIT,
+    TEST,
+    VERSION,
+    changed,
+    data,
+    submission,
+)
+from morphgen.benchmark.survey import BaselineResult
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.library import default_library
+from morphgen.rl.scores import leaderboard
+from morphgen.rl.scores.episode_table import EPISODES, append_submission
+from morphgen.rl.scores.leaderboard import (
+    References,
+    Row,
+    SideScore,
+    collect_references,
+    random_scores,
+    ranked,
+    ranking_table,
+    read_references,
+    reference_files,
+    score_submission,
+    study_results,
+)
+from morphgen.rl.scores.scores import stratified_mean_interval
+from morphgen.rl.scores.submission import require_same_random
+from morphgen.tasks.goals.eval_protocol import EvalProtocol
+
+LIBRARY = default_library()
+
+
+@pytest.fixture
+def this_version(monkeypatch):
+    monkeypatch.setattr(leaderboard, "version", lambda name: VERSION)
+
+
+def test_scores_are_computed_from_the_episodes():
+    row = score_submission(submission())
+    assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
+    assert [(each.side, each.task, each.robots) for each in row.sides] == [
+        ("train", "reach", 2),
+        ("test", "reach", 1),
+    ]
+    test = row.group("test", "reach")
+    relative = np.array([150, 151, 152, -1]) + 2
+    assert (test.score, test.success) == (relative.mean(), 0.75)
+    interval = stratified_mean_interval([relative])
+    assert (test.low, test.high) == (interval.low, interval.high)
+    train = row.group("train", "reach")
+    assert train.score == relative.mean()
+    assert test.high - test.low > train.high - train.low > 0
+
+
+def test_the_random_scores_of_a_release_replace_those_of_a_submission():
+    forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
+    assert score_submission(submission(forged)).group("test", "reach").score > 600
+    random = random_scores(submission())
+    fair = score_submission(submission(forged), random)
+    assert fair.sides == score_submission(submission()).sides
+
+
+def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
+    random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
+    for episodes in (4, 5, 8):
+        each = submission(data(episodes=episodes))
+        score = score_submission(each, random).group("test", "reach").score
+        assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
+
+
+def row(method, *sides):
+    return Row(method, "submission", "", (), 34, tuple(SideScore(*side) for side in sides))
+
+
+def test_rows_are_ranked_by_the_test_robots():
+    rows = [
+        row("low", ("test", "reach", 1, 10.0, 0.5), ("train", "reach", 9, 99.0, 1.0)),
+        row("high", ("test", "reach", 1, 20.0, 0.1)),
+        row("none", ("train", "reach", 9, 99.0, 1.0)),
+    ]
+    assert [each.method for each in ranked(rows)] == ["high", "low", "none"]
+    mixed = [
+        row("a", ("test", "reach", 1, 90.0, 0.5), ("test", "push", 3, 0.1, 0.1)),
+        row("b", ("test", "reach", 1, 10.0, 0.3), ("test", "push", 3, 0.9, 0.9)),
+    ]
+    assert [each.method for each in ranked(mixed)] == ["b", "a"]
+    # A baseline that can do one task only has a score, but no success rate over all robots.
+    partial = row("ik", ("test", "reach", 1, 200.0, 1.0))
+    assert [each.method for each in ranked([partial, *mixed])] == ["b", "a", "ik"]
+    header, _, first, *_ = ranking_table(rows).splitlines()
+    assert header.split()[:4] == ["rank", "method", "from", "seeds"]
+    assert first.split()[:6] == ["1", "high", "submission", "-", "20.0", "10%"]
+
+
+def test_fine_tuned_policies_are_told_from_others(tmp_path, this_version):
+    training = {"simulator": "warp", "transitions": 1000}
+    tuned = data() | {"training": training | {"finetuned": 30_000}}
+    for name, values in (("zero-shot", data() | {"training": training}), ("tuned", tuned)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(values))
+    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json")]
+    references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
+    assert set(reference_files(references)) == {
+        *("scores.json", "submissions/ours-seed0.json"),
+        "submissions/ours-fine-tuned-30000-seed0.json",
+    }
+    assert [each.label for each in references.rows()] == ["ours (fine-tuned 30,000)", "ours"]
+    assert "ours (fine-tuned 30,000)" in ranking_table(references.rows())
+
+
+def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_version):
+    baseline = data("random") | BASELINE
+    for method, values in (("random", baseline), ("ours", data()), ("other", data("random"))):
+        (tmp_path / f"{method}.json").write_text(json.dumps(values))
+    policy = data("me-mlp") | {"training_seed": 3, "config": {"of": "its study"}}
+    (tmp_path / "study").mkdir()
+    append_submission(tmp_path / "study" / EPISODES, submission(policy))
+    names = ("random.json", "ours.json", "other.json", "study")
+    paths = [tmp_path / name for name in names]
+    files = reference_files(collect_references(paths, SPLIT, PROTOCOL, LIBRARY))
+    assert set(files) == {
+        *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
+        *("submissions/me-mlp-seed3.json", "submissions/random-seed0.json"),  # of this name
+    }
+    again = collect_references(paths[::-1], SPLIT, PROTOCOL, LIBRARY)
+    assert files == reference_files(again)
+    for name, content in files.items():
+        (tmp_path / "release" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "release" / name).write_bytes(content)
+    rows = read_references(tmp_path / "release").rows()
+    assert {(each.method, each.source, each.seeds) for each in rows} == {
+        ("ours", "reference", (0,)),
+        ("random", "reference", ()),
+        ("random", "reference", (0,)),
+        ("me-mlp", "reference", (3,)),
+    }
+    assert json.loads(files["scores.json"])["rows"] == json.loads(
+        json.dumps(msgspec.to_builtins(rows))
+    )
+    assert read_references(tmp_path).rows() == []
+    baseline["robots"] = baseline["robots"][TEST:]
+    (tmp_path / "random.json").write_text(json.dumps(baseline))
+    with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
+        collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
+    with pytest.raises(BenchmarkError, match=r"train robot [a-z-]+: the release has no episodes"):
+        score_submission(submission(), random_scores(submission(baseline)))
+
+
+def test_references_of_other_splits_and_rules_are_refused(tmp_path, this_version):
+    append_submission(tmp_path / EPISODES, submission())
+    other = small_split(task="push")
+    with pytest.raises(BenchmarkError, match=r"no scores of split mine/small, id "):
+        collect_references([tmp_path], other, PROTOCOL, LIBRARY)
+    (tmp_path / "a.json").write_text(json.dumps(data(near=100.0)))
+    with pytest.raises(BenchmarkError, match=r"another submission of ours is there"):
+        collect_references([tmp_path], SPLIT, PROTOCOL, LIBRARY)
+    strict = EvalProtocol(episodes=5)
+    with pytest.raises(BenchmarkError, match=r"evaluation\.episodes: 4; expected 5 or more"):
+        collect_references([tmp_path], SPLIT, strict, LIBRARY)
+    with pytest.raises(BenchmarkError, match="no such file or folder"):
+        collect_references([tmp_path / "d"], SPLIT, PROTOCOL, LIBRARY)
+
+
+def with_random(*scores, robot=TEST):
+    """Return a submission whose random policy has other scores on a robot."""
+    values = data(episodes=len(scores))
+    values["robots"][robot]["random_score"] = list(scores)
+    return submission(values)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "robot"),
+    [
+        ((-9.0, -1.0, -9.0, -1.0), (-9.0, -1.0, -9.0, -5.1), TEST),
+        ((-9.0, -1.0, -9.0, -1.0), (-99.0, -99.0, -99.0, -99.0, -99.0), TEST),
+        ((-9.0, -1.0, -9.0, -1.0), (-200.0, 150.0, -200.0, 150.0), TEST),
+        ((-9.0, -1.0, -9.0, -1.0), (-99.0, -99.0, -99.0, -99.0), 0),
+    ],
+    ids=["same episodes", "more episodes", "wide", "train"],
+)
+def test_submissions_that_disagree_about_the_random_policy_are_refused(first, second, robot):
+    named = [("a", with_random(*first, robot=robot)), ("b", with_random(*second, robot=robot))]
+    for pair, last in ((named, "b"), (named[::-1], "a")):
+        with pytest.raises(BenchmarkError, match=rf"{last}: \w+ robot \S+: random_score: mean "):
+            require_same_random(pair)
+
+
+def test_submissions_agree_about_the_random_policy_up_to_rounding_and_other_episodes():
+    scores = (-9.0, -1.0, -9.0, -1.0)
+    same = with_random(-9.001, -1.0, -9.0, -1.2)
+    more = with_random(-2.0, -12.0, -1.0, -9.0, -11.0)
+    require_same_random([("a", with_random(*scores)), ("b", same), ("c", more)])
+    train = with_random(*scores, robot=0), with_random(-4.0, -12.0, -3.0, -11.0, robot=0)
+    require_same_random([("a", train[0]), ("b", train[1])])
+
+
+def test_references_that_disagree_about_the_random_policy_need_a_submission_of_it(
+    tmp_path, this_version
+):
+    forged = data("b")
+    forged["robots"][TEST]["random_score"] = [-200.0] * 4
+    baseline = data("random") | BASELINE
+    for name, values in (("a", data("a")), ("b", forged), ("random", baseline)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(values))
+    paths = [tmp_path / f"{name}.json" for name in ("a", "b", "random")]
+    with pytest.raises(BenchmarkError, match=r"random_score: mean -200\.00; expected -2\.00, as"):
+        collect_references(paths[:2], SPLIT, PROTOCOL, LIBRARY)
+    references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
+    assert "submissions/random.json" in reference_files(references)
+
+
+NAMES = [(each.side, each.member.name) for each in EXPECTED]
+
+
+def write(folder, *submissions):
+    """Write the table of a study."""
+    for values in submissions:
+        append_submission(folder / EPISODES, submission(values))
+
+
+def random_policy():
+    """Return the random policy, which scores -1 in each episode."""
+    values = data("random", successes=0) | BASELINE
+    for robot in values["robots"]:
+        robot["random_score"] = robot["score"]
+    return values
+
+
+def test_a_study_gives_the_results_of_its_baselines_in_order(tmp_path):
+    write(tmp_path, data("ik", near=100.0) | BASELINE, random_policy(), data("zero"))
+    results = study_results(tmp_path, SPLIT)
+    assert list(results) == ["random", "ik"]
+    assert results["ik"] == dict.fromkeys(NAMES, BaselineResult(77.5, 0.75))
+
+
+def test_references_give_results_relative_to_random_policy():
+    ik = submission(data("ik", near=100.0) | BASELINE)
+    policy = submission(data("zero"))  # of this name
+    results = References((ik, policy, submission(random_policy()))).results()
+    assert list(results) == ["random", "ik"]
+    assert results["random"] == dict.fromkeys(NAMES, BaselineResult(0.0, 0.0))
+    # Episodes 100, 101, 102 and -1, relative to those of random.
+    assert results["ik"] == dict.fromkeys(NAMES, BaselineResult(76.5, 0.75))
+    alone = References((ik,)).results()  # relative to the -2 in its own file
+    assert alone["ik"] == dict.fromkeys(NAMES, BaselineResult(77.5, 0.75))
+    assert References().results() == {}
+
+
+def test_studies_that_do_not_fit_are_refused(tmp_path):
+    with pytest.raises(BenchmarkError, match=r"expected the output folder of morphgen study"):
+        study_results(tmp_path, SPLIT)
+    write(tmp_path, random_policy())
+    with pytest.raises(
+        BenchmarkError, match=r"no episodes of baselines on split 'mine/smal'.* did"
+    ):
+        study_results(tmp_path, replace(SPLIT, name="mine/smal"))
+    with pytest.raises(BenchmarkError, match=r"random: of other robots: split id "):
+        study_results(tmp_path, replace(SPLIT, test=SPLIT.train[:1]))
+    evaluation = data()["evaluation"] | {"simulator": "pybullet"}
+    write(tmp_path, data("ik") | BASELINE | {"evaluation": evaluation})
+    with pytest.raises(BenchmarkError, match=r"ik: evaluation.simulator 'pybullet'; expected 'muj"):
+        study_results(tmp_path, SPLIT)
