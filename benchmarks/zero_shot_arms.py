@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
@@ -28,17 +28,10 @@ from tqdm import tqdm
 from morphgen.errors import TaskError, one_line
 from morphgen.grammar.library import default_library
 from morphgen.processes import parallel_map
-from morphgen.rl.evaluation import (
-    EvalConfig,
-    ZeroShotResult,
-    eval_config_of,
-    evaluate,
-    result_of,
-    zero_shot,
-)
+from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate, zero_shot, zero_shot_data
 from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source
-from morphgen.rl.scores.scores import finite_or_none
+from morphgen.rl.scores.scores import Score, success_of
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import IK_SHARE
@@ -67,7 +60,7 @@ class Measuring:
     policy: Path
     config: EvalConfig
 
-    def __call__(self, robot: tuple[str, str]) -> tuple[str, list[ZeroShotResult] | str]:
+    def __call__(self, robot: tuple[str, str]) -> tuple[str, dict[str, Score] | str]:
         """Return the label of a robot and its results, or why it cannot do the task.
 
         Args:
@@ -81,7 +74,8 @@ class Measuring:
             return label, one_line(str(error))
         if self.task == "reach":
             (score,) = evaluate([FollowPath], source, self.config, Interface(channels=PATH))
-            results.insert(1, result_of("path", score))
+            (policy, own), *others = results.items()
+            results = {policy: own, "path": score, **dict(others)}
         return label, results
 
 
@@ -117,19 +111,22 @@ def main() -> None:
     config = replace(eval_config_of(run, args.episodes, seed=args.seed), sim="mujoco")
     work = Measuring(args.task, args.obstacles, policy, config)
     results = parallel_map(work, list(robots.items()), args.jobs, chunk=1)
-    measured: dict[str, list[ZeroShotResult]] = {}
+    measured: dict[str, dict[str, Score]] = {}
     for label, result in tqdm(results, total=len(robots), unit="robot"):
         if isinstance(result, str):
             tqdm.write(f"left out: {label}: {result}")
         else:
             measured[label] = result
     if args.json:
-        rows = {label: [asdict(result) for result in row] for label, row in measured.items()}
-        args.json.write_text(json.dumps(finite_or_none(rows), indent=2) + "\n")
-    names = [result.controller for result in next(iter(measured.values()))]
-    rates = list(zip(*([r.success.value for r in row] for row in measured.values()), strict=True))
+        rows = {label: zero_shot_data(row) for label, row in measured.items()}
+        args.json.write_text(json.dumps(rows, indent=2) + "\n")
+    names = list(next(iter(measured.values())))
+    rates = list(
+        zip(*([s.success for s in row.values()] for row in measured.values()), strict=True)
+    )
     table: list[list[str]] = [
-        [label, *(result.success.as_percent() for result in row)] for label, row in measured.items()
+        [label, *(success_of([score]).as_percent() for score in row.values())]
+        for label, row in measured.items()
     ]
     table.append(["mean", *(f"{mean(rate):.1%}" for rate in rates)])
     table.append(["below 80%", *(str(sum(x < ENOUGH for x in rate)) for rate in rates)])

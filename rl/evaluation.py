@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,12 +23,12 @@ from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores.scores import (
-    Interval,
     RobotOutcomes,
     Score,
     episode_interval,
+    finite_or_none,
     relative_scores,
-    success_interval,
+    success_of,
 )
 from morphgen.rl.shipped_policies import name_of
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
@@ -302,43 +302,28 @@ def eval_config_of(
     return EvalConfig(episodes, sim, seed, workers, config.evaluation_tasks)
 
 
-@dataclass(frozen=True)
-class ZeroShotResult:
-    """Result of a controller on a robot."""
-
-    controller: str
-    """Name of the controller."""
-    episodes: int
-    """Number of episodes."""
-    success: Interval
-    """Success rate with its 95% Wilson interval."""
-    distance: float
-    """Mean distance from success at the end of an episode [m]."""
-    angle: float
-    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
-    score: float
-    """Mean score of the episodes; that of reach is relative to the random policy."""
-
-
-def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> list[ZeroShotResult]:
+def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> dict[str, Score]:
     """Run a policy on a robot, and the controllers that do not learn, but for zero actions.
 
-    All of them have the same starts and goals.
+    All of them have the same starts and goals. The scores are by name of the controller.
     """
     name = name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)
-    (score,) = evaluate_checkpoints([policy], source, config, "deterministic")
-    results = [result_of(name, score)]
+    scores = {name: evaluate_checkpoints([policy], source, config, "deterministic")[0]}
     for baseline in baselines_for(str(source.task)):
         if baseline != ZERO.name:
-            (score,) = evaluate_baseline(baseline, source, config)
-            results.append(result_of(baseline, score))
-    return results
+            (scores[baseline],) = evaluate_baseline(baseline, source, config)
+    return scores
 
 
-def result_of(controller: str, score: Score) -> ZeroShotResult:
-    """Return the result of a controller from its score on a robot."""
-    success = success_interval(score.success, score.episodes)
-    return ZeroShotResult(
-        controller, score.episodes, success, score.distance, score.angle, score.score
-    )
+def zero_shot_data(scores: Mapping[str, Score]) -> list[dict[str, Any]]:
+    """Return the scores of ``zero_shot`` as JSON values, with null instead of nan."""
+    return [
+        {
+            "controller": name,
+            "episodes": score.episodes,
+            "success": asdict(success_of([score])),
+            **{key: finite_or_none(getattr(score, key)) for key in ("distance", "angle", "score")},
+        }
+        for name, score in scores.items()
+    ]

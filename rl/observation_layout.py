@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -233,14 +233,6 @@ def truncate_links(observation: Observation, rows: int) -> Observation:
     return {
         name: value[:, :rows] if name in LINK_ROWS else value for name, value in observation.items()
     }
-
-
-def absent_entries(tasks: Collection[str]) -> frozenset[str]:
-    """Return the standard entries of observations, and their masks, that no task fills."""
-    filled = {field for task in tasks for field in TASKS[task].fields}
-    present = {name for field in filled for name in (field.name, field.mask)}
-    standard = {name for field in STANDARD_FIELDS for name in (field.name, field.mask)}
-    return frozenset(standard - present)
 
 
 def pad_links(actions: torch.Tensor, links: int) -> torch.Tensor:

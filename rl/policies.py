@@ -18,13 +18,14 @@ from morphgen.rl.observation_layout import (
     Layout,
     MaskedGaussian,
     MaskedMultiDiscrete,
-    absent_entries,
     bounded_log_std,
     last_link,
 )
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import STANDARD_FIELDS
 
 MAX_NORMALIZED = 5.0
 """Bound of a normalized number [standard deviations]."""
@@ -178,4 +179,7 @@ def entries_unneeded(config: PolicyConfig, tasks: Collection[str]) -> frozenset[
     """Return the entries of observations that the networks do not need, as no task fills them."""
     if AGENTS[config.agent].network.needs_all_entries:
         return frozenset()
-    return absent_entries(tasks)
+    filled = {field for task in tasks for field in TASKS[task].fields}
+    present = {name for field in filled for name in (field.name, field.mask)}
+    standard = {name for field in STANDARD_FIELDS for name in (field.name, field.mask)}
+    return frozenset(standard - present)

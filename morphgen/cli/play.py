@@ -6,8 +6,9 @@ import argparse
 import itertools
 import math
 from collections import deque
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib import import_module
 from math import degrees, isnan
 from pathlib import Path
@@ -21,9 +22,10 @@ from morphgen.rl.shipped_policies import POLICIES
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
-    from morphgen.rl.evaluation import EvalConfig, ZeroShotResult
+    from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.rollouts import Episode
     from morphgen.rl.runs.robot_source import RobotSource
+    from morphgen.rl.scores.scores import Score
 
 
 OBSTACLES = flag("--obstacles", "place the robot among obstacles")
@@ -221,10 +223,9 @@ FILM_EPISODES = 3
 )
 def zeroshot(args: argparse.Namespace) -> None:
     """Run the episodes, print the table, and write the video."""
-    from morphgen.rl.evaluation import eval_config_of, zero_shot
+    from morphgen.rl.evaluation import eval_config_of, zero_shot, zero_shot_data
     from morphgen.rl.runs.checkpoint import read_checkpoint
     from morphgen.rl.runs.robot_source import robot_source
-    from morphgen.rl.scores.scores import finite_or_none
     from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
     from morphgen.tasks.reach import GOAL_KINDS
     from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
@@ -248,29 +249,30 @@ def zeroshot(args: argparse.Namespace) -> None:
     tasks = opt.with_goal(config.tasks, args.goal, [args.task])
     config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)
     with bar(args, "running the episodes"):
-        results = zero_shot(source, policy, config)
-    rows = [finite_or_none(asdict(result)) for result in results]
-    opt.print_result(args, rows, lambda: _table(results, args.task))
+        scores = zero_shot(source, policy, config)
+    opt.print_result(args, zero_shot_data(scores), lambda: _table(scores, args.task))
     if args.out is not None:
         with status(args, "filming"):
             _film(source, policy, config, args)
         print_line(str(args.out))
 
 
-def _table(results: list[ZeroShotResult], task: str) -> str:
+def _table(scores: Mapping[str, Score], task: str) -> str:
     from tabulate import tabulate
 
+    from morphgen.rl.scores.scores import success_of
     from morphgen.tasks.registry import TASKS
 
     columns = {
-        "controller": [result.controller for result in results],
-        "success": [result.success.as_percent() for result in results],
-        "distance [m]": [f"{result.distance:.3f}" for result in results],
+        "controller": list(scores),
+        "success": [success_of([score]).as_percent() for score in scores.values()],
+        "distance [m]": [f"{score.distance:.3f}" for score in scores.values()],
     }
-    if not any(math.isnan(result.angle) for result in results):
-        columns["angle [deg]"] = [f"{math.degrees(result.angle):.1f}" for result in results]
+    if not any(math.isnan(score.angle) for score in scores.values()):
+        angles = (math.degrees(score.angle) for score in scores.values())
+        columns["angle [deg]"] = [f"{angle:.1f}" for angle in angles]
     if TASKS[task].relative_to_random:  # the score of others is their success
-        columns["score"] = [f"{result.score:.1f}" for result in results]
+        columns["score"] = [f"{score.score:.1f}" for score in scores.values()]
     return tabulate(columns, headers="keys")
 
 

@@ -204,13 +204,21 @@ class TrainingProgress:
         """
         from tqdm import tqdm
 
+        from morphgen.rl.runs.robot_source import tasks_of
+        from morphgen.tasks.registry import TASKS
+
         raise_if_interrupted()
         self.close()
         name = subrun.config.source.member or subrun.config.source.name
         diverged = Counter[str]()
         self._shown.callback(_print_divergence, name, diverged)
+        # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
+        tasks = tasks_of(subrun.config.source)
+        shown_metric = "score" if any(TASKS[t].relative_to_random for t in tasks) else "reward"
         if not sys.stderr.isatty():
-            return lambda report, total: _print_update(name, _counted(report, diverged), total)
+            return lambda report, total: _print_update(
+                name, _counted(report, diverged), total, shown_metric
+            )
         shown = tqdm(
             desc=name,
             total=subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs,
@@ -220,7 +228,7 @@ class TrainingProgress:
             dynamic_ncols=True,
         )
         self._shown.callback(shown.close)
-        return lambda report, total: _draw_update(shown, _counted(report, diverged))
+        return lambda report, total: _draw_update(shown, _counted(report, diverged), shown_metric)
 
     @contextmanager
     def stage(self, title: str) -> Iterator[None]:
@@ -242,22 +250,23 @@ class TrainingProgress:
         self._goal_bar = None
 
 
-def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics) -> None:
+def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics, metric: str) -> None:
     if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
         shown.initial = report.transitions - report.transitions // report.update
         shown.n = shown.initial
-    shown.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
+    facts = {metric: f"{getattr(report, metric):.2f}", "success": _success(report)}
+    shown.set_postfix(facts, refresh=False)
     shown.update(report.transitions - shown.n)
 
 
-def _print_update(name: str, report: UpdateMetrics, num_updates: int) -> None:
+def _print_update(name: str, report: UpdateMetrics, num_updates: int, metric: str) -> None:
     if report.update % max(num_updates // TRAINING_LINES, 1) and report.update < num_updates:
         return
     updates_left = num_updates - report.update
     seconds_left = updates_left * report.transitions / report.update / report.steps_per_second
     print(
         f"{name}: update {report.update} of {num_updates}, {report.transitions:,} steps, "
-        f"score {report.score:.2f}, success {_success(report)}, "
+        f"{metric} {getattr(report, metric):.2f}, success {_success(report)}, "
         f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left",
         file=sys.stderr,
         flush=True,

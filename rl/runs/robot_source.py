@@ -155,12 +155,6 @@ def tasks_of(source: RobotSource) -> tuple[str, ...]:
     return tuple(dict.fromkeys(member.task for member in members(source)))
 
 
-def single_members(source: RobotSource) -> Iterator[RobotSource]:
-    """Yield a source for each robot of a split's side."""
-    for member in members(source):
-        yield replace(source, member=member.name)
-
-
 def other_side(source: RobotSource, side: Side) -> RobotSource:
     """Return a whole side of the same split."""
     if source.split:
@@ -294,7 +288,12 @@ def drawn_source(
     """Return robots of grammars as a source; ``draw`` draws them."""
     folders = tuple(library)
     grammars = [
-        (load_sound_grammar(name, default_library(folders)).name, _portable(name), count)
+        # A file by its absolute path: a run may be resumed in another folder.
+        (
+            load_sound_grammar(name, default_library(folders)).name,
+            str(Path(name).resolve()) if name.endswith(SUFFIX) else name,
+            count,
+        )
         for name, count in _parse_request(request)
     ]
     names = Counter(name for name, _, _ in grammars)
@@ -417,23 +416,14 @@ def _parse_request(request: str) -> Iterator[tuple[str, int]]:
         yield name, int(count)
 
 
-def _portable(grammar: str) -> str:
-    """Return the name of a grammar, or the absolute path of its file."""
-    return str(Path(grammar).resolve()) if grammar.endswith(SUFFIX) else grammar
-
-
-def _held_out(source: RobotSource) -> tuple[str, ...]:
-    """Return the hashes of the test robots of all splits that are held out, sorted."""
-    splits = (read_split(name) for name in (*split_names(), *source.held_out))
-    return tuple(sorted({member.robot_hash for split in splits for member in split.test}))
-
-
 def _draw_all(
     source: RobotSource, config: GoalConfig, jobs: int, others: frozenset[str] = frozenset()
 ) -> DrawnRobots:
     """Draw the robots of a source, without those of test sides and those with other hashes."""
     library = default_library(tuple(map(Path, source.library)))
-    held_out, total = _held_out(source), num_drawn(source)
+    splits = (read_split(name) for name in (*split_names(), *source.held_out))
+    held_out = tuple(sorted({member.robot_hash for split in splits for member in split.test}))
+    total = num_drawn(source)
     goals = replace(config, seed=source.goal_seed)
     draw_one = partial(_draw_one, source, goals, library.folders, others | frozenset(held_out))
     kept: dict[str, tuple[Member, EnvSpec]] = {}

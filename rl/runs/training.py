@@ -44,7 +44,6 @@ from morphgen.rl.runs.robot_source import (
     members,
     num_drawn,
     require_links,
-    single_members,
     specs_of,
     write_drawn,
 )
@@ -374,7 +373,7 @@ def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
     per_robot = AGENTS[config.policy.agent].per_robot
     if not per_robot or not config.source.split or config.source.member:
         return [Subrun(folder, config)]
-    sources = list(single_members(config.source))
+    sources = [replace(config.source, member=each.name) for each in members(config.source)]
     share = 1 if config.full_budget else len(sources)
     num_envs = -(-config.num_envs // share)
     ppo = replace(config.ppo, total_timesteps=-(-config.ppo.total_timesteps // share))

@@ -6,7 +6,7 @@ import pytest
 
 from morphgen.cli import main
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.shipped_policies import POLICIES, ZERO_SHOT, ShippedPolicy, policies_for
+from morphgen.rl.shipped_policies import POLICIES, ShippedPolicy, policies_for
 
 
 @pytest.mark.parametrize("name", POLICIES.builtin)
@@ -66,14 +66,14 @@ def test_results_are_beside_controllers_that_do_not_learn(capsys):
     code = main(["zeroshot", "arm=ur5", "ee=stick", "--episodes", "2", "--json"])
     assert code == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row["controller"] for row in rows] == [ZERO_SHOT.name, "ik", "jacobian", "random"]
+    assert [row["controller"] for row in rows] == ["zero-shot", "ik", "jacobian", "random"]
     for row in rows:
         assert row["episodes"] == 2
         assert row["success"]["low"] <= row["success"]["value"] <= row["success"]["high"]
 
 
 def test_the_shipped_policy_is_for_reach_alone(capsys):
-    assert main(["play", "push", "prims", "--policy", ZERO_SHOT.name]) == 2
+    assert main(["play", "push", "prims", "--policy", "zero-shot"]) == 2
     assert "policy 'zero-shot' is for reach, not for push" in capsys.readouterr().err
 
 
@@ -86,12 +86,14 @@ def test_a_shipped_policy_is_named_like_a_checkpoint(capsys, tmp_path):
     assert "unknown" not in captured.err
     few = ["--steps", "64", "--envs", "2", "--set", "num_steps=8", "--set", "minibatches=2"]
     assert main(["finetune", *words, *few, "--no-tensorboard", "--out", str(tmp_path)]) == 0
-    assert read_checkpoint(tmp_path / "checkpoint.pt")[0].initial_checkpoint == str(ZERO_SHOT.file)
+    assert read_checkpoint(tmp_path / "checkpoint.pt")[0].initial_checkpoint == str(
+        POLICIES["zero-shot"].file
+    )
 
 
 def test_other_packages_register_policies(monkeypatch, capsys):
     monkeypatch.setattr(POLICIES, "_loaded", {})
-    POLICIES.register(ShippedPolicy("mine", ZERO_SHOT.file, ("reach",)))
+    POLICIES.register(ShippedPolicy("mine", POLICIES["zero-shot"].file, ("reach",)))
     poses = ("zero-shot-pose", "zero-shot-pose-obstacles")
     assert policies_for("reach")[-5:] == ("zero-shot", "zero-shot-obstacles", *poses, "mine")
     words = ["arm=arm3", "ee=stick", "--policy", "mine", "--sim", "mujoco"]
