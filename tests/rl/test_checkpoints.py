@@ -98,15 +98,6 @@ def test_saving_the_state_does_not_change_the_learner():
     assert equal(weights(looked_at), weights(alone))
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_run():
-    runs = [learner(seed=seed) for seed in (1, 1, 2)]
-    for each in runs:
-        each.iterate()
-    assert equal(weights(runs[0]), weights(runs[1]))
-    assert not equal(weights(runs[0]), weights(runs[2]))
-
-
 def test_resume_rejects_checkpoints_of_other_runs_and_changes_nothing():
     made = learner()
     before = weights(made)

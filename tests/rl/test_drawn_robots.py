@@ -120,19 +120,6 @@ def test_test_robots_of_splits_are_never_drawn(tmp_path):
     assert shipped < set(robots.held_out)
 
 
-def test_shipped_test_robots_are_never_drawn(monkeypatch):
-    free = draw(drawn_source("cubes:2", "reach"), FEW)
-    test = Member("cube", "cubes", free.members[0].derivation, "reach", False, hashes(free)[0])
-    own = split((member("base=planar ee=cube"),), (test,))
-    monkeypatch.setattr(drawn_robots, "_drawn", {})
-    monkeypatch.setattr(drawn_robots, "split_names", lambda: ["own"])
-    monkeypatch.setattr(drawn_robots, "read_split", lambda name: own)
-    assert [each.name[-1] for each in draw(drawn_source("cubes:2", "reach"), FEW).members] == [
-        "1",
-        "2",
-    ]
-
-
 def test_equal_robots_are_drawn_once(grammar_file):
     path = grammar_file("robot -> cubes(size=0.1) | cubes(size=0.2)")
     robots = draw(drawn_source(f"{path}:2", "reach"), FEW)

@@ -166,21 +166,6 @@ def test_the_cheapest_path_is_taken(with_tree, goals, goal_cost, deadline, goal)
     assert planner.plan_straight(start, np.array(goals), **options).goal == goal
 
 
-@pytest.mark.parametrize("far", [0.0, 0.03, 0.0501, 0.0999, 0.1499, 0.52, 0.999])
-def test_tested_configurations_are_no_farther_apart_than_the_resolution(far):
-    class Recording(FreeSpace):
-        def free(self, q, blocks=None):
-            self.tested = np.array(q)
-            return super().free(q, blocks)
-
-    space = Recording(space_of().scene)
-    start = np.array([-0.5, -0.5])
-    end = start + np.array([far, far / 3])
-    assert PathPlanner(space, STEP, 0).plan_straight(start, end[None]) is not None
-    assert space.tested[[0, -1]] == pytest.approx(np.array([end, start]))
-    assert np.abs(np.diff(space.tested, axis=0)).max() <= RESOLUTION + 1e-12
-
-
 @pytest.fixture
 def slider_batch(tmp_path):
     batches = []
@@ -222,3 +207,14 @@ def test_followers_take_paths_of_any_length(slider_batch):
     finished = torch.stack([follower.advance() for _ in range(27)])
     assert finished[:, 0].tolist() == [False] * 26 + [True]
     assert follower.waypoint[1].numpy() == pytest.approx(other, abs=1e-6)
+
+
+@pytest.mark.parametrize("far", [0.0, 0.0501, 0.0999, 0.52])
+def test_tested_configurations_are_no_farther_apart_than_the_resolution(far, monkeypatch):
+    space, tested, free = space_of(), [], FreeSpace.free
+    monkeypatch.setattr(FreeSpace, "free", lambda *args: tested.append(args[1]) or free(*args))
+    start = np.array([-0.5, -0.5])
+    end = start + np.array([far, far / 3])
+    assert PathPlanner(space, STEP, 0).plan_straight(start, end[None]) is not None
+    assert tested[-1][[0, -1]] == pytest.approx(np.array([end, start]))
+    assert np.abs(np.diff(tested[-1], axis=0)).max() <= RESOLUTION + 1e-12

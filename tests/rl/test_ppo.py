@@ -36,11 +36,16 @@ def test_policy_loss_by_hand():
 
 def test_the_learning_rate_falls_linearly_over_the_updates():
     trainer = learner()
-    rates = []
+    reports = []
     while not trainer.done:
-        rates.append(trainer.iterate().learning_rate)
-    assert trainer.num_updates == 4
+        reports.append(trainer.iterate())
+    rates = [each.learning_rate for each in reports]
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
+    assert [each.transitions for each in reports] == [64, 128, 192, 256]
+    for each in reports:
+        assert sum(each.terms.values()) == pytest.approx(each.reward, rel=1e-5)
+        seconds = each.collect_seconds + each.learn_seconds
+        assert each.steps_per_second == pytest.approx(64 / seconds)
 
 
 @pytest.mark.parametrize(
@@ -191,28 +196,6 @@ def test_gradients_of_actor_and_critic_are_clipped_separately():
         left = torch.stack([each.grad.norm() for each in network.parameters()]).norm()
         assert getattr(report, norm) > 1e-3
         assert left.item() == pytest.approx(1e-3, rel=1e-2)
-
-
-def test_update_metrics_match_the_rollout():
-    batch = OnALine(8, horizon=4)
-    steps = []
-    step = batch.step
-    batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
-    report = learner(batch).iterate()
-    over = torch.stack([each.terminated | each.truncated for each in steps])
-    scores = torch.stack([each.score for each in steps])
-    success = torch.stack([each.success for each in steps])[over].float()
-    assert report.update == 1
-    assert report.transitions == 64
-    assert report.episodes == over.sum()
-    assert report.success == pytest.approx(success.mean().item())
-    assert report.score == pytest.approx(scores.mean().item())
-    by_robot = [scores[:, ::2].mean().item(), scores[:, 1::2].mean().item()]
-    assert report.scores == pytest.approx(by_robot)
-    assert sum(report.terms.values()) == pytest.approx(report.reward, rel=1e-5)
-    assert report.steps_per_second == pytest.approx(
-        64 / (report.collect_seconds + report.learn_seconds)
-    )
 
 
 @pytest.mark.parametrize("fixed", [False, True])
