@@ -17,16 +17,14 @@ from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.registry import CHANNELS
 
-MAX_NUM_STEPS = 16_384
-"""Largest rollout length per environment; a rollout is held in memory."""
+MAX_NUM_STEPS = 16_384  # largest rollout length per environment; a rollout is held in memory
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
     """An agent and its networks: actor and critic have the same sizes and share no weights."""
 
-    agent: str = "me-tf"
-    """Name in ``morphgen.rl.agents.AGENTS``."""
+    agent: str = "me-tf"  # name in `morphgen.rl.agents.AGENTS`
     discrete: bool = True
     """Actions are bins rather than numbers (paper: bins for reach, numbers for push)."""
     fixed_std: bool = False
@@ -38,8 +36,7 @@ class PolicyConfig:
     """Show the tool's position to the networks (ours; the paper's policies have to infer it)."""
     observe: tuple[str, ...] = ()
     """Further observation channels, of ``morphgen.tasks.registry.CHANNELS``, in that order."""
-    normalize: bool = False
-    """Normalize the kinematic channels by their running means and variances."""
+    normalize: bool = False  # normalize the kinematic channels by their running means and variances
     residual: bool = False
     """Add the steps that the channel ``ik`` shows to the mean actions. The policy learns what to
     change about them (Silver et al. 2018, Residual policy learning, arXiv 1812.06298)."""
@@ -126,16 +123,11 @@ class PPOConfig:
 
     total_timesteps: int = 2_000_000
     """Control steps of all environments together; rounded up to whole updates (paper: 1.28e9)."""
-    num_steps: int = 128
-    """Rollout length per environment between updates [control steps] (paper)."""
-    epochs: int = 4
-    """Passes over a rollout per update (paper)."""
-    minibatches: int = 16
-    """Minibatches per epoch (paper)."""
-    clip_coef: float = 0.2
-    """Clip range of the ratio of action probabilities (paper)."""
-    gamma: float = 0.99
-    """Discount factor (paper)."""
+    num_steps: int = 128  # rollout length per environment between updates [control steps] (paper)
+    epochs: int = 4  # passes over a rollout per update (paper)
+    minibatches: int = 16  # minibatches per epoch (paper)
+    clip_coef: float = 0.2  # clip range of the ratio of action probabilities (paper)
+    gamma: float = 0.99  # discount factor (paper)
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation (Schulman et al. 2017)."""
     learning_rate: float = 3e-4
@@ -173,10 +165,8 @@ class PPOConfig:
     curriculum: bool = True
     """Move the line of the push task from near to far during training; reach has no curriculum
     (paper)."""
-    bf16: bool = False
-    """Run the networks in bfloat16, by autocast."""
-    compile: bool = False
-    """Run networks and losses by ``torch.compile``; on a GPU as CUDA graphs."""
+    bf16: bool = False  # run the networks in bfloat16, by autocast
+    compile: bool = False  # run networks and losses by `torch.compile`; on a GPU as CUDA graphs
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -41,20 +41,16 @@ MAX_ENVS_PER_ROBOT = 34
 EVAL_SEED_OFFSET = 0x5C0_4E5
 """Mixed into the seed, so that evaluation episodes differ from training ones with the same seed."""
 
-MakeController = Callable[[], Controller]
-"""Function that returns a new controller."""
+MakeController = Callable[[], Controller]  # function that returns a new controller
 
 
 @dataclass(frozen=True)
 class EvalConfig:
     """Configuration of an evaluation."""
 
-    episodes: int = 34
-    """Minimum number of complete episodes per robot."""
-    sim: str = DEFAULT_SIMULATOR
-    """Name of the simulator."""
-    seed: int = 0
-    """Seed of the episodes."""
+    episodes: int = 34  # minimum number of complete episodes per robot
+    sim: str = DEFAULT_SIMULATOR  # name of the simulator
+    seed: int = 0  # seed of the episodes
     workers: int = 1
     """Number of PyBullet processes, or of MuJoCo threads; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)

@@ -19,8 +19,7 @@ from morphgen.tasks.task import STANDARD_FIELDS
 MIN_LOG_STD, MAX_LOG_STD, INITIAL_LOG_STD = -4.0, 0.5, -0.7
 """Log of the Gaussian's standard deviation: its bounds, and its initial value. 0.5 is half of a
 joint's step per control step."""
-REST = BINS.index(0.0)
-"""The bin that moves nothing."""
+REST = BINS.index(0.0)  # the bin that moves nothing
 
 
 def bounded_log_std(raw: torch.Tensor) -> torch.Tensor:
@@ -36,12 +35,10 @@ def bounded_log_std(raw: torch.Tensor) -> torch.Tensor:
 class MaskedGaussian:
     """Independent normal distributions, one per link."""
 
-    mean: torch.Tensor
-    """Means, shape (n, L)."""
+    mean: torch.Tensor  # means, shape (n, L)
     log_std: torch.Tensor
     """Log of the standard deviations, shape (n, L), or one that broadcasts to it."""
-    mask: torch.Tensor
-    """Movable links, shape (n, L), bool."""
+    mask: torch.Tensor  # movable links, shape (n, L), bool
 
     def mode(self) -> torch.Tensor:
         """Return the mean actions, shape (n, L); 0 for links that do not move."""
@@ -68,10 +65,8 @@ class MaskedGaussian:
 class MaskedMultiDiscrete:
     """Independent choices among ``BINS``, one per link."""
 
-    logits: torch.Tensor
-    """Logits of the bins, shape (n, L, 11)."""
-    mask: torch.Tensor
-    """Movable links, shape (n, L), bool."""
+    logits: torch.Tensor  # logits of the bins, shape (n, L, 11)
+    mask: torch.Tensor  # movable links, shape (n, L), bool
 
     def mode(self) -> torch.Tensor:
         """Return the bins nearest to the mean actions, shape (n, L), int64.
@@ -134,24 +129,17 @@ KNOWN = {
 class Layout:
     """Sizes and channels of the observations that a network is built for."""
 
-    links: int
-    """Rows of link tokens, L."""
-    token: int
-    """Numbers per link token."""
-    obstacles: int
-    """Rows of obstacle tokens, O."""
-    points: int
-    """Points of the cloud, P; 0 without a cloud."""
-    channels: tuple[str, ...]
-    """Names of the entries of ``CHANNELS`` that the observations contain."""
-    tool: bool = False
-    """Whether the observations have the tool's position."""
+    links: int  # rows of link tokens, L
+    token: int  # numbers per link token
+    obstacles: int  # rows of obstacle tokens, O
+    points: int  # points of the cloud, P; 0 without a cloud
+    channels: tuple[str, ...]  # names of the entries of `CHANNELS` that the observations contain
+    tool: bool = False  # whether the observations have the tool's position
     fields: tuple[tuple[str, int, str], ...] = ()
     """Name, size and mask of the fields that tasks of other packages declare, by name."""
     vectors: tuple[tuple[str, int], ...] = ()
     """Name and size of the kinematic channels, which have a vector per link."""
-    tree: bool = False
-    """Whether the observations have the entries of ``TREE``."""
+    tree: bool = False  # whether the observations have the entries of `TREE`
 
     def as_data(self) -> dict[str, Any]:
         """Return plain data for a checkpoint; without the entries of newer versions if unused."""

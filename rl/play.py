@@ -23,20 +23,16 @@ from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import TaskConfig
 
-STRIDE = 2
-"""Control steps between two frames."""
-FPS = 1 / (STRIDE * CONTROL_PERIOD)
-"""Frames per second, so that videos run in real time: 25."""
+STRIDE = 2  # control steps between two frames
+FPS = 1 / (STRIDE * CONTROL_PERIOD)  # frames per second, so that videos run in real time: 25
 
 
 @dataclass(frozen=True, eq=False)
 class ControllerSpec:
     """A controller for one task: a baseline, or the policy of a checkpoint."""
 
-    name: str
-    """Name of a baseline or a shipped policy, or path of a checkpoint."""
-    task: str
-    """Name of the task."""
+    name: str  # name of a baseline or a shipped policy, or path of a checkpoint
+    task: str  # name of the task
     task_config: TaskConfig
     """Constants of the task that the checkpoint's run is evaluated with, else the defaults."""
     interface: Interface = field(default_factory=Interface)

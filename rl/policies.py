@@ -27,8 +27,7 @@ from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import STANDARD_FIELDS
 
-MAX_NORMALIZED = 5.0
-"""Bound of a normalized number [standard deviations]."""
+MAX_NORMALIZED = 5.0  # bound of a normalized number [standard deviations]
 MIN_VARIANCE = 1e-4
 """Smallest variance to divide by: columns that hardly vary in training stay small elsewhere."""
 

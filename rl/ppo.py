@@ -115,8 +115,7 @@ KL_FACTOR = 1.2
 """Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
 MIN_ACTOR_LR_SCALE = 0.01
 """Smallest factor on the actor's learning rate, so that it rises again soon (rsl_rl: 1e-5/1e-3)."""
-FINETUNING_ACTOR_LR_SCALE = 0.1
-"""Factor with which fine-tuning begins if it has a ``desired_kl``."""
+FINETUNING_ACTOR_LR_SCALE = 0.1  # factor with which fine-tuning begins if it has a `desired_kl`
 
 
 def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
@@ -161,8 +160,7 @@ class FinalObservations:
         }
 
 
-MAX_COMPILED = 64
-"""Functions and input shapes that a process may compile."""
+MAX_COMPILED = 64  # functions and input shapes that a process may compile
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -14,8 +14,7 @@ from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
 
-STEPS_UNREAD = 32
-"""Number of control steps after which the results on a GPU are read."""
+STEPS_UNREAD = 32  # number of control steps after which the results on a GPU are read
 
 
 class Controller(Protocol):
@@ -29,20 +28,13 @@ class Controller(Protocol):
 class Episode:
     """Result of an episode."""
 
-    env: int
-    """Index of the environment."""
-    robot_index: int
-    """Index of the robot."""
-    success: bool
-    """Whether the episode ended in success."""
-    distance: float
-    """Distance from success at the end [m]."""
-    score: float
-    """Score of the episode; see ``episode_score``."""
-    steps: int
-    """Length of the episode [control steps]."""
-    unstable: bool
-    """Whether the episode ended because the simulation diverged."""
+    env: int  # index of the environment
+    robot_index: int  # index of the robot
+    success: bool  # whether the episode ended in success
+    distance: float  # distance from success at the end [m]
+    score: float  # score of the episode; see `episode_score`
+    steps: int  # length of the episode [control steps]
+    unstable: bool  # whether the episode ended because the simulation diverged
     angle: float = math.nan
     """Angle from success at the end [rad]; nan if the task wants no orientation."""
 

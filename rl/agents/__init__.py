@@ -16,10 +16,8 @@ from typing import Any
 from morphgen.errors import TaskError, nearest
 from morphgen.tasks.registry import Registry
 
-MAX_WIDTH = 8192
-"""Largest width of a layer; the weights between two such layers take 256 MiB."""
-MAX_LAYERS = 100
-"""Largest number of layers of a network."""
+MAX_WIDTH = 8192  # largest width of a layer; the weights between two such layers take 256 MiB
+MAX_LAYERS = 100  # largest number of layers of a network
 
 
 @dataclass(frozen=True)
@@ -104,12 +102,9 @@ def network_fields() -> Iterator[tuple[str, float, tuple[str, ...]]]:
 class Preset:
     """Defaults of a training."""
 
-    summary: str
-    """Purpose, for the help."""
-    total_timesteps: int
-    """Control steps of all environments together."""
-    num_envs: int
-    """Number of environments."""
+    summary: str  # purpose, for the help
+    total_timesteps: int  # control steps of all environments together
+    num_envs: int  # number of environments
     switches: Mapping[str, bool] = field(default_factory=dict)
     """Switches of ``morphgen.rl.runs.agent_spec.SWITCHES``."""
     constants: Mapping[str, float] = field(default_factory=dict)
@@ -139,8 +134,7 @@ PAPER = Preset(
     total_timesteps=2_000_000,
     num_envs=128,
 )
-PRESETS: Mapping[str, Preset] = {"fast": FAST, "paper": PAPER}
-"""Presets by name."""
+PRESETS: Mapping[str, Preset] = {"fast": FAST, "paper": PAPER}  # presets by name
 
 
 def preset_of(name: str | None, agent: str) -> Preset:

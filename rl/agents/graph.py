@@ -38,14 +38,10 @@ DESCRIPTION = slice(TOOL.start, POSITION.start)
 class Config(NetworkConfig):
     """Sizes of the graph network; tuned on reach with ten arm3 on two CPU cores."""
 
-    graph_features: int = 32
-    """Width of a joint's token."""
-    graph_layers: int = 2
-    """Number of attention layers."""
-    graph_heads: int = 4
-    """Attention heads per layer; they divide ``graph_features``."""
-    graph_hidden: int = 64
-    """Hidden width of a layer's feedforward part and of the head."""
+    graph_features: int = 32  # width of a joint's token
+    graph_layers: int = 2  # number of attention layers
+    graph_heads: int = 4  # attention heads per layer; they divide `graph_features`
+    graph_hidden: int = 64  # hidden width of a layer's feedforward part and of the head
 
     def __post_init__(self) -> None:
         """Check the sizes."""

@@ -20,12 +20,9 @@ if TYPE_CHECKING:
 class Config(NetworkConfig):
     """Sizes of the MLP; the paper gives none, these are those of its released code."""
 
-    mlp_features: int = 16
-    """Width of an encoded entity."""
-    mlp_width: int = 192
-    """Width of the residual layers."""
-    mlp_layers: int = 3
-    """Number of residual layers."""
+    mlp_features: int = 16  # width of an encoded entity
+    mlp_width: int = 192  # width of the residual layers
+    mlp_layers: int = 3  # number of residual layers
 
 
 class Network(encoder.Network):

@@ -23,14 +23,10 @@ if TYPE_CHECKING:
 class Config(NetworkConfig):
     """Sizes of the transformer; unless said otherwise those of the paper's released code."""
 
-    features: int = 64
-    """Width of an encoded entity."""
-    layers: int = 4
-    """Number of transformer layers."""
-    heads: int = 4
-    """Attention heads per layer; they divide ``features``."""
-    feedforward: int = 512
-    """Hidden width of a layer's feedforward part."""
+    features: int = 64  # width of an encoded entity
+    layers: int = 4  # number of transformer layers
+    heads: int = 4  # attention heads per layer; they divide `features`
+    feedforward: int = 512  # hidden width of a layer's feedforward part
     decoder: int = 64
     """Hidden width of the MLP from a link's features to its action, and to the value (ours)."""
     logit_scale: float = 64.0

@@ -23,16 +23,12 @@ from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
-STARTS = 16
-"""Number of start configurations of inverse kinematics per goal."""
-ATTEMPTS = 4
-"""Maximum number of attempts per goal, each with other starts."""
+STARTS = 16  # number of start configurations of inverse kinematics per goal
+ATTEMPTS = 4  # maximum number of attempts per goal, each with other starts
 TREE_ITERATIONS = 200
 """Number of random configurations of a tree, grown if inverse kinematics has no solution."""
-ITERATIONS = 60
-"""Iterations of inverse kinematics."""
-CLOSE = 0.003
-"""Distance of tool and goal that counts as solved [m]; angles count as above."""
+ITERATIONS = 60  # iterations of inverse kinematics
+CLOSE = 0.003  # distance of tool and goal that counts as solved [m]; angles count as above
 
 
 class InverseKinematics:

@@ -24,14 +24,10 @@ from morphgen.typing import Array
 FreeFraction = Callable[[Array, Array], float]
 """Return the collision-free fraction of the line between two configurations, each (dof,)."""
 
-ITERATIONS = 2500
-"""Maximum number of random configurations of RRT-Connect."""
-MIN_EDGE, MAX_EDGE = 1.0, 12.0
-"""Length of a tree's edges [control steps]."""
-SHORTCUTS = 60
-"""Number of random pairs of waypoints that are tried as shortcuts of a path."""
-COMPARED = 6
-"""Number of free paths along a tree of which the cheapest is taken."""
+ITERATIONS = 2500  # maximum number of random configurations of RRT-Connect
+MIN_EDGE, MAX_EDGE = 1.0, 12.0  # length of a tree's edges [control steps]
+SHORTCUTS = 60  # number of random pairs of waypoints that are tried as shortcuts of a path
+COMPARED = 6  # number of free paths along a tree of which the cheapest is taken
 LATE_COST, MAX_LATE_COST = 20.0, 400.0
 """Cost of each control step after the deadline, and the largest such cost [control steps]."""
 ARRIVED = 1.01 * min(fraction for fraction in BINS if fraction > 0)
@@ -44,18 +40,15 @@ class Path:
 
     waypoints: tuple[Array, ...]
     """Configurations to go through after the start, each (dof,); the last is the goal."""
-    goal: int
-    """Index of the goal."""
+    goal: int  # index of the goal
 
 
 @dataclass(frozen=True, eq=False)
 class PathCost:
     """Cost of paths to n goals, in control steps."""
 
-    goal_cost: Array
-    """Cost of the motion that follows at each goal, shape (n,)."""
-    deadline: Array
-    """Control steps within which a path should reach each goal, shape (n,)."""
+    goal_cost: Array  # cost of the motion that follows at each goal, shape (n,)
+    deadline: Array  # control steps within which a path should reach each goal, shape (n,)
 
     def of(self, length: Array | float, goal: int | slice = slice(None)) -> Array:
         """Return the cost of paths of a length [control steps] to all goals (n,), or to one ()."""

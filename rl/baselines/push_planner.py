@@ -25,8 +25,7 @@ from morphgen.tasks.sim.base import GRAVITY, Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
-SPEED = 0.006
-"""Largest motion of the tool in a control step while it pushes [m]: 0.3 m/s."""
+SPEED = 0.006  # largest motion of the tool in a control step while it pushes [m]: 0.3 m/s
 
 # Lengths below are in edges of the block, costs in control steps; both were tuned on the robots of
 # the shipped splits.
@@ -36,17 +35,14 @@ _NEAREST, _QUICKEST = 24, 36
 """Starts of inverse kinematics per distance: those nearest in space, and nearest in joint space."""
 _MIN_HEIGHT, _MAX_HEIGHT = 0.2, 0.45
 """Heights of the tool: pushed above its middle, a block with a friction of 1 tips over."""
-_CANDIDATES = 24
-"""Pre-contacts, the cheapest first, to which straight paths are tried."""
+_CANDIDATES = 24  # pre-contacts, the cheapest first, to which straight paths are tried
 _SIMULATED, _OVERHANG_EVERY = 12, 3
 """Number of points at which a push is tested; the overhang is tested at every third of them."""
-_TOLERANCE = 0.02
-"""Distance from a point that counts as reached."""
+_TOLERANCE = 0.02  # distance from a point that counts as reached
 _NEARER, _FARTHER = 0.3, 0.4
 """In a simulated push, the robot must touch a block that is nearer by the one distance, and not
 touch one that is farther by the other."""
-_LIFT = 1.4
-"""Height of the waypoint above a pre-contact, from which the tool comes down."""
+_LIFT = 1.4  # height of the waypoint above a pre-contact, from which the tool comes down
 _RETREAT_STEP, _RETREAT_STEPS = 0.15, 8
 """Motion of the tool in a step away from the block, and the largest number of such steps."""
 _RETREAT_DIRECTIONS = (
@@ -60,10 +56,8 @@ _UNFINISHED_COST, _NARROW_COST = 400.0, 120.0
 """Cost of a push that does not move the block, and of a contact of width zero."""
 _OVERHANG_COST, _MAX_OVERHANG = 3000.0, 0.1
 """Cost per edge of overhang, and the overhang at which the cost is capped."""
-_COMPLIANCE_COST = 3000.0
-"""Cost per metre of the tool's deflection by the block's friction."""
-_ACCELERATION_STEPS = 25
-"""Time until arm and block have the speed of the push [control steps]."""
+_COMPLIANCE_COST = 3000.0  # cost per metre of the tool's deflection by the block's friction
+_ACCELERATION_STEPS = 25  # time until arm and block have the speed of the push [control steps]
 _EXPENSIVE, _TREE_ITERATIONS = 350.0, 1500
 """Cost of a plan above which a tree of reachable configurations is grown to find a cheaper one, and
 the number of random configurations of that tree."""
@@ -73,36 +67,25 @@ the number of random configurations of that tree."""
 class Plan:
     """A planned push: the path behind the block, and the pose of the tool during the push."""
 
-    path: tuple[Array, ...]
-    """Waypoints, each (dof,); at the last one the tool is behind the block."""
-    rotation: torch.Tensor
-    """Rotation of the tool at the last waypoint, shape (3, 3)."""
-    height: float
-    """Height of the tool at the last waypoint [m]."""
+    path: tuple[Array, ...]  # waypoints, each (dof,); at the last one the tool is behind the block
+    rotation: torch.Tensor  # rotation of the tool at the last waypoint, shape (3, 3)
+    height: float  # height of the tool at the last waypoint [m]
     offset: float
     """x of the tool minus x of the block with which the tool pushes the block's middle [m]."""
-    gap: float
-    """Motion of the tool along y until it touches the block [m]."""
+    gap: float  # motion of the tool along y until it touches the block [m]
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
     """Pre-contacts that can begin a push, a row each."""
 
-    q: Array
-    """Configurations, shape (n, dof)."""
-    position: Array
-    """Positions of the tool, shape (n, 3) [m]."""
-    rotation: Array
-    """Rotations of the tool, shape (n, 3, 3)."""
-    offset: Array
-    """``Plan.offset``, shape (n,)."""
-    gap: Array
-    """``Plan.gap``, shape (n,)."""
-    cost: Array
-    """Cost of the push [control steps], shape (n,)."""
-    steps: Array
-    """Duration of the push [control steps], shape (n,)."""
+    q: Array  # configurations, shape (n, dof)
+    position: Array  # positions of the tool, shape (n, 3) [m]
+    rotation: Array  # rotations of the tool, shape (n, 3, 3)
+    offset: Array  # `Plan.offset`, shape (n,)
+    gap: Array  # `Plan.gap`, shape (n,)
+    cost: Array  # cost of the push [control steps], shape (n,)
+    steps: Array  # duration of the push [control steps], shape (n,)
 
     def take(self, rows: NDArray[np.intp]) -> Self:
         """Return some of the rows."""
@@ -348,29 +331,24 @@ class PushPlanner:
 # All lengths are in edges of the block.
 SHIFTS = np.arange(0.05, 2.0, 0.1)
 """Distances that the block is moved towards the robot to find their contact."""
-BISECTIONS = 5
-"""Bisections of the interval between two of these shifts."""
+BISECTIONS = 5  # bisections of the interval between two of these shifts
 OFFSETS = np.linspace(-1.0, 1.0, 9)
 """Offsets of the block along x at which the width of the contact is tested."""
 BELOW, ABOVE = -0.5, 0.15
 """Shifts of the block along z: a block lowered by half an edge is touched only below its middle; a
 raised one also slightly above it."""
-PRESSED = 0.1
-"""Distance that the block is pressed against the robot when the width is tested."""
+PRESSED = 0.1  # distance that the block is pressed against the robot when the width is tested
 
 
 @dataclass(frozen=True, eq=False)
 class PreContact:
     """Configurations behind the block that touch it if they move along y; one per row."""
 
-    q: Array
-    """Configurations, shape (n, dof) [rad or m]."""
-    gap: Array
-    """Motion along y until the robot touches the block, shape (n,) [m]."""
+    q: Array  # configurations, shape (n, dof) [rad or m]
+    gap: Array  # motion along y until the robot touches the block, shape (n,) [m]
     offset: Array
     """Offset of the block along x for which the contact is on its middle, shape (n,) [m]."""
-    width: Array
-    """Fraction of ``OFFSETS`` at which the block is touched, shape (n,)."""
+    width: Array  # fraction of `OFFSETS` at which the block is touched, shape (n,)
     overhang: Array
     """Overhang over the block as the function ``overhang`` returns it, shape (n,) [edges]."""
 

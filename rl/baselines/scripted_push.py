@@ -17,15 +17,13 @@ from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec
 
-MAX_PLANS = 8
-"""Maximum number of plans per episode."""
+MAX_PLANS = 8  # maximum number of plans per episode
 GAIN = 0.2
 """Fraction of the lateral error between tool and block that is corrected in a control step."""
 LEAD, LEAD_STEP, MAX_LEAD = 0.05, 0.004, 0.3
 """Lead of the commanded tool before the actual one: initial value, growth per control step in which
 the block does not move, and maximum [m]. A slender arm needs it to build up force."""
-MOVING = 0.03
-"""Speed of the block from which it counts as moving [m/s]."""
+MOVING = 0.03  # speed of the block from which it counts as moving [m/s]
 ARRIVED, SETTLE_STEPS = 0.02, 15
 """A push begins when the joints are ``ARRIVED`` from their targets [rad or m], or ``SETTLE_STEPS``
 control steps after the last waypoint."""

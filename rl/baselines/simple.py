@@ -48,12 +48,10 @@ class Random:
 class ReachGoals:
     """Goals of the n environments of a batch, in the root frames."""
 
-    positions: torch.Tensor
-    """Goal positions of the tools, shape (n, 3) [m]."""
+    positions: torch.Tensor  # goal positions of the tools, shape (n, 3) [m]
     rotations: torch.Tensor | None
     """Goal rotations of the tools, shape (n, 3, 3); None for goals of positions."""
-    metres_per_radian: float
-    """See ``ReachConfig.metres_per_radian``."""
+    metres_per_radian: float  # see `ReachConfig.metres_per_radian`
 
 
 def reach_goals(task: TaskBatch) -> ReachGoals:
@@ -66,8 +64,7 @@ def reach_goals(task: TaskBatch) -> ReachGoals:
 GAIN = 0.3
 """Fraction of the error that a joint would remove in one control step if it acted alone. All joints
 act at once and lag behind their targets, so that 1 overshoots; tuned on arm3 and Panda."""
-MIN_COLUMN = 1e-4
-"""Jacobian columns shorter than this do not move the tool [m per rad or m per m]."""
+MIN_COLUMN = 1e-4  # Jacobian columns shorter than this do not move the tool [m per rad or m per m]
 
 
 class JacobianColumns:

@@ -41,8 +41,7 @@ ABLATION = (
 class AgentSpec:
     """An agent with switches; ``configs_of`` decides those that are not named."""
 
-    agent: str
-    """Name of the agent."""
+    agent: str  # name of the agent
     switches: Mapping[str, bool] = field(default_factory=dict)
     """Whether a switch is on, by its name."""
 

@@ -120,20 +120,15 @@ def _require_tensors(
             )
 
 
-HASH = "sha256"
-"""Key of the hash of all other content."""
-MAX_BYTES = 512 * 2**20
-"""Largest size of a checkpoint's file, and of its tensors together [bytes]."""
+HASH = "sha256"  # key of the hash of all other content
+MAX_BYTES = 512 * 2**20  # largest size of a checkpoint's file, and of its tensors together [bytes]
 MAX_INDEX_BYTES = 32 * 2**20
 """Largest size of a checkpoint without the numbers of its tensors [bytes]."""
 MAX_INSTRUCTIONS = 2_000_000
 """Most pickle instructions of that part; a run of 1,000 environments has about 60,000."""
-MAX_VALUES = 1_000_000
-"""Most numbers, texts, tensors and containers in a checkpoint."""
-MAX_LEVELS = 20
-"""Most levels of nested containers."""
-MAX_INTEGER_BITS = 256
-"""Most bits of an integer; the states of random generators have 128."""
+MAX_VALUES = 1_000_000  # most numbers, texts, tensors and containers in a checkpoint
+MAX_LEVELS = 20  # most levels of nested containers
+MAX_INTEGER_BITS = 256  # most bits of an integer; the states of random generators have 128
 _GLOBALS = frozenset(
     {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"}
     | {f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16")}
@@ -309,16 +304,14 @@ def in_main_memory(value: object) -> object:
 
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
-FORMAT = 3
-"""Version of the files' format."""
+FORMAT = 3  # version of the files' format
 
 
 @dataclass(frozen=True)
 class Interface:
     """Actions and observations that a policy needs from its environments."""
 
-    kind: ActionKind = "continuous"
-    """Kind of the actions."""
+    kind: ActionKind = "continuous"  # kind of the actions
     max_links: int | None = None
     """Links that observations and actions are padded to; None: the number of the benchmark, or the
     links of the largest robot if it has more."""
@@ -338,22 +331,15 @@ def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) ->
 class RunConfig:
     """Configuration of a run; together with the machine it determines the weights."""
 
-    source: RobotSource
-    """Robots and their tasks."""
-    policy: PolicyConfig
-    """Agent and networks."""
-    ppo: PPOConfig
-    """Hyperparameters of PPO."""
-    seed: int = 0
-    """Seed of weights, actions, minibatches and episodes."""
-    sim: str = DEFAULT_SIMULATOR
-    """Name of the simulator."""
+    source: RobotSource  # robots and their tasks
+    policy: PolicyConfig  # agent and networks
+    ppo: PPOConfig  # hyperparameters of PPO
+    seed: int = 0  # seed of weights, actions, minibatches and episodes
+    sim: str = DEFAULT_SIMULATOR  # name of the simulator
     geometry: CollisionGeometry = "primitive"
     """Collision shapes of the robots in training; evaluations have all of them."""
-    num_envs: int = 128
-    """Number of parallel environments of all robots together."""
-    device: str = "cpu"
-    """Device of networks and rollouts."""
+    num_envs: int = 128  # number of parallel environments of all robots together
+    device: str = "cpu"  # device of networks and rollouts
     initial_checkpoint: str = ""
     """Path of a checkpoint with the initial networks, relative to the folder of the run; empty for
     random initial weights."""

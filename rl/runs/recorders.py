@@ -22,8 +22,7 @@ from morphgen.rl.scores.scores import finite_or_none
 
 METRICS, EVENTS = "metrics.jsonl", "events"
 
-Recorder = Callable[[UpdateMetrics], None]
-"""Function that records the metrics of an update."""
+Recorder = Callable[[UpdateMetrics], None]  # function that records the metrics of an update
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

@@ -52,32 +52,24 @@ class RobotSource:
     name: str
     """Name of the split, or words that describe one robot, or the path of its file, or the grammars
     with the number of robots of each."""
-    split: str = ""
-    """Text of the split's file; empty without a split."""
+    split: str = ""  # text of the split's file; empty without a split
     task: str | None = None
     """Task of all robots; None for a split, which has a task for each of them."""
     obstacles: bool = False
     """Whether the robots are among obstacles; a split says it for each of them."""
-    side: Side = "train"
-    """Side of the split."""
-    robot_hash: str = ""
-    """Hash of the one robot; empty with a split, which has one for each."""
-    member: str | None = None
-    """Name of the only member that is meant; None for all of the side."""
-    goal_seed: int = 0
-    """Seed of goals, starts and obstacles."""
+    side: Side = "train"  # side of the split
+    robot_hash: str = ""  # hash of the one robot; empty with a split, which has one for each
+    member: str | None = None  # name of the only member that is meant; None for all of the side
+    goal_seed: int = 0  # seed of goals, starts and obstacles
     goal_dir: str = ""
     """Folder where the split is built with the goal sets to use; without it goals are sampled."""
-    library: tuple[str, ...] = ()
-    """Folders with further parts."""
+    library: tuple[str, ...] = ()  # folders with further parts
     grammars: tuple[tuple[str, int], ...] = ()
     """Grammars, by name or path, and the number of robots to draw from each; see ``draw``."""
-    draw_seed: int = 0
-    """Seed of the drawn robots: they are those of ``morphgen sample --seed``."""
+    draw_seed: int = 0  # seed of the drawn robots: they are those of `morphgen sample --seed`
     held_out: tuple[str, ...] = ()
     """Splits whose test robots are not drawn, besides the splits that morphgen ships."""
-    drawn_hash: str = ""
-    """Hash of the drawn robots; empty until they are drawn."""
+    drawn_hash: str = ""  # hash of the drawn robots; empty until they are drawn
 
 
 def split_source(
@@ -233,18 +225,14 @@ def _shipped(folder: str, side: Side) -> dict[str, GoalSet]:
     return read_goals(folder, side)
 
 
-FILE = "robots.json"
-"""File in a run's folder that lists its drawn robots."""
+FILE = "robots.json"  # file in a run's folder that lists its drawn robots
 FORMAT = 1
-MAX_DRAWS = 4
-"""Draws per requested robot, after which a grammar is considered unfit for the task."""
-MIN_DRAWS = 20
-"""The same limit for few robots: draws per grammar."""
+MAX_DRAWS = 4  # draws per requested robot, after which a grammar is considered unfit for the task
+MIN_DRAWS = 20  # the same limit for few robots: draws per grammar
 ROBOTS_PER_JOB = 16
 """Robots that a process draws before it reports; a process takes seconds to start, an arm3 with its
 goals 0.06 s."""
-MAX_FRESH = 10
-"""Most robots of a grammar that are drawn to evaluate on."""
+MAX_FRESH = 10  # most robots of a grammar that are drawn to evaluate on
 _FRESH = 0xF4E54
 """Mixed into the seed of robots to evaluate on, which thus are others than those to train on."""
 HELD_OUT, DRAWN_BEFORE, UNFIT = "held out", "drawn before", "without goals"
@@ -257,12 +245,9 @@ class DrawnRobots:
 
     members: tuple[Member, ...]
     """Name, derivation and hash of each robot; its category is its grammar."""
-    specs: tuple[EnvSpec, ...]
-    """Environments of each robot, with its goal set."""
-    skipped: Mapping[str, int]
-    """Number of skipped robots, by reason."""
-    held_out: tuple[str, ...]
-    """Hashes of the robots that are never drawn, sorted."""
+    specs: tuple[EnvSpec, ...]  # environments of each robot, with its goal set
+    skipped: Mapping[str, int]  # number of skipped robots, by reason
+    held_out: tuple[str, ...]  # hashes of the robots that are never drawn, sorted
 
     @property
     def hash(self) -> str:
@@ -343,8 +328,7 @@ def draw(source: RobotSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobo
 
 _drawn: dict[tuple[RobotSource, GoalConfig], DrawnRobots] = {}
 """The robots drawn last, by source and goals."""
-_MAX_DRAWN = 8
-"""Largest number of sources whose robots are kept."""
+_MAX_DRAWN = 8  # largest number of sources whose robots are kept
 
 
 def fresh_source(

@@ -289,8 +289,7 @@ class TrainingBatches:
         return slice_of(len(self._specs), config.num_envs, number, config.seed)
 
 
-NUM_ENVS = 64
-"""Default number of environments."""
+NUM_ENVS = 64  # default number of environments
 CONSTANTS: Mapping[str, Any] = {
     "num_steps": 32,
     "minibatches": 4,
@@ -326,8 +325,7 @@ MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
 A checkpoint has no simulator state, so that it cuts all running episodes short: it must be rare."""
 CHECKPOINTS, MIN_CHECKPOINTS = 10, 4
 """Intended number of checkpoints, and the minimum for runs that are short for these bounds."""
-ROBOTS = "robots"
-"""Subfolder with a run per robot, in the folder of a run of ``se`` on a split."""
+ROBOTS = "robots"  # subfolder with a run per robot, in the folder of a run of `se` on a split
 
 ShowMetrics = Callable[[UpdateMetrics, int], None]
 """Callback with the metrics of an update, and the number of updates of the run."""
@@ -337,12 +335,9 @@ ShowMetrics = Callable[[UpdateMetrics, int], None]
 class ExecutionConfig:
     """How a run is executed; the weights do not depend on it."""
 
-    workers: int = 1
-    """Number of PyBullet processes, or of MuJoCo threads."""
-    tensorboard: bool = True
-    """Write TensorBoard events."""
-    wandb: bool = False
-    """Send metrics to Weights & Biases."""
+    workers: int = 1  # number of PyBullet processes, or of MuJoCo threads
+    tensorboard: bool = True  # write TensorBoard events
+    wandb: bool = False  # send metrics to Weights & Biases
     minutes: int | None = None
     """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
 
@@ -358,8 +353,7 @@ class ExecutionConfig:
 class Subrun:
     """A part of a run that trains one set of weights."""
 
-    folder: Path
-    """Folder of the part's config, metrics and checkpoint."""
+    folder: Path  # folder of the part's config, metrics and checkpoint
     config: RunConfig
     """Config with the part's share of robots, environments, timesteps and its own seed."""
 

@@ -36,8 +36,7 @@ from morphgen.rl.scores.submission import (
     submission_from,
 )
 
-EPISODES = "episodes.csv.gz"
-"""Name of the table in the folder of a study."""
+EPISODES = "episodes.csv.gz"  # name of the table in the folder of a study
 RUN = ("split", "method", "mode", "training_seed", "finetuned")
 ROBOT = ("robot", "side", "task", "body", "goal_set")
 RANDOM = ("random_score", "random_success")

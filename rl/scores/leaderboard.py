@@ -57,14 +57,10 @@ class SideScore:
     side: Side
     task: str
     robots: int
-    score: float
-    """Mean score, relative to the random policy where the task wants it."""
-    success: float
-    """Mean success rate, 0 to 1."""
-    low: float | None = None
-    """Lower end of the 95% interval of ``score``; None if it is not known."""
-    high: float | None = None
-    """Upper end of the interval."""
+    score: float  # mean score, relative to the random policy where the task wants it
+    success: float  # mean success rate, 0 to 1
+    low: float | None = None  # lower end of the 95% interval of `score`; None if it is not known
+    high: float | None = None  # upper end of the interval
 
 
 @dataclass(frozen=True)
@@ -72,16 +68,12 @@ class Row:
     """A method in a ranking."""
 
     method: str
-    source: Source
-    """``submission``; or ``reference``, a submission in a release."""
+    source: Source  # `submission`; or `reference`, a submission in a release
     mode: str
-    seeds: tuple[int, ...]
-    """Seeds of the training; empty for a baseline."""
-    episodes: int
-    """Episodes per robot."""
+    seeds: tuple[int, ...]  # seeds of the training; empty for a baseline
+    episodes: int  # episodes per robot
     sides: tuple[SideScore, ...]
-    finetuned: int = 0
-    """Transitions of fine-tuning on the test robots."""
+    finetuned: int = 0  # transitions of fine-tuning on the test robots
 
     @property
     def label(self) -> str:
@@ -198,8 +190,7 @@ def _cells(row: Row, side: SideScore | None, decimals: int) -> list[str]:
 
 
 FORMAT = 2
-RANDOM = "random"
-"""Method whose episodes all scores of a release are relative to."""
+RANDOM = "random"  # method whose episodes all scores of a release are relative to
 
 
 @dataclass(frozen=True, eq=False)

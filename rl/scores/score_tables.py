@@ -133,14 +133,10 @@ class SideResult:
     """Result of a method on the robots of one side that do one task, over all of its seeds."""
 
     robots: int
-    episodes: int
-    """Number of episodes of all robots and seeds."""
-    mean: float
-    """Mean score over seeds and robots."""
-    iqm: Interval
-    """Interquartile mean of the scores of seeds and robots; no interval for one seed."""
-    success: Interval
-    """Success rate of all episodes with its Wilson interval."""
+    episodes: int  # number of episodes of all robots and seeds
+    mean: float  # mean score over seeds and robots
+    iqm: Interval  # interquartile mean of the scores of seeds and robots; no interval for one seed
+    success: Interval  # success rate of all episodes with its Wilson interval
     difference: Interval | None
     """Score minus that of the reference in the same episodes, with a bootstrap over the episodes
     of each robot; None without a reference."""
@@ -153,16 +149,12 @@ class ResultRow:
     split: str
     task: str
     method: str
-    mode: str
-    """``deterministic``, ``stochastic``, or empty for a controller that does not learn."""
-    finetuned: int
-    """Transitions of fine-tuning on the test robots."""
+    mode: str  # `deterministic`, `stochastic`, or empty for a controller that does not learn
+    finetuned: int  # transitions of fine-tuning on the test robots
     transitions: int | None
     """Transitions of the training; None if it is not known or there was none."""
-    simulator: str
-    """Simulator of the training; empty like ``transitions``."""
-    seeds: tuple[int, ...]
-    """Seeds of the training."""
+    simulator: str  # simulator of the training; empty like `transitions`
+    seeds: tuple[int, ...]  # seeds of the training
     sides: Mapping[Side, SideResult]
 
 

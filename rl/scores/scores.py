@@ -24,15 +24,12 @@ from morphgen.formats.records import FiniteNumber, Record
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 
-LEVEL = 0.95
-"""Confidence level of the intervals."""
+LEVEL = 0.95  # confidence level of the intervals
 RESAMPLES = 2000
-MAX_RESAMPLED = 2**26
-"""Largest number of values that are resampled at once: 512 MB."""
+MAX_RESAMPLED = 2**26  # largest number of values that are resampled at once: 512 MB
 _MAX_DIGITS = 6
 """Largest number of decimals of a rate's ends, which have as many as tell them apart."""
-TRIM = 0.25
-"""Fraction that the interquartile mean leaves out at each end."""
+TRIM = 0.25  # fraction that the interquartile mean leaves out at each end
 
 
 @dataclass(frozen=True)
@@ -171,19 +168,13 @@ class RobotOutcomes(Record, frozen=True):
     robot: Name
     side: Side
     task: Name
-    body: Name
-    """Hash of the robot in the split."""
-    goal_set: Name
-    """Key of the robot's goal set: a hash of all that goals and starts follow from."""
+    body: Name  # hash of the robot in the split
+    goal_set: Name  # key of the robot's goal set: a hash of all that goals and starts follow from
     success: tuple[bool, ...]
-    score: tuple[FiniteNumber, ...]
-    """Score of each episode, not relative to the random policy."""
-    distance: tuple[FiniteNumber, ...]
-    """Distance from success at the end of each episode [m]."""
-    steps: tuple[Count, ...]
-    """Length of each episode [control steps]."""
-    diverged: tuple[bool, ...]
-    """Whether each episode ended because the simulation diverged."""
+    score: tuple[FiniteNumber, ...]  # score of each episode, not relative to the random policy
+    distance: tuple[FiniteNumber, ...]  # distance from success at the end of each episode [m]
+    steps: tuple[Count, ...]  # length of each episode [control steps]
+    diverged: tuple[bool, ...]  # whether each episode ended because the simulation diverged
     random_score: tuple[FiniteNumber, ...]
     """Score of each episode of the random policy with the same starts and goals."""
     random_success: tuple[bool, ...]
@@ -216,38 +207,23 @@ def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None)
 class Score:
     """Result of one robot in an evaluation."""
 
-    robot: str
-    """Name of the robot."""
-    side: Side
-    """Side of the split that the robot is on."""
-    task: str
-    """Task of the robot."""
-    episodes: int
-    """Number of episodes."""
-    steps: int
-    """Total length of the episodes [control steps]."""
-    score: float
-    """``raw``, or ``raw - random`` for tasks with ``Task.relative_to_random``."""
-    low: float
-    """Lower end of the 95% interval of ``score`` over episodes; see ``episode_interval``."""
-    high: float
-    """Upper end of the interval; nan like ``low`` if the episodes cannot tell it."""
-    raw: float
-    """Mean score of the episodes; see ``Task.episode_score``."""
-    random: float
-    """Mean score of the random policy's episodes."""
-    success: float
-    """Success rate of the episodes, 0 to 1."""
-    random_success: float
-    """Success rate of the random policy's episodes, 0 to 1."""
-    distance: float
-    """Mean distance from success at the end of an episode [m]."""
+    robot: str  # name of the robot
+    side: Side  # side of the split that the robot is on
+    task: str  # task of the robot
+    episodes: int  # number of episodes
+    steps: int  # total length of the episodes [control steps]
+    score: float  # `raw`, or `raw - random` for tasks with `Task.relative_to_random`
+    low: float  # lower end of the 95% interval of `score` over episodes; see `episode_interval`
+    high: float  # upper end of the interval; nan like `low` if the episodes cannot tell it
+    raw: float  # mean score of the episodes; see `Task.episode_score`
+    random: float  # mean score of the random policy's episodes
+    success: float  # success rate of the episodes, 0 to 1
+    random_success: float  # success rate of the random policy's episodes, 0 to 1
+    distance: float  # mean distance from success at the end of an episode [m]
     relative_distance: float
     """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
-    unstable: int
-    """Number of episodes that ended because the simulation diverged."""
-    angle: float
-    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
+    unstable: int  # number of episodes that ended because the simulation diverged
+    angle: float  # mean angle from success at the end of an episode [rad]; nan without orientation
     outcomes: RobotOutcomes = field(repr=False, compare=False)
     """The episodes, for submissions; tables leave them out."""
 
@@ -302,8 +278,7 @@ HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "r
 UNSTABLE = "episodes that ended because their simulation became unstable"
 SUFFIXES = (".csv", ".json", ".md")
 
-Scores = Mapping[str, Sequence[Score]]
-"""Scores by mode, or by the name of a baseline."""
+Scores = Mapping[str, Sequence[Score]]  # scores by mode, or by the name of a baseline
 
 
 def score_table(scores_by_mode: Scores, style: str = "simple") -> str:

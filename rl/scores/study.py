@@ -46,26 +46,19 @@ from morphgen.tasks.goals.eval_protocol import rules_data
 from morphgen.tasks.registry import evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
-FINETUNED = "finetuned"
-"""Folder of fine-tuned policies in the folder of a run."""
+FINETUNED = "finetuned"  # folder of fine-tuned policies in the folder of a run
 
 
 @dataclass(frozen=True)
 class Cell:
     """An agent with a seed on a split, or a baseline on a split; done when it has episodes."""
 
-    study: Path
-    """Folder of the study, with the table of episodes."""
-    agent: str
-    """Label of the agent, or name of the baseline."""
-    seed: int | None
-    """Seed of the run; None for a baseline."""
-    source: RobotSource
-    """Robots that the agent is trained on; for a baseline, a side of the split."""
-    eval_config: EvalConfig
-    """Configuration of the evaluation."""
-    config: RunConfig | None = None
-    """Config of the run; None for a baseline."""
+    study: Path  # folder of the study, with the table of episodes
+    agent: str  # label of the agent, or name of the baseline
+    seed: int | None  # seed of the run; None for a baseline
+    source: RobotSource  # robots that the agent is trained on; for a baseline, a side of the split
+    eval_config: EvalConfig  # configuration of the evaluation
+    config: RunConfig | None = None  # config of the run; None for a baseline
     finetune: tuple[int, ...] = ()
     """Numbers of transitions that the policy is fine-tuned with on the test robots, each of them
     from the end of the run."""
@@ -256,18 +249,15 @@ def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> Submission:
     )
 
 
-POLL = 2.0
-"""Time between two checks of cells that another process works on [s]."""
+POLL = 2.0  # time between two checks of cells that another process works on [s]
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Success or failure of a cell."""
 
-    cell: Cell
-    """The finished or failed cell."""
-    error: str = ""
-    """Error message; empty after success."""
+    cell: Cell  # the finished or failed cell
+    error: str = ""  # error message; empty after success
 
 
 def run_cells(

@@ -36,8 +36,7 @@ class SplitName(Record, frozen=True):
     """The split that a submission is for."""
 
     name: Name
-    id: Name
-    """Id of the split, see ``morphgen.benchmark.split.split_id``."""
+    id: Name  # id of the split, see `morphgen.benchmark.split.split_id`
 
 
 class Training(Record, frozen=True):
@@ -54,20 +53,14 @@ class Submission(Record, frozen=True):
 
     kind: Literal["morphgen submission"]
     format: int
-    method: Name
-    """Name of the method in rankings."""
-    mode: Literal["", "deterministic", "stochastic"]
-    """How the policy acts; empty for a baseline."""
-    training_seed: Seed | None
-    """Seed of the training; None for a baseline."""
-    morphgen: Name
-    """Version of morphgen that ran the episodes."""
+    method: Name  # name of the method in rankings
+    mode: Literal["", "deterministic", "stochastic"]  # how the policy acts; empty for a baseline
+    training_seed: Seed | None  # seed of the training; None for a baseline
+    morphgen: Name  # version of morphgen that ran the episodes
     split: SplitName
-    evaluation: dict[str, Any]
-    """Rules of the evaluation, see ``morphgen.tasks.goals.eval_protocol``."""
+    evaluation: dict[str, Any]  # rules of the evaluation, see `morphgen.tasks.goals.eval_protocol`
     robots: tuple[RobotOutcomes, ...]
-    training: Training | None = None
-    """How the policy was trained, if it is known."""
+    training: Training | None = None  # how the policy was trained, if it is known
     config: dict[str, Any] | None = None
     """Config of the run in a study, without the text of its split."""
 
@@ -167,10 +160,8 @@ def submission_from(data: object, where: Path | str) -> Submission:
 
 LISTS = ("success", "score", "distance", "steps", "diverged")
 """Lists of a robot with an entry per episode of the policy."""
-MAX_EPISODES = 10_000
-"""Largest number of episodes of a robot."""
-MAX_DISTANCE = 1e3
-"""Largest distance from success [m]."""
+MAX_EPISODES = 10_000  # largest number of episodes of a robot
+MAX_DISTANCE = 1e3  # largest distance from success [m]
 ROUNDING = 1e-4
 """Relative error of a sum of an episode's scores in single precision, which a valid score may
 exceed its range by."""

@@ -1,21 +1,164 @@
-"""The scripted push moves blocks across the line, and plans again after failures."""
+"""The scripted push: its plans, its contacts with the block, and episodes of it."""
+
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
+from helpers.goal_sets import draw_spec
 from helpers.resets import reset_envs
-from helpers.scenes import robot
+from helpers.scenes import ball, robot
 from helpers.simulators import PYBULLET
+from morphgen.benchmark.split_file import read_split
+from morphgen.grammar.library import default_library
+from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.rl.baselines.push_planner import PushPlanner
+from morphgen.model.robot import Link
+from morphgen.rl.baselines import push_planner
+from morphgen.rl.baselines.push_planner import (
+    SPEED,
+    PushPlanner,
+    ToolKinematics,
+    find_contacts,
+    overhang,
+)
 from morphgen.rl.baselines.scripted_push import MAX_PLANS, RISE, ScriptedPush
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.env_specs import member_spec
 from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
+from morphgen.tasks.sim.base import Block, Scene
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
+
+
+def planner_of(setting):
+    tables = build_robot_tables([setting.robot])
+    return PushPlanner(setting, setting.scene, tables, 0, np.random.default_rng(0))
+
+
 PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
+
+
+def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
+    setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
+    planner = planner_of(setting)
+    space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
+    for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
+        plan = planner.plan(q, block)
+        points = [q, *plan.path]
+        for a, b in pairwise(points):
+            between = a + np.linspace(0, 1, 200)[:, None] * (b - a)
+            assert space.free(between, np.tile(block, (200, 1))).mean() > 0.99
+        position, rotation = (each[0] for each in tool.poses(points[-1][None]))
+        assert position[1] < block[1] - setting.goals.block.size[1] / 2
+        assert position[2] == pytest.approx(plan.height)
+        assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
+    across = (setting.goals.line - block[1]) / SPEED
+    assert planner.plan(q, block, steps_left=across + 1) is not None
+    assert planner.plan(q, block, steps_left=across - 1) is None
+
+
+@pytest.mark.slow
+def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
+    """A patched overhang penalises configurations near the end of the first plan."""
+    setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
+    planner = planner_of(setting)
+    q, block = setting.goals.q[0], setting.goals.blocks[0]
+    first = planner.plan(q, block).path[-1]
+
+    def near(configurations):
+        return np.abs(configurations - first).max(axis=-1) < 1.0
+
+    def said(space, configurations, blocks, edge):
+        assert blocks.shape == (len(configurations), 7)
+        assert (blocks[:, 1] >= block[1]).all()
+        return near(configurations).astype(float)
+
+    monkeypatch.setattr(push_planner, "overhang", said)
+    assert near(first)
+    assert not near(planner.plan(q, block).path[-1])
+
+
+def test_the_planner_rejects_other_tasks(tmp_path):
+    setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
+    with pytest.raises(ValueError, match="does not push"):
+        planner_of(setting)
+
+
+@pytest.mark.slow
+def test_obstructed_arms_push_below_the_middle(tmp_path):
+    """Starts of YuMi without a straight path behind the block."""
+    members = read_split("extrapolation/arms/push").train
+    member = next(each for each in members if each.name == "yumi")
+    setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
+    planner = planner_of(setting)
+    space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
+    over = []
+    for i in (3, 4, 29, 31, 36, 39):
+        plan = planner.plan(setting.goals.q[i], setting.goals.blocks[i])
+        if plan is not None:
+            block = setting.goals.blocks[i]
+            over += find_contacts(space, plan.path[-1][None], block, edge).overhang.tolist()
+    assert (np.array(over) < 0.05).sum() >= 5
+
+
+def test_the_tool_can_turn_around():
+    tables = build_robot_tables([robot(PANDA)])
+    tool, q = ToolKinematics(tables, 0), np.array([tables.robots[0].home])
+    position, rotation = tool.poses(q)
+    turned = rotation @ np.diag([-1.0, -1.0, 1.0])
+    reached = tool.poses(tool.move_towards(q, position, turned, 60))
+    assert np.abs(reached[0] - position).max() < 5e-3
+    assert np.abs(reached[1] - turned).max() < 0.02
+
+
+def test_contacts_are_found_where_the_robot_touches_the_block():
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
+
+    def found(height):
+        scene = Scene(ball(height), block=Block((0.4, 0.4, 0.4)), ground=None)
+        return find_contacts(FreeSpace(scene), q, block, 0.4)
+
+    low = found(0.2)
+    assert low.q.tolist() == q[:2].tolist()
+    assert low.gap == pytest.approx(0.2, abs=0.002)
+    assert low.offset == pytest.approx([0.0, 0.1], abs=0.05)
+    assert low.width == pytest.approx(0.5, abs=0.12)
+    assert low.overhang.max() == 0
+    assert found(0.35).overhang.min() > 0.5
+
+
+@pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
+def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
+    """A box that touches the block below its middle, and a brim at its upper edge."""
+    foot = Shape(Box((0.2, 0.1, 0.1)))
+    brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
+    wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
+    assert found.overhang[0] == pytest.approx(over, abs=0.0035)
+
+    beyond = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
+    each = overhang(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
+    assert each[0] == found.overhang[0]
+    assert each[1] == 0
+
+
+def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
+    plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
+    wide = ball(0.2).with_links([plate])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.width[0] == 1
 
 
 def batch(words, n, cache, task="push", **options):
