@@ -193,8 +193,14 @@ def do_cell(
         return
 
     def learn(folder: Path, config: RunConfig) -> None:
-        hold = lambda folder: nullcontext()  # noqa: E731  # the caller has locked the cell's folder
-        train(folder, config, resume=True, execution=execution, show=show, hold=hold)
+        train(
+            folder,
+            config,
+            resume=True,
+            execution=execution,
+            show=show,
+            hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
+        )
 
     if cell.config is not None:
         learn(cell.folder, cell.config)
