@@ -137,6 +137,7 @@ def test_environments_give_the_same_bits_alone_and_in_a_batch(load, scenes):
             assert torch.equal(together.q[same, :dof], alone.q[0])
             assert torch.equal(together.qd[same, :dof], alone.qd[0])
             assert torch.equal(together.block_pose[same], alone.block_pose[0])
+            assert torch.equal(together.block_velocity[same], alone.block_velocity[0])
 
 
 @pytest.mark.parametrize("sim", WITH_CONTACTS)
