@@ -50,7 +50,6 @@ def make(cache, opened):
 @pytest.mark.parametrize(
     "imports",
     [
-        "import gymnasium, morphgen",
         "import gymnasium, morphgen.tasks",
         "import morphgen, gymnasium, morphgen.tasks",
         "import morphgen.tasks, gymnasium, morphgen.tasks.gym.env",

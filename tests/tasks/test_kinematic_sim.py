@@ -179,9 +179,6 @@ def test_joints_without_limits_turn_on():
 def test_scenes_with_something_to_touch_are_refused(scene, thing):
     with pytest.raises(SimulationError, match=f"environment 1 .*has {thing}"):
         KinematicSimulation([reach_scene(), scene])
-
-
-def test_requested_contacts_are_refused():
     for contacts in (Contacts(), Contacts(scene=False), Contacts(self_collision=False)):
         with pytest.raises(SimulationError, match="has no contacts"):
             KinematicSimulation([reach_scene()], contacts)
