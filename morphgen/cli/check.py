@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option, whole_number
+from morphgen.cli.command import command, flag, number, option
 from morphgen.errors import FormatError, one_line
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ SEVERITIES = ("error", "warning", "info")
     "find faults of robots and say how to repair them",
     opt.ROBOTS,
     flag("--strict", "fail on warnings, too"),
-    path_option("--fix", "DIR", "make the safe repairs and write bundles to DIR"),
+    option("--fix DIR", "make the safe repairs and write bundles to DIR", Path),
     *opt.ROOT_LIBRARY_JSON,
     details="The exit code is 1 if there is an error, or a warning with --strict; and 2 if a robot "
     "cannot be read, which does not stop the others.",
@@ -108,13 +108,7 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
     "conform",
     "compare robots in every loader and simulator, and measure how they hold and move",
     opt.ROBOTS,
-    option(
-        "--samples",
-        type=whole_number(1, 100_000),
-        default=100,
-        metavar="N",
-        help="number of random configurations",
-    ),
+    number("--samples", "number of random configurations", most=100_000, default=100),
     opt.SEED,
     *opt.ROOT_LIBRARY_JSON,
     details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio; they are "
@@ -206,11 +200,9 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    from tabulate import tabulate
-
     # As headers, the titles would be padded to more than 120 columns.
     lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
-    return tabulate(lines, tablefmt="plain", disable_numparse=True)
+    return opt.table(lines, tablefmt="plain", disable_numparse=True)
 
 
 def _cell(value: str | bool | float | None) -> str:

@@ -9,7 +9,6 @@ import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from morphgen.errors import MorphgenError, nearest
@@ -52,13 +51,20 @@ class Option:
         return f"only with {self.needs}" if self.needs and self.needs not in given else ""
 
 
-def option(*names: str, help: str = "", **settings: object) -> Option:
-    """Return an option; its help ends with the default, if there is one to show."""
+def option(
+    name: str, help: str = "", type: Callable[[str], object] | None = None, **settings: object
+) -> Option:
+    """Return an option, or an argument by position.
+
+    name: Name, and the word for its value in the help, such as ``--out DIR``.
+    help: Its text; it ends with the default, if there is one to show.
+    """
+    name, _, metavar = name.partition(" ")
     default = settings.get("default")
     if default not in (None, [], "") and "default" not in help:
         shown = f"{default:,}" if isinstance(default, int) else f"{default}"
         help += f" (default: {shown})" if help else f"default: {shown}"
-    return Option(names, {**settings, "help": help})
+    return Option((name,), {**settings, "help": help, "type": type, "metavar": metavar or None})
 
 
 def flag(name: str, help: str) -> Option:
@@ -66,20 +72,19 @@ def flag(name: str, help: str) -> Option:
     return Option((name,), {"action": "store_true", "help": help})
 
 
-def number(name: str, help: str, *, default: int | None = None, least: int = 1) -> Option:
+def number(
+    name: str, help: str, *, default: int | None = None, least: int = 1, most: int | None = None
+) -> Option:
     """Return an option whose value is a whole number."""
-    return option(name, type=whole_number(least), default=default, metavar="N", help=help)
+    return option(f"{name} N", help, whole_number(least, most), default=default)
 
 
-def path_option(name: str, metavar: str, help: str, *, default: Path | None = None) -> Option:
-    """Return an option whose value is a path."""
-    return option(name, type=Path, default=default, metavar=metavar, help=help)
-
-
-def repeated(name: str, help: str, **settings: object) -> Option:
+def repeated(
+    name: str, help: str, type: Callable[[str], object] | None = None, **settings: object
+) -> Option:
     """Return an option that may be given several times; its value is a list."""
     settings = {"action": "append", "default": [], **settings}
-    return Option((name,), {**settings, "help": f"{help}; may be repeated"})
+    return option(name, f"{help}; may be repeated", type, **settings)
 
 
 def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import check, robots
 from morphgen.cli import options as opt
-from morphgen.cli.command import Parser, add_commands, command, parse, path_option
+from morphgen.cli.command import Parser, add_commands, command, option, parse
 
 if TYPE_CHECKING:
     from morphgen.doctor import Entry
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @command(
     "demo",
     "compose a UR5 with a plate, check it and load it in every installed loader",
-    path_option("--out", "DIR", "output folder", default=Path("robots")),
+    option("--out DIR", "output folder", Path, default=Path("robots")),
     details="Each command is printed before it runs. The extra conform installs all loaders.",
     examples=("demo",),
 )

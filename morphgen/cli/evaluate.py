@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, number, option, path_option
+from morphgen.cli.command import command, number, option
 from morphgen.cli.progress import training_progress
 from morphgen.cli.train import (
     GOAL_SEED,
@@ -85,16 +85,14 @@ def plan_submission(
     "score a trained policy or a baseline on each robot",
     option(
         "checkpoint",
-        help="a checkpoint, a run folder, a policy that comes with morphgen "
+        "a checkpoint, a run folder, a policy that comes with morphgen "
         f"({', '.join(POLICIES)}), or a baseline ({', '.join(BASELINES)})",
     ),
     split_option("robots of a baseline, or other robots than the checkpoint's"),
-    option("--on", choices=SIDES, help="side of the split (default: both)"),
+    option("--on", "side of the split (default: both)", choices=SIDES),
     opt.OBSTACLES.needing("--split"),
     option(
-        "--mode",
-        choices=["deterministic", "stochastic"],
-        help="how the policy acts (default: both)",
+        "--mode", "how the policy acts (default: both)", choices=["deterministic", "stochastic"]
     ),
     (
         number("--episodes", "least number of episodes per robot"),
@@ -110,16 +108,16 @@ def plan_submission(
     opt.DEVICE,
     opt.SEED,
     GOAL_SEED,
-    path_option("--out", "FILE", "write a table: .csv, .json or .md"),
-    path_option(
-        "--submission",
-        "FILE",
+    option("--out FILE", "write a table: .csv, .json or .md", Path),
+    option(
+        "--submission FILE",
         "write the outcome of every episode, for morphgen split score; the default mode is then "
         "deterministic, and the default simulator that of the release, else mujoco",
+        Path,
     ),
-    option(
-        "--method", metavar="NAME", help="with --submission: name of the method in rankings"
-    ).needing("--submission"),
+    option("--method NAME", "with --submission: name of the method in rankings").needing(
+        "--submission"
+    ),
     opt.LIBRARY.needing("--split"),
     opt.JSON,
     details="Scores have 95% bootstrap intervals over episodes, success rates 95% Wilson "

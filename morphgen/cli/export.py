@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option, whole_number
+from morphgen.cli.command import command, flag, number, option
 from morphgen.errors import FormatError
 
 if TYPE_CHECKING:
@@ -248,42 +248,35 @@ _DEFAULT = "html"
     opt.ROBOTS,
     option(
         "--format",
+        "; ".join(f"{name}: {row.summary}" for name, row in FORMATS.items())
+        + f" (default: {_DEFAULT})",
         choices=tuple(FORMATS),
         default=_DEFAULT,
-        help="; ".join(f"{name}: {row.summary}" for name, row in FORMATS.items())
-        + f" (default: {_DEFAULT})",
     ),
-    path_option(
-        "--out",
-        "DIR",
-        "output folder (default: for files the robot's bundle, else this folder)",
+    option(
+        "--out DIR", "output folder (default: for files the robot's bundle, else this folder)", Path
     ),
     flag("--dark", f"a dark page ({formats_with('dark')} only)"),
-    option(
+    number(
         "--samples",
-        type=whole_number(1, MAX_SAMPLES),
-        metavar="N",
-        help="number of configurations in which pairs of links are tested "
+        "number of configurations in which pairs of links are tested "
         f"({formats_with('samples')} only; default: {SAMPLES:,})",
+        most=MAX_SAMPLES,
     ),
-    option(
+    number(
         "--seed",
-        type=whole_number(0),
-        metavar="N",
-        help=f"seed of these configurations ({formats_with('seed')} only; default: 0)",
+        f"seed of these configurations ({formats_with('seed')} only; default: 0)",
+        least=0,
     ),
-    option(
+    number(
         "--spheres",
-        type=whole_number(1),
-        metavar="N",
-        help="replace the collision shapes of each link by N spheres; in an SRDF, add them "
+        "replace the collision shapes of each link by N spheres; in an SRDF, add them "
         f"({formats_with('spheres')} only; default: keep the shapes, for curobo 8)",
     ),
     option(
-        "--cover",
-        type=float,
-        metavar="SHARE",
-        help="with --spheres: share of each link's volume that they must cover, such as 0.995",
+        "--cover SHARE",
+        "with --spheres: share of each link's volume that they must cover, such as 0.995",
+        float,
     ).needing("--spheres"),
     opt.ROOT,
     *opt.LIBRARY_JSON,
@@ -325,14 +318,11 @@ def export(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> ExportSettings:
     """Return the values of the options that only some formats have."""
-    given = {
-        "samples": args.samples,
-        "seed": args.seed,
-        "dark": args.dark or None,
-        "spheres": args.spheres,
-        "cover": args.cover,
+    names = [each.name for each in fields(ExportSettings) if each.name != "folders"]
+    given = {name: getattr(args, name) for name in names}
+    values = {
+        name: value for name, value in given.items() if value is not None and value is not False
     }
-    values = {name: value for name, value in given.items() if value is not None}
     for name in values:
         if name not in FORMATS[args.format].options:
             raise FormatError(

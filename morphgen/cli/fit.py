@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option, whole_number
+from morphgen.cli.command import command, flag, number, option
 from morphgen.cli.progress import bar, print_line, status, track
 from morphgen.errors import FitError, FormatError, MorphgenError
 
@@ -56,42 +56,36 @@ class Target:
 @command(
     "fit",
     "fit primitives to meshes, and measure how good they are",
-    option("words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {opt.ROBOTS_HELP}"),
+    option("words ROBOT", f"a part, a mesh file, or {opt.ROBOTS_HELP}", nargs="*"),
     flag("--all", "fit every part with meshes, and store the fits in the library"),
     flag("--missing", "with --all: only the parts without stored fits").needing("--all"),
-    option(
-        "--max-primitives",
-        type=int,
-        metavar="K",
-        help="largest number of primitives per link (default: 1)",
-    ).without("--all", "--spheres"),
+    option("--max-primitives K", "largest number of primitives per link (default: 1)", int).without(
+        "--all", "--spheres"
+    ),
     option(
         "--iou",
-        type=float,
-        help="with --max-primitives: use the fewest primitives that reach this intersection over "
+        "with --max-primitives: use the fewest primitives that reach this intersection over "
         f"union (default: {DEFAULT_IOU})",
+        float,
     )
     .needing("--max-primitives")
     .without("--all", "--spheres"),
-    option(
+    number(
         "--spheres",
-        type=whole_number(1),
-        metavar="N",
-        help="fit N spheres to each link, and no other primitives, for planners",
+        "fit N spheres to each link, and no other primitives, for planners",
     ).without("--all"),
     option(
-        "--cover",
-        type=float,
-        metavar="SHARE",
-        help="with --spheres: share of each link's volume that they must cover, such as 0.995 "
+        "--cover SHARE",
+        "with --spheres: share of each link's volume that they must cover, such as 0.995 "
         "(default: the largest intersection over union)",
+        float,
     ).needing("--spheres"),
     flag("--enclose", "enclose every point of the link, for conservative collision checks").without(
         "--all", "--spheres"
     ),
     flag("--visual", "replace the visual shapes, too").needing("--out").without("--all"),
-    path_option(
-        "--out", "DIR", "write the robot's bundle to DIR; several robots: a bundle each in DIR"
+    option(
+        "--out DIR", "write the robot's bundle to DIR; several robots: a bundle each in DIR", Path
     ).without("--all"),
     opt.NO_PICTURE.needing("--out").without("--all"),
     number(
@@ -267,20 +261,16 @@ def _report_text(report: FitReport) -> str:
 
 
 def _agreement_text(primitives: Agreement, hulls: Agreement, n: int) -> str:
-    from tabulate import tabulate
-
     rows = [
         (name, result.accuracy, result.precision, result.recall)
         for name, result in (("primitives", primitives), ("convex hulls of meshes", hulls))
     ]
-    table = tabulate(rows, ("", "agree", "precision", "recall"), floatfmt=".3f")
+    table = opt.table(rows, ("", "agree", "precision", "recall"), floatfmt=".3f")
     return f"collisions in {n} random configurations, compared with the meshes' triangles:\n{table}"
 
 
 def _table(rows: list[tuple[object, ...]]) -> str:
-    from tabulate import tabulate
-
-    return tabulate(rows, list(COLUMNS), floatfmt=tuple(COLUMNS.values()))
+    return opt.table(rows, list(COLUMNS), floatfmt=tuple(COLUMNS.values()))
 
 
 def _row(link: str, fit: LinkFit, same_as: str | None = None) -> tuple[object, ...]:

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from morphgen.cli.command import Option, flag, number, option, path_option, repeated
+from morphgen.cli.command import Option, flag, number, option, repeated
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
@@ -29,17 +29,15 @@ ROBOT_HELP = (
     "compose such as arm=ur5 ee=plane"
 )
 ROBOTS_HELP = f"{ROBOT_HELP}; a set of morphgen sample or a folder of bundles names all its robots"
-ROBOT = option("words", nargs="+", metavar="ROBOT", help=ROBOT_HELP)
-ROBOTS = option("words", nargs="+", metavar="ROBOT", help=ROBOTS_HELP)
+ROBOT = option("words ROBOT", ROBOT_HELP, nargs="+")
+ROBOTS = option("words ROBOT", ROBOTS_HELP, nargs="+")
 JSON = flag("--json", "print JSON")
-LIBRARY = repeated(
-    "--library", "a folder of your own parts (also: MORPHGEN_LIBRARY)", metavar="DIR", type=Path
-)
-ROOT = path_option(
-    "--root",
-    "DIR",
+LIBRARY = repeated("--library DIR", "a folder of your own parts (also: MORPHGEN_LIBRARY)", Path)
+ROOT = option(
+    "--root DIR",
     "a folder that meshes, includes and YAML may come from, besides the description's own "
     "folder and package",
+    Path,
 )
 MAX_LINKS = number(
     "--max-links",
@@ -55,41 +53,35 @@ LIBRARY_JSON = (LIBRARY, JSON)
 JOBS_LIBRARY_JSON = (JOBS, *LIBRARY_JSON)
 ROOT_LIBRARY_JSON = (ROOT, *LIBRARY_JSON)
 BUNDLE_OUT = (
-    path_option("--out", "DIR", "output folder", default=Path("robots")),
-    option("--name", help="name of the robot and of its folder (default: from its parts or file)"),
+    option("--out DIR", "output folder", Path, default=Path("robots")),
+    option("--name", "name of the robot and of its folder (default: from its parts or file)"),
     NO_PICTURE,
 )
 WORKERS = number("--workers", "number of processes of PyBullet, or of threads of MuJoCo", default=1)
-DEVICE = option("--device", default="cpu", help="device of the networks: cpu or cuda")
+DEVICE = option("--device", "device of the networks: cpu or cuda", default="cpu")
 RAY = option(
-    "--ray",
-    metavar="ADDRESS",
+    "--ray ADDRESS",
+    "run on the Ray cluster at this address (without an address: on a local Ray)",
     nargs="?",
     const="",
-    help="run on the Ray cluster at this address (without an address: on a local Ray)",
 )
 TASK_NAMES = f"{', '.join(TASKS.builtin)}, or a task of an installed package"
-TASK = option("task", choices=TASKS, metavar="TASK", help=TASK_NAMES)
+TASK = option("task TASK", TASK_NAMES, choices=TASKS)
 
 
 def sim_option(default: str = DEFAULT_SIMULATOR) -> Option:
     """Return the option ``--sim``; its value is None if it is not given."""
     names = f"{', '.join(SIMULATORS.builtin)}, or a simulator of an installed package"
-    return option(
-        "--sim",
-        choices=SIMULATORS,
-        metavar="SIM",
-        help=f"{names} (default: {default})",
-    )
+    return option("--sim SIM", f"{names} (default: {default})", choices=SIMULATORS)
 
 
 def goal_option(default: str = GOAL_KINDS[0]) -> Option:
     """Return the option ``--goal``, which ``with_goal`` evaluates; None if it is not given."""
     return option(
         "--goal",
-        choices=GOAL_KINDS,
-        help="reach: the goal's position, within 3 cm, or its pose, within 3 cm and 10 degrees "
+        "reach: the goal's position, within 3 cm, or its pose, within 3 cm and 10 degrees "
         f"(default: {default})",
+        choices=GOAL_KINDS,
     )
 
 
@@ -116,6 +108,13 @@ def print_result(args: argparse.Namespace, data: object, text: Callable[[], str]
     """Print data as JSON if ``--json`` is given, else text unless it is empty."""
     if shown := json.dumps(data, default=str) if args.json else text():
         print(shown)
+
+
+def table(rows: Iterable[Any], headers: Sequence[str] | str = (), **style: object) -> str:
+    """Return rows as a table; ``style`` are arguments of tabulate."""
+    from tabulate import tabulate
+
+    return tabulate(rows, headers, **style)
 
 
 def library_of(args: argparse.Namespace) -> Library:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option, positive
+from morphgen.cli.command import command, flag, number, option, positive
 from morphgen.cli.progress import bar, print_line, status
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES
@@ -46,16 +46,15 @@ def _policy(text: str) -> str:
     opt.TASK,
     opt.ROBOT,
     option(
-        "--policy",
-        type=_policy,
-        default="random",
-        metavar="POLICY",
-        help="the controller: zero (no action), random, jacobian (each joint along its own "
+        "--policy POLICY",
+        "the controller: zero (no action), random, jacobian (each joint along its own "
         "Jacobian column, for reach), ik (inverse kinematics, for reach), scripted (for push), "
         "zero-shot and zero-shot-obstacles (policies for reach that come with morphgen); or a "
         "checkpoint or run folder",
+        _policy,
+        default="random",
     ),
-    path_option("--out", "FILE", "the video: .mp4 or .gif"),
+    option("--out FILE", "the video: .mp4 or .gif", Path),
     opt.sim_option(),
     opt.goal_option("that of the checkpoint, else position"),
     number("--episodes", "number of episodes", default=1),
@@ -63,8 +62,8 @@ def _policy(text: str) -> str:
     OBSTACLES,
     option(
         "--kind",
+        "kind of actions (default: that of the checkpoint, else continuous)",
         choices=["continuous", "discrete"],
-        help="kind of actions (default: that of the checkpoint, else continuous)",
     ),
     opt.LIBRARY,
     details="The result of each episode is printed.",
@@ -125,17 +124,11 @@ def play(args: argparse.Namespace) -> None:
     opt.WORKERS,
     option(
         "--device",
-        help="device of the environments: cpu, or cuda with --sim warp or kinematic (default: cpu; "
+        "device of the environments: cpu, or cuda with --sim warp or kinematic (default: cpu; "
         "warp: cuda)",
     ),
     OBSTACLES,
-    option(
-        "--seconds",
-        type=positive,
-        default=5.0,
-        metavar="S",
-        help="least duration of the measurement",
-    ),
+    option("--seconds S", "least duration of the measurement", positive, default=5.0),
     *opt.LIBRARY_JSON,
     details="Environments of one robot are stepped with random actions. Environment steps are at "
     "50 Hz, physics steps at 200 Hz. The share of the simulator is its library's step alone, if it "
@@ -148,8 +141,6 @@ def play(args: argparse.Namespace) -> None:
 )
 def speed(args: argparse.Namespace) -> None:
     """Measure the speed and print it."""
-    from tabulate import tabulate
-
     with status(args, "loading"):
         from morphgen.tasks.scenes.make import make_batch
         from morphgen.tasks.speed import measure_speed
@@ -179,7 +170,7 @@ def speed(args: argparse.Namespace) -> None:
             f"{batch.device.type}, {args.workers} worker(s)\n"
             f"environment steps per second: {result.steps_per_second:,.0f}\n"
             f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
-            f"{tabulate(shares)}"
+            f"{opt.table(shares)}"
         )
 
     data = {"steps_per_second": result.steps_per_second, "shares": result.shares}
@@ -194,18 +185,18 @@ FILM_EPISODES = 3
     "zeroshot",
     "let a policy that comes with morphgen act on any robot, without training",
     opt.ROBOT,
-    option("--task", default="reach", help="task of the robot (default: reach)"),
-    path_option("--policy", "CHECKPOINT", "another policy: a checkpoint, or a run folder"),
+    option("--task", "task of the robot (default: reach)", default="reach"),
+    option("--policy CHECKPOINT", "another policy: a checkpoint, or a run folder", Path),
     number("--episodes", "number of episodes", default=20),
     opt.OBSTACLES,
     opt.goal_option("that of the policy's training; of the policies here, position"),
     opt.SEED,
     opt.sim_option(),
     opt.WORKERS,
-    path_option(
-        "--out",
-        "FILE",
+    option(
+        "--out FILE",
         "a video of three episodes, which end after 1 s of success: .mp4 or .gif",
+        Path,
     ),
     *opt.LIBRARY_JSON,
     details="There are policies for reach and --goal pose, each also with --obstacles, and for "
@@ -258,8 +249,6 @@ def zeroshot(args: argparse.Namespace) -> None:
 
 
 def _table(scores: Mapping[str, Score], task: str) -> str:
-    from tabulate import tabulate
-
     from morphgen.rl.scores.scores import success_of
     from morphgen.tasks.registry import TASKS
 
@@ -273,7 +262,7 @@ def _table(scores: Mapping[str, Score], task: str) -> str:
         columns["angle [deg]"] = [f"{angle:.1f}" for angle in angles]
     if TASKS[task].relative_to_random:  # the score of others is their success
         columns["score"] = [f"{score.score:.1f}" for score in scores.values()]
-    return tabulate(columns, headers="keys")
+    return opt.table(columns, headers="keys")
 
 
 def _film(source: RobotSource, policy: Path, config: EvalConfig, args: argparse.Namespace) -> None:

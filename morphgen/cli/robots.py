@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option, repeated
+from morphgen.cli.command import command, flag, option, repeated
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import CompositionError, FormatError, MorphgenError
 
@@ -29,18 +29,17 @@ PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment"
     "compose",
     "join a base, arms and end-effectors into a robot",
     option(
-        "words",
+        "words [GRAMMAR] KEY=VALUE",
+        "arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
         nargs="+",
-        metavar="[GRAMMAR] KEY=VALUE",
-        help="arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
     ),
     option(
         "--geometry",
-        choices=["mesh", "primitive", "convex", "sphere"],
-        default="mesh",
-        help="collision shapes: meshes of real parts; in their place fitted boxes, cylinders and "
+        "collision shapes: meshes of real parts; in their place fitted boxes, cylinders and "
         "spheres, or convex pieces by CoACD, which takes minutes once for each part; or 8 spheres "
         "for each link",
+        choices=["mesh", "primitive", "convex", "sphere"],
+        default="mesh",
     ),
     *opt.BUNDLE_OUT,
     *opt.LIBRARY_JSON,
@@ -114,7 +113,7 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> WrittenBundle:
 @command(
     "list",
     "list the parts that morphgen compose joins",
-    option("kind", nargs="?", choices=list(PART_KINDS), help="list only this kind"),
+    option("kind", "list only this kind", nargs="?", choices=list(PART_KINDS)),
     *opt.LIBRARY_JSON,
     details="The columns are degrees of freedom, reach (m), mass (kg), source, licence "
     "and manufacturer of the real product.",
@@ -122,13 +121,11 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> WrittenBundle:
 )
 def list_parts(args: argparse.Namespace) -> None:
     """Print a table with a row per part."""
-    from tabulate import tabulate
-
     from morphgen.grammar.catalogue import catalogue
 
     with status(args, "reading the parts"):
         rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
+    opt.print_result(args, rows, lambda: opt.table(rows, headers="keys", floatfmt=".3g"))
 
 
 @command(
@@ -221,20 +218,15 @@ _PARTS = Path("parts")
     "import",
     "turn a URDF, xacro or MJCF into a bundle, or several",
     option(
-        "files",
-        nargs="+",
-        metavar="FILE",
-        help="a URDF, an MJCF, or a xacro if its suffix is .xacro; or menagerie:NAME or "
+        "files FILE",
+        "a URDF, an MJCF, or a xacro if its suffix is .xacro; or menagerie:NAME or "
         "robot_descriptions:NAME, a robot of one of these pip packages",
+        nargs="+",
     ),
-    option(
-        "--root-link",
-        metavar="LINK",
-        help="link where the robot begins (default: the root of the file)",
-    ),
-    option("--tool", metavar="LINK", help="link whose frame is the tool"),
-    path_option("--srdf", "FILE", "an SRDF; the pairs of links that it disables are ignored, too"),
-    repeated("--arg", "a xacro argument", metavar="NAME=VALUE"),
+    option("--root-link LINK", "link where the robot begins (default: the root of the file)"),
+    option("--tool LINK", "link whose frame is the tool"),
+    option("--srdf FILE", "an SRDF; the pairs of links that it disables are ignored, too", Path),
+    repeated("--arg NAME=VALUE", "a xacro argument"),
     flag(
         "--as-is",
         "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
@@ -244,15 +236,13 @@ _PARTS = Path("parts")
         "--skip-missing-meshes",
         "leave out the shapes of a URDF whose mesh is missing; the findings and the card name them",
     ),
+    option("--part", "also write a manifest: the robot becomes a part", choices=KINDS_OF_PARTS),
     option(
-        "--part", choices=KINDS_OF_PARTS, help="also write a manifest: the robot becomes a part"
+        "--parts DIR", f"with --part: folder of the manifests (default: {_PARTS})", Path
+    ).needing("--part"),
+    option("--licence TEXT", "with --part: licence, if the robot's source has none").needing(
+        "--part"
     ),
-    path_option(
-        "--parts", "DIR", f"with --part: folder of the manifests (default: {_PARTS})"
-    ).needing("--part"),
-    option(
-        "--licence", metavar="TEXT", help="with --part: licence, if the robot's source has none"
-    ).needing("--part"),
     opt.ROOT,
     *opt.BUNDLE_OUT,
     opt.JSON,

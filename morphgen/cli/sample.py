@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, command, flag, number, option, path_option, repeated
+from morphgen.cli.command import Command, command, flag, number, option, repeated
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import FormatError
 
@@ -22,18 +22,16 @@ if TYPE_CHECKING:
     from morphgen.grammar.robot_source import RobotSource
 
 
-GRAMMAR = option("grammar", help="name of a grammar (see: morphgen grammar list), or its file")
+GRAMMAR = option("grammar", "name of a grammar (see: morphgen grammar list), or its file")
 
 
 @command("list", "list the grammars that come with morphgen", opt.JSON)
 def list_grammars(args: argparse.Namespace) -> None:
     """Print the names and summaries."""
-    from tabulate import tabulate
-
     from morphgen.grammar.grammar_file import grammar_names, grammar_summary
 
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
+    opt.print_result(args, rows, lambda: opt.table(rows, headers="keys"))
 
 
 @command(
@@ -135,8 +133,8 @@ NUMBER = number("-n", "number of robots", default=10)
     GRAMMAR,
     NUMBER,
     opt.SEED,
-    path_option("--out", "DIR", "output folder (default: robots/GRAMMAR)"),
-    repeated("--where", "keep only robots such as 'reach > 0.4 and dof >= 5'", metavar="CONDITION"),
+    option("--out DIR", "output folder (default: robots/GRAMMAR)", Path),
+    repeated("--where CONDITION", "keep only robots such as 'reach > 0.4 and dof >= 5'"),
     flag("--light", "write the URDF and the derivation only"),
     opt.NO_PICTURE,
     opt.JOBS,
@@ -188,10 +186,9 @@ def sample(args: argparse.Namespace) -> None:
     "derive",
     "print or replay the derivation of a robot",
     option(
-        "words",
+        "words ROBOT",
+        "folder of a bundle or of a robot of a light set, or words of morphgen compose",
         nargs="+",
-        metavar="ROBOT",
-        help="folder of a bundle or of a robot of a light set, or words of morphgen compose",
     ),
     flag(
         "--replay",
@@ -230,12 +227,10 @@ def derive(args: argparse.Namespace) -> int:
 @command(
     "mutate",
     "sample neighbours of a robot: one choice or parameter of its grammar changed",
-    option(
-        "robot", type=Path, metavar="ROBOT", help="a robot's folder in a set of morphgen sample"
-    ),
+    option("robot ROBOT", "a robot's folder in a set of morphgen sample", Path),
     NUMBER,
     opt.SEED,
-    path_option("--out", "DIR", "output folder (default: SET-mutants-SEED)"),
+    option("--out DIR", "output folder (default: SET-mutants-SEED)", Path),
     opt.NO_PICTURE,
     *opt.LIBRARY_JSON,
     examples=("mutate robots/chain/chain-000001 -n 20",),

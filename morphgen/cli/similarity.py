@@ -8,10 +8,11 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, path_option
+from morphgen.cli.command import command, flag, option
 from morphgen.cli.progress import bar, track
 from morphgen.errors import BenchmarkError
 from morphgen.progress import part_of
@@ -32,10 +33,10 @@ LARGEST_MATRIX = 20
     "similarity",
     "compare robots: tokens, kinematic trees, workspaces",
     opt.ROBOTS,
-    option("--measure", choices=MEASURES, default="tree", help="how the robots are compared"),
-    path_option("--heatmap", "FILE.png", "draw the matrix"),
-    path_option("--map", "FILE.png", "draw the robots by their distances"),
-    path_option("--csv", "FILE", "write a row per pair of robots"),
+    option("--measure", "how the robots are compared", choices=MEASURES, default="tree"),
+    option("--heatmap FILE.png", "draw the matrix", Path),
+    option("--map FILE.png", "draw the robots by their distances", Path),
+    option("--csv FILE", "write a row per pair of robots", Path),
     opt.MAX_LINKS,
     *opt.ROOT_LIBRARY_JSON,
     details="The whole matrix is printed for up to 20 robots; beyond that, the nearest robot of "
@@ -127,15 +128,12 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
 
 
 def _matrix_table(names: Sequence[str], measure: str, values: Array) -> str:
-    from tabulate import tabulate
-
     rows = [(i, name, *row) for i, (name, row) in enumerate(zip(names, values, strict=True))]
-    return tabulate(rows, ("#", "robot", *map(str, range(len(names)))), floatfmt=".3f")
+    return opt.table(rows, ("#", "robot", *map(str, range(len(names)))), floatfmt=".3f")
 
 
 def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
     import numpy as np
-    from tabulate import tabulate
 
     from morphgen.benchmark.similarity import to_distances
 
@@ -146,7 +144,7 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
         (name, names[nearest], values[i, nearest], means[i])
         for i, (name, nearest) in enumerate(zip(names, distance.argmin(axis=1), strict=True))
     ]
-    return tabulate(rows, ("robot", "nearest", measure, "mean of others"), floatfmt=".3f")
+    return opt.table(rows, ("robot", "nearest", measure, "mean of others"), floatfmt=".3f")
 
 
 def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
@@ -195,9 +193,9 @@ HEADERS = (
 @command(
     "tokens",
     "print or write the tokens of robots, 48 numbers per link",
-    option("words", nargs="*", metavar="ROBOT", help=opt.ROBOTS_HELP),
+    option("words ROBOT", opt.ROBOTS_HELP, nargs="*"),
     flag("--layout", "print the fields of a token"),
-    path_option("--out", "FILE.npz", "write the tokens to this file"),
+    option("--out FILE.npz", "write the tokens to this file", Path),
     opt.MAX_LINKS,
     *opt.ROOT_LIBRARY_JSON,
     details="The table shows the tokens decoded, at the home configuration. The token of a link "
@@ -254,8 +252,6 @@ def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:
 
 def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
     """Return a table with a row per link, decoded from the tokens."""
-    from tabulate import tabulate
-
     from morphgen.benchmark.tokens import robot_from_tokens
 
     decoded, shapes = robot_from_tokens(tokens, robot.name, max_links=max_links)
@@ -279,7 +275,7 @@ def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
                 f"{home[i - 1] + 0.0:.3f}" if i - 1 in home else "",
             )
         )
-    table = tabulate(rows, HEADERS, disable_numparse=True)
+    table = opt.table(rows, HEADERS, disable_numparse=True)
     return f"{table}\n{robot.name}: {tokens.shape}, indices over {max_links - 1}"
 
 
@@ -303,12 +299,11 @@ def _numbers(values: Sequence[float], digits: int = 3) -> str:
 
 
 def _layout_text() -> str:
-    from tabulate import tabulate
 
     from morphgen.benchmark.tokens import LAYOUT
 
     rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
-    return tabulate(rows, ("field", "columns", "size", "content"), disable_numparse=True)
+    return opt.table(rows, ("field", "columns", "size", "content"), disable_numparse=True)
 
 
 def _layout_data() -> list[dict[str, object]]:

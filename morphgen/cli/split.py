@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, Option, command, flag, number, option, path_option
+from morphgen.cli.command import Command, Option, command, flag, number, option
 from morphgen.cli.progress import bar, status
 from morphgen.cli.split_new import new
 from morphgen.cli.split_release import release, score
@@ -38,12 +38,11 @@ HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certifi
     "goals",
     "sample the goal sets of robots, and certify that each goal can be reached",
     option(
-        "words",
+        "words SPLIT",
+        f"name of a split, its file or built folder; with --task, a robot: {opt.ROBOT_HELP}",
         nargs="+",
-        metavar="SPLIT",
-        help=f"name of a split, its file or built folder; with --task, a robot: {opt.ROBOT_HELP}",
     ),
-    option("--task", choices=TASKS, metavar="TASK", help=f"one robot: its task, {opt.TASK_NAMES}"),
+    option("--task TASK", f"one robot: its task, {opt.TASK_NAMES}", choices=TASKS),
     opt.OBSTACLES,
     opt.SEED,
     flag("--certify", "verify every goal with the configuration that it was sampled from"),
@@ -107,9 +106,7 @@ def make_goals(
 
 
 def _goals_text(results: Sequence[GoalResult], seed: int) -> str:
-    from tabulate import tabulate
-
-    lines = [tabulate([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
+    lines = [opt.table([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
     for result in results:
         robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
         if result.goals is None:
@@ -162,13 +159,11 @@ def _goal_seed(help: str) -> Option:
 @command(
     "audit",
     "look for leaks between train and test robots",
-    option("split", metavar="SPLIT", help="name of a split, its file, or its built folder"),
+    option("split SPLIT", "name of a split, its file, or its built folder"),
     option(
-        "--near",
-        metavar="TREE,COSINE[,WORKSPACE]",
-        help="robots are nearly the same if their tree distance is below, and their cosine "
-        "similarity or, at one reach, their workspace overlap above "
-        "(default: 0.001,0.99999,0.999)",
+        "--near TREE,COSINE[,WORKSPACE]",
+        "robots are nearly the same if their tree distance is below, and their cosine similarity "
+        "or, at one reach, their workspace overlap above (default: 0.001,0.99999,0.999)",
     ),
     flag("--strict", "fail on warnings, too"),
     flag("--goals", "audit goal sets even if the split ships none"),
@@ -242,7 +237,6 @@ def _audit_goals(
 
 
 def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
-    from tabulate import tabulate
 
     from morphgen.benchmark.similarity import MEASURES
 
@@ -252,7 +246,7 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: s
         nearest.setdefault(neighbour.test, []).append(cell)
     rows = [(test, *cells) for test, cells in nearest.items()]
     headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
-    lines = [tabulate(rows, headers, disable_numparse=True)] if rows else []
+    lines = [opt.table(rows, headers, disable_numparse=True)] if rows else []
     for code, findings in _by_code(result.findings).items():
         lines.append(f"{findings[0].severity} {code} ({len(findings)})")
         lines += _listed(findings)
@@ -290,8 +284,8 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 @command(
     "build",
     "write every robot of a split and its tokens into a folder",
-    option("split", metavar="SPLIT", help="name of a split, or its file"),
-    path_option("--out", "DIR", "folder where the split's folder goes", default=Path("data")),
+    option("split SPLIT", "name of a split, or its file"),
+    option("--out DIR", "folder where the split's folder goes", Path, default=Path("data")),
     flag("--light", "write the URDF and the derivation only"),
     flag("--picture", "draw preview.png of every robot"),
     flag("--goals", "ship the goal set of every robot"),
@@ -331,11 +325,7 @@ def build(args: argparse.Namespace) -> None:
 @command(
     "verify",
     "verify that a split, its built folder or its release has the robots that it claims",
-    option(
-        "path",
-        metavar="PATH",
-        help="name of a split, its file, its built folder, or the archive of a release",
-    ),
+    option("path PATH", "name of a split, its file, its built folder, or the archive of a release"),
     *opt.JOBS_LIBRARY_JSON,
     details="Every robot is composed anew and compared: with the hashes of the split, or with all "
     "files of a built folder or a release. The exit code is 1 if something differs.",
@@ -371,18 +361,13 @@ def verify(args: argparse.Namespace) -> int:
 @command(
     "difficulty",
     "print how hard each robot of splits is: size, nearest train robots, baselines",
+    option("splits SPLIT", "names of splits, their files, or their built folders", nargs="+"),
     option(
-        "splits",
-        nargs="+",
-        metavar="SPLIT",
-        help="names of splits, their files, or their built folders",
-    ),
-    path_option(
-        "--study",
-        "FOLDER",
+        "--study FOLDER",
         "output folder of morphgen study, for score and success of the baselines",
+        Path,
     ),
-    path_option("--csv", "FILE", "write a row per robot"),
+    option("--csv FILE", "write a row per robot", Path),
     *opt.JOBS_LIBRARY_JSON,
     details="The columns are the movable joints between root and tool, links, reach, and by each "
     "similarity measure the nearest other train robot with its value. With --study, score and "
@@ -471,8 +456,6 @@ SHORT_DERIVATION = 60
 @command("list", "list the splits that come with morphgen", opt.JSON)
 def list_splits(args: argparse.Namespace) -> None:
     """Print a row per split."""
-    from tabulate import tabulate
-
     from morphgen.benchmark.split_file import read_split, split_names
 
     splits = [read_split(name) for name in split_names()]
@@ -499,13 +482,13 @@ def list_splits(args: argparse.Namespace) -> None:
         )
         for row in data
     ]
-    opt.print_result(args, data, lambda: tabulate(rows, headers))
+    opt.print_result(args, data, lambda: opt.table(rows, headers))
 
 
 @command(
     "show",
     "print the robots of a split",
-    option("split", metavar="SPLIT", help="name of a split, or its file"),
+    option("split SPLIT", "name of a split, or its file"),
     flag("--full", "print whole derivations, and how the robots were chosen"),
     *opt.LIBRARY_JSON,
     details="Names the licences of the parts, and the robots with a part under a non-commercial, "
@@ -529,7 +512,6 @@ def show(args: argparse.Namespace) -> None:
 
 
 def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
-    from tabulate import tabulate
 
     from morphgen.benchmark.split import SIDES, split_id
 
@@ -548,7 +530,7 @@ def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
         counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
         rows = [_row(member, full=full) for member in members]
         lines.append(f"\n{side}, {len(members)}: {counts}")
-        lines.append(tabulate(rows, headers, disable_numparse=True))
+        lines.append(opt.table(rows, headers, disable_numparse=True))
     return "\n".join(lines)
 
 
@@ -574,9 +556,7 @@ def _categories(members: Sequence[Member]) -> Counter[str]:
 @command(
     "stats",
     "print statistics of splits next to those of the paper",
-    option(
-        "splits", nargs="*", metavar="SPLIT", help="names or files (default: all shipped splits)"
-    ),
+    option("splits SPLIT", "names or files (default: all shipped splits)", nargs="*"),
     flag("--markdown", "print the table as Markdown"),
     *opt.JOBS_LIBRARY_JSON,
     details="The columns are the mean numbers of links, of movable joints and of movable joints "
@@ -585,8 +565,6 @@ def _categories(members: Sequence[Member]) -> Counter[str]:
 )
 def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
-    from tabulate import tabulate
-
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
     from morphgen.benchmark.split_file import read_split, split_names
     from morphgen.benchmark.survey import PAPER_TABLE, paper_row, statistics
@@ -617,7 +595,7 @@ def stats(args: argparse.Namespace) -> None:
         ]
         style = "github" if args.markdown else "simple"
         lines = [
-            tabulate(rows, "keys", tablefmt=style, disable_numparse=True),
+            opt.table(rows, "keys", tablefmt=style, disable_numparse=True),
             "",
             "links, joints, mass: mean over the train robots; cosine: of test and train robots",
             f"in parentheses: {PAPER_TABLE}",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
+from morphgen.cli.command import Command, Option, flag, number, option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
 
@@ -122,16 +122,13 @@ def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
     """Return the options of all regimes; ``train`` is the default of ``--train``."""
     return (
         option(
-            "--train",
-            metavar="N,...",
-            default=train,
-            help="number of train robots; several numbers give a split each, with the same test "
+            "--train N,...",
+            "number of train robots; several numbers give a split each, with the same test "
             f"robots, the smaller within the larger (default: {train_default or train})",
+            default=train,
         ),
-        option("--test", type=int, default=1, metavar="N", help="number of test robots"),
-        option(
-            "--task", default="reach", metavar="TASK,...", help="one task, or several with commas"
-        ),
+        option("--test N", "number of test robots", int, default=1),
+        option("--task TASK,...", "one task, or several with commas", default="reach"),
         flag("--obstacles", "tasks have obstacles"),
         opt.SEED,
         number(
@@ -140,11 +137,11 @@ def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
             "(default: 23)",
             least=2,
         ),
-        option("--name", help="name of the split (default: from the other options)"),
-        path_option(
-            "--out",
-            "FILE.yaml|DIR",
+        option("--name", "name of the split (default: from the other options)"),
+        option(
+            "--out FILE.yaml|DIR",
             "the file, or the folder where NAME.yaml goes (default: this folder)",
+            Path,
             default=Path(),
         ),
         flag("--statistics", "add the statistics of morphgen split stats to the file"),
@@ -159,15 +156,15 @@ REGIMES = (
         (
             option(
                 "--grammar",
+                "name of a grammar (see: morphgen grammar list), or its file",
                 required=True,
-                help="name of a grammar (see: morphgen grammar list), or its file",
             ),
             option(
                 "--hull",
+                "parameters of test robots are inside or outside of the convex hull of those "
+                "of the train robots with the same structure",
                 choices=["inside", "outside", "any"],
                 default="any",
-                help="parameters of test robots are inside or outside of the convex hull of those "
-                "of the train robots with the same structure",
             ),
             *split_options("10"),
         ),
@@ -180,10 +177,9 @@ REGIMES = (
         "test robots join parts that are trained, but not together",
         (
             repeated(
-                "--from",
+                "--from WORDS",
                 "words of morphgen compose with choices in braces and wildcards",
                 dest="patterns",
-                metavar="WORDS",
                 required=True,
                 default=None,
             ),
@@ -205,19 +201,17 @@ REGIMES = (
         (
             *(
                 option(
-                    f"--{side}-category",
-                    metavar="GRAMMAR,...",
+                    f"--{side}-category GRAMMAR,...",
+                    f"names or files of grammars whose robots are {side} robots, in turn",
                     required=True,
-                    help=f"names or files of grammars whose robots are {side} robots, in turn",
                 )
                 for side in ("train", "test")
             ),
             option(
-                "--similarity",
-                metavar="BOUND",
-                default="",
-                help="bound on the cosine similarity of each test robot to its nearest train "
+                "--similarity BOUND",
+                "bound on the cosine similarity of each test robot to its nearest train "
                 "robot, such as '<0.6'",
+                default="",
             ),
             *split_options("10"),
         ),
@@ -235,24 +229,21 @@ new = Command(
     "choose train and test robots, and write them as a split",
     (
         repeated(
-            "--hold-out",
+            "--hold-out RULE,...",
             "what test robots have and train robots do not: names of parts (arm=kinova*), a "
             "manufacturer (manufacturer=Kinova), a range of a parameter (arm3.length=0.3..0.4), or "
             "a combination (arm=ur5+ee=plane); several are separated by commas",
-            metavar="RULE,...",
         ),
         repeated(
-            "--from",
+            "--from WORDS",
             "robots to draw from: words of morphgen compose with choices in braces and wildcards "
             "(default: 'arm=* ee=*')",
             dest="patterns",
-            metavar="WORDS",
         ),
         option(
-            "--grammar",
-            metavar="GRAMMAR,...",
+            "--grammar GRAMMAR,...",
+            "draw robots from these grammars instead, or besides those of --from",
             default="",
-            help="draw robots from these grammars instead, or besides those of --from",
         ),
         *split_options("10"),
     ),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option, repeated
+from morphgen.cli.command import command, flag, number, option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
@@ -24,35 +24,23 @@ if TYPE_CHECKING:
 @command(
     "release",
     "write an archive of a split that others can verify, cite and score against",
-    option("split", metavar="SPLIT", help="name of a split, or its file"),
-    option(
-        "--version",
-        dest="release_version",  # `morphgen --version` has the other name
-        metavar="X.Y.Z",
-        default="1.0.0",
-        help="version of the release",
-    ),
-    path_option("--out", "DIR", "folder of the archive", default=Path("releases")),
-    option(
-        "--date",
-        metavar="YYYY-MM-DD",
-        default="",
-        help="date of publication, which dataset tools recommend",
-    ),
-    repeated("--creator", "who publishes the release", metavar="NAME"),
-    option("--url", default="", help="address where the release will be"),
+    option("split SPLIT", "name of a split, or its file"),
+    # `morphgen --version` has the other name
+    option("--version X.Y.Z", "version of the release", dest="release_version", default="1.0.0"),
+    option("--out DIR", "folder of the archive", Path, default=Path("releases")),
+    option("--date YYYY-MM-DD", "date of publication, which dataset tools recommend", default=""),
+    repeated("--creator NAME", "who publishes the release"),
+    option("--url", "address where the release will be", default=""),
     repeated(
-        "--licence-allow",
+        "--licence-allow LICENCE,...",
         "licences with restrictions that parts may have, such as CC-BY-NC-ND-4.0",
-        metavar="LICENCE,...",
     ),
     option(
-        "--scores",
+        "--scores PATH",
+        "reference scores: submissions (morphgen eval --submission), or folders of studies",
+        Path,
         nargs="+",
-        type=Path,
         default=[],
-        metavar="PATH",
-        help="reference scores: submissions (morphgen eval --submission), or folders of studies",
     ),
     opt.sim_option(),
     number("--episodes", "least number of episodes per robot of a submission (default: 34)"),
@@ -152,17 +140,10 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 @command(
     "score",
     "check submissions to a split, compute their scores and rank them",
+    option("submissions SUBMISSION", "file that morphgen eval --submission wrote", Path, nargs="+"),
     option(
-        "submissions",
-        nargs="+",
-        type=Path,
-        metavar="SUBMISSION",
-        help="file that morphgen eval --submission wrote",
-    ),
-    option(
-        "--split",
-        metavar="SPLIT",
-        help="archive or folder of a release, or name or file of a split (default: the split of "
+        "--split SPLIT",
+        "archive or folder of a release, or name or file of a split (default: the split of "
         "morphgen that the first submission names)",
     ),
     flag("--markdown", "print the table as Markdown"),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, path_option
+from morphgen.cli.command import command, flag, number, option
 from morphgen.cli.progress import training_progress
 from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
 from morphgen.errors import BenchmarkError, TaskError
@@ -30,35 +30,30 @@ PAPER = "paper"
     "study",
     "train and score a matrix of agents, seeds and splits",
     option(
-        "words",
+        "words SPLIT",
+        "name of a split, its file or built folder; paper: the 15 splits of the benchmark",
         nargs="+",
-        metavar="SPLIT",
-        help="name of a split, its file or built folder; paper: the 15 splits of the benchmark",
     ),
     option(
         "--agents",
-        default=",".join(AGENTS),
-        help="agents, separated by commas, with or without switches such as "
+        "agents, separated by commas, with or without switches such as "
         "me-tf-symlog+task-reweighting; se@test is trained on the test robots; ablation: those of "
         "the paper (default: all agents)",
+        default=",".join(AGENTS),
     ),
-    option("--seeds", default="0..2", help="such as 0..2 or 0,3"),
-    path_option("--out", "DIR", "output folder", default=Path("study")),
+    option("--seeds", "such as 0..2 or 0,3", default="0..2"),
+    option("--out DIR", "output folder", Path, default=Path("study")),
     number("--eval-steps", "number of control steps of each robot's evaluation", default=10_000),
     option(
-        "--finetune",
-        default="",
-        metavar="N,...",
-        help="also fine-tune every policy of train robots on the test robots, with these numbers "
+        "--finetune N,...",
+        "also fine-tune every policy of train robots on the test robots, with these numbers "
         "of control steps, such as 10000,30000",
+        default="",
     ),
     flag("--report", "only write tables and curves of the finished cells"),
     opt.RAY,
     option(
-        "--gpus",
-        type=float,
-        metavar="N",
-        help="with --ray: GPUs per cell (default: 1 with --device cuda, else 0)",
+        "--gpus N", "with --ray: GPUs per cell (default: 1 with --device cuda, else 0)", float
     ).needing("--ray"),
     *TRAINING_OPTIONS,
     opt.LIBRARY,
@@ -204,17 +199,16 @@ MODES = ("deterministic", "stochastic", "all")
     "score",
     "compute tables of results from the episodes of studies and evaluations",
     option(
-        "files",
+        "files FILE",
+        "submission, table of a study, or a folder with such files at any depth",
+        Path,
         nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="submission, table of a study, or a folder with such files at any depth",
     ),
     option(
         "--mode",
+        "policies that act by the mean of their actions, that sample them, or both",
         choices=MODES,
         default=MODES[0],
-        help="policies that act by the mean of their actions, that sample them, or both",
     ),
     flag("--markdown", "print the tables as Markdown"),
     opt.JSON,

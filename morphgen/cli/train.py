@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
+from morphgen.cli.command import Option, command, flag, number, option, repeated
 from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS, preset_of
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from morphgen.tasks.task import TaskConfig
 
 
-AGENT = option(
-    "--agent", default="me-graph", help=f"one of {', '.join(AGENTS)} (default: me-graph)"
-)
+AGENT = option("--agent", f"one of {', '.join(AGENTS)} (default: me-graph)", default="me-graph")
 SWITCHES = {
     "symlog": ("the critic predicts the symlog of returns", "on"),
     "slow-critic": ("compute returns with a moving average of the critic", "on"),
@@ -72,16 +70,15 @@ def on_off(name: str, help: str, default: bool | None = None) -> Option:
 
 
 OBSERVE = option(
-    "--observe",
-    metavar="A,B,...",
-    default="",
-    help="further channels of the observations: "
+    "--observe A,B,...",
+    "further channels of the observations: "
     + ", ".join(CHANNELS).replace("_", "-")
     + "".join(
         f"; --preset {label} has {', '.join(names)} already, and --agent AGENT-NAME drops one"
         for label, preset in PRESETS.items()
         if (names := [name for name in preset.switches if name.replace("-", "_") in CHANNELS])
     ),
+    default="",
 )
 AGENT_OPTIONS = (*(on_off(name, switch_help(name)) for name in SWITCHES), OBSERVE)
 
@@ -111,18 +108,15 @@ GOAL_SEED = number(
 
 DRAWN_OPTIONS = (
     option(
-        "--robots",
-        metavar="GRAMMAR:N,...",
-        help="train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
+        "--robots GRAMMAR:N,...",
+        "train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
         "processes as --workers; the test robots of the splits of morphgen are never drawn",
     ),
     number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0).needing(
         "--robots"
     ),
     repeated(
-        "--held-out",
-        "with --robots: a further split whose test robots are never drawn",
-        metavar="SPLIT",
+        "--held-out SPLIT", "with --robots: a further split whose test robots are never drawn"
     ).needing("--robots"),
     number(
         "--slice-updates",
@@ -135,14 +129,7 @@ DRAWN_OPTIONS = (
 
 def split_option(purpose: str) -> Option:
     """Return the option ``--split``, whose words ``robots_to_train`` reads."""
-    return option(
-        "--split",
-        dest="words",
-        nargs="+",
-        metavar="SPLIT",
-        default=[],
-        help=f"{purpose}: {SPLIT_HELP}",
-    )
+    return option("--split SPLIT", f"{purpose}: {SPLIT_HELP}", dest="words", nargs="+", default=[])
 
 
 def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
@@ -250,9 +237,7 @@ def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Optio
         opt.WORKERS,
         opt.DEVICE,
         repeated(
-            "--set",
-            "set a hyperparameter, such as learning_rate=1e-4 or num_steps=32",
-            metavar="NAME=VALUE",
+            "--set NAME=VALUE", "set a hyperparameter, such as learning_rate=1e-4 or num_steps=32"
         ),
         flag("--no-tensorboard", "write no TensorBoard events"),
         flag("--wandb", "also log metrics to Weights & Biases"),
@@ -263,9 +248,9 @@ TRAINING_OPTIONS = (
     *learning_options(None, None),
     option(
         "--preset",
-        choices=list(PRESETS),
-        help="; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items())
+        "; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items())
         + " (default: the agent's, fast for me-graph and paper for the agents of the paper)",
+        choices=list(PRESETS),
     ),
     opt.sim_option(),
     number(
@@ -285,10 +270,10 @@ TRAINING_OPTIONS = (
     opt.MAX_LINKS,
     option(
         "--geometry",
+        "collision shapes of the robots in training: primitives, or convex pieces of the "
+        "meshes; evaluations have primitives (default: primitive)",
         choices=COLLISION_GEOMETRIES,
         default=COLLISION_GEOMETRIES[0],
-        help="collision shapes of the robots in training: primitives, or convex pieces of the "
-        "meshes; evaluations have primitives (default: primitive)",
     ),
     *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
 )
@@ -302,14 +287,12 @@ MINUTES = number(
 @command(
     "train",
     "train an agent on the robots of a split, or on one robot",
-    option(
-        "words", nargs="+", metavar="SPLIT", help=f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}"
-    ),
+    option("words SPLIT", f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}", nargs="+"),
     AGENT,
     opt.SEED,
-    option("--on", choices=SIDES, default="train", help="side of the split"),
+    option("--on", "side of the split", choices=SIDES, default="train"),
     opt.OBSTACLES,
-    path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
+    option("--out DIR", "run folder (default: runs/SPLIT/AGENT/seedN)", Path),
     RESUME,
     MINUTES,
     *DRAWN_OPTIONS,
@@ -517,16 +500,18 @@ def _folder_name(source: RobotSource) -> str:
 @command(
     "finetune",
     "train a policy further, by default on the test robots of its split",
-    option("checkpoint", help=f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
+    option("checkpoint", f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
     split_option("other robots than those of the checkpoint's split"),
-    option("--on", choices=SIDES, default="test", help="side of the split"),
+    option("--on", "side of the split", choices=SIDES, default="test"),
     opt.OBSTACLES.needing("--split"),
     opt.SEED,
     opt.sim_option("that of the training"),
     GOAL_SEED,
     opt.goal_option("that of the training"),
-    path_option(
-        "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
+    option(
+        "--out DIR",
+        "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)",
+        Path,
     ),
     RESUME,
     MINUTES,

@@ -31,20 +31,18 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
     "view",
     "show robots in the browser: browse, compose, compare and run them",
     option(
-        "words",
-        nargs="*",
-        metavar="TARGET",
-        help="a folder of robots, a bundle, a URDF, xacro or MJCF, a split's name or file, a "
+        "words TARGET",
+        "a folder of robots, a bundle, a URDF, xacro or MJCF, a split's name or file, a "
         "grammar, words of morphgen compose, a checkpoint or a run's folder (its policy is run), "
         "or an episode that was saved from the page",
+        nargs="*",
     ),
-    option("--host", default="127.0.0.1", help="address to listen on"),
-    option("--port", type=whole_number(1, 65535), default=8080, help="default: 8080"),
+    option("--host", "address to listen on", default="127.0.0.1"),
+    option("--port", "default: 8080", whole_number(1, 65535), default=8080),
     repeated(
-        "--allow-origin",
+        "--allow-origin ORIGIN",
         "a website whose pages may use this one, such as https://hub.example.com if a proxy shows "
         "it there, or http://box:8080 for the name of this machine",
-        metavar="ORIGIN",
     ),
     LIBRARY,
     details="The server runs until it is interrupted. Without a target, it shows the library, the "
