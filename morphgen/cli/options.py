@@ -110,11 +110,18 @@ def print_result(args: argparse.Namespace, data: object, text: Callable[[], str]
         print(shown)
 
 
-def table(rows: Iterable[Any], headers: Sequence[str] | str = (), **style: object) -> str:
-    """Return rows as a table; ``style`` are arguments of tabulate."""
+def table(
+    rows: Iterable[Any],
+    headers: Sequence[str] | str = (),
+    *,
+    floatfmt: str | Sequence[str] = "g",
+    tablefmt: str = "simple",
+    disable_numparse: bool = False,
+) -> str:
+    """Return rows as a table of tabulate, whose import ``morphgen --help`` does not wait for."""
     from tabulate import tabulate
 
-    return tabulate(rows, headers, **style)
+    return tabulate(rows, headers, tablefmt, floatfmt=floatfmt, disable_numparse=disable_numparse)
 
 
 def library_of(args: argparse.Namespace) -> Library:

@@ -32,6 +32,18 @@ def run(capfd):
 
 
 @pytest.fixture
+def ok(run):
+    """Run a command that must succeed and print nothing but its result, which is returned."""
+
+    def command(*argv):
+        code, out, err = run(*argv)
+        assert (code, err) == (0, "")
+        return out
+
+    return command
+
+
+@pytest.fixture
 def refused(run, tmp_path):
     """Run a command that must be rejected: exit code 2, one line, no changes on disk."""
 

@@ -10,8 +10,10 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.faulty_robots import valid_robot, with_joint
+from helpers.mjcf import TWO_JOINTS, write
 from helpers.parts import PINCER
 from helpers.robots import arm
+from morphgen.checks.readers import LOADERS
 from morphgen.cli import main
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf.write import urdf_text
@@ -20,9 +22,8 @@ from morphgen.grammar import catalogue
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 
 
-def test_compose_writes_a_bundle_and_prints_its_summary(run, tmp_path):
-    code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "robots")
-    assert (code, err) == (0, "")
+def test_compose_writes_a_bundle_and_prints_its_summary(ok, tmp_path):
+    out = ok("compose", "base=gantry", "ee=plane", "--out", "robots")
     first, *files = out.splitlines()
     assert first.startswith("robots/gantry-plane: 7 links, 5 DoF, ")
     assert [name.strip() for name in files] == [
@@ -52,29 +53,26 @@ def test_compose_prints_the_card_as_json_and_nothing_else():
     assert data["card"] == json.loads(Path("robots/gantry-plane/card.json").read_text())
 
 
-def test_list_prints_one_row_per_part(run):
-    code, out, err = run("list", "bases")
-    assert (code, err) == (0, "")
+def test_list_prints_one_row_per_part(ok):
+    out = ok("list", "bases")
     rows = [line.split() for line in out.splitlines()[2:]]
     assert {"fixed", "gantry", "pedestal", "planar"} <= {row[0] for row in rows}
     assert {row[1] for row in rows} == {"base"}
-    code, out, err = run("list", "bases", "--json")
+    out = ok("list", "bases", "--json")
     assert {row["name"]: row["dof"] for row in json.loads(out)}["gantry"] == 5
 
 
-def test_show_prints_the_tree(run, robot_urdf):
-    code, out, err = run("show", robot_urdf(arm()))
-    assert (code, err) == (0, "")
+def test_show_prints_the_tree(ok, robot_urdf):
+    out = ok("show", robot_urdf(arm()))
     assert out.splitlines()[0].startswith("arm: 6 links, 4 DoF, ")
     assert "\n  upper  shoulder: revolute (0 1 0) [-114.6, 114.6] deg  " in out
     assert "extend: prismatic (0 0 1) [0, 0.04] m" in out
     assert "right: prismatic (0 1 0) [-0.04, 0] m = -1 * left + 0" in out
 
 
-def test_show_prints_the_frames_of_a_bundle_as_json(run, tmp_path):
+def test_show_prints_the_frames_of_a_bundle_as_json(ok, tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
-    code, out, err = run("show", folder, "--json")
-    assert (code, err) == (0, "")
+    out = ok("show", folder, "--json")
     data = json.loads(out)
     assert [link["name"] for link in data["links"]][:2] == ["base", "upper"]
     assert data["frames"]["tool"]["link"] == "slider"
@@ -198,17 +196,13 @@ def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):
     assert "b.urdf and a.urdf are both named 'arm'" in err
 
 
-def test_import_converts_a_urdf_to_a_bundle(run, robot_urdf, tmp_path):
+def test_import_converts_a_urdf_to_a_bundle(ok, robot_urdf, tmp_path):
     path = robot_urdf(arm())
-    code, out, err = run(
-        "import", path, "--root-link", "upper", "--tool", "slider", "--out", "robots"
-    )
-    assert (code, err) == (0, "")
+    out = ok("import", path, "--root-link", "upper", "--tool", "slider", "--out", "robots")
     assert out.startswith("robots/arm: 5 links, 3 DoF, ")
     assert read_bundle(tmp_path / "robots" / "arm").frame("tool").link == "slider"
     words = ("import", path, "--name", "limb", "--no-picture", "--json")
-    code, out, err = run(*words)
-    assert (code, err) == (0, "")
+    out = ok(*words)
     assert json.loads(out)["folder"] == "robots/limb"
     assert json.loads(out)["card"]["source"] == "some_robot.urdf"
 
@@ -224,12 +218,11 @@ def test_import_ignores_the_pairs_that_an_srdf_disables(run, refused, robot_urdf
     assert refused(*words).startswith(f"morphgen: {srdf}: robot 'arm' has no link 'slidr'; did you")
 
 
-def test_import_passes_arguments_to_xacro_and_prints_repairs(run, tmp_path):
+def test_import_passes_arguments_to_xacro_and_prints_repairs(run, ok, tmp_path):
     path = tmp_path / "pincer.xacro"
     path.write_text(PINCER.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 2 0"/>'))
     words = ("import", path, "--arg", "length=0.4", "--no-picture", "--out", "o")
-    code, out, err = run(*words)
-    assert (code, err) == (0, "")
+    out = ok(*words)
     assert "  repaired joint left_slide: the axis (0.0, 2.0, 0.0) was scaled to unit length" in out
     palm = read_bundle(tmp_path / "o" / "pincer").link("palm")
     assert palm.collisions[0].geometry.size == pytest.approx((0.02, 0.02, 0.4))
@@ -238,14 +231,6 @@ def test_import_passes_arguments_to_xacro_and_prints_repairs(run, tmp_path):
     assert "  error axis-not-unit at joint left_slide: its axis (0.0, 2.0, 0.0) is 2 long" in out
     assert "repaired" not in out
     assert (tmp_path / "o" / "as_is" / "card.json").is_file()
-
-
-def test_conform_compares_all_loaders(run, tmp_path):
-    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
-    code, out, err = run("conform", folder, "--samples", "5")
-    assert (code, err) == (0, "")
-    for loader in ("yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"):
-        assert f"bundle  {loader}" in out
 
 
 def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
@@ -325,3 +310,52 @@ def test_the_help_fits_every_terminal(words, columns, monkeypatch, capsys):
         main(words)
     assert exit_.value.code == 0
     assert "--help" in "".join(capsys.readouterr().out.split())
+
+
+def test_demo_composes_checks_and_loads_a_robot(ok):
+    out = ok("demo")
+    commands = [line for line in out.splitlines() if line.startswith("$ ")]
+    assert commands == [
+        "$ morphgen compose arm=ur5 ee=plane --out robots",
+        "$ morphgen check robots/ur5-plane --strict",
+        "$ morphgen conform robots/ur5-plane",
+    ]
+    assert "robots/ur5-plane: 0 error, 0 warning, 0 info\n" in out
+    assert all(f"ur5-plane  bundle  {loader.name} " in out for loader in LOADERS)
+    *_, last = out.splitlines()
+    assert last == "The robot is in robots/ur5-plane; its picture is robots/ur5-plane/preview.png"
+    assert Path("robots/ur5-plane/preview.png").is_file()
+
+
+def test_demo_prints_one_line_if_it_cannot_write(run):
+    Path("file").write_text("")
+    code, out, err = run("demo", "--out", "file")
+    assert (code, out) == (2, "$ morphgen compose arm=ur5 ee=plane --out file\n")
+    assert err.startswith("morphgen: ")
+    assert err.count("\n") == 1
+
+
+def test_check_and_show_read_an_mjcf(run, ok, tmp_path):
+    path = write(tmp_path, TWO_JOINTS)
+    out = ok("check", path, "--json")
+    assert {f["code"] for f in json.loads(out)[str(path)]["findings"]} == {
+        *("effort-missing", "velocity-missing", "self-collision"),
+    }
+    code, out, _ = run("show", "robot.xml")
+    assert (code, out.splitlines()[0]) == (0, "test: 3 links, 2 DoF, 12.57 kg")
+
+
+def test_import_converts_an_mjcf_to_a_bundle(ok, tmp_path):
+    path = write(tmp_path, TWO_JOINTS)
+    out = ok("import", path, "--tool", "right", "--no-picture", "--out", "robots")
+    assert out.startswith("robots/test: 3 links, 2 DoF, ")
+    assert read_bundle(tmp_path / "robots" / "test").frame("tool").link == "right"
+
+
+def test_import_keeps_the_excluded_pairs_of_an_mjcf(run, tmp_path):
+    apart = TWO_JOINTS.replace('name="right"', 'name="right" pos="1 0 0"')
+    for exclude, is_ignored in (("", False), ('<exclude body1="left" body2="right"/>', True)):
+        path = write(tmp_path, f"{apart}<contact>{exclude}</contact>")
+        assert run("import", path, "--no-picture", "--out", "robots")[0] == 0
+        pairs = read_bundle(tmp_path / "robots" / "test").ignore_pairs
+        assert (("left", "right") in pairs) == is_ignored

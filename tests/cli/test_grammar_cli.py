@@ -54,11 +54,10 @@ def test_sample_reads_a_grammar_file(run, mine):
     ]
 
 
-def test_light_set_and_its_robots_are_accepted_by_other_commands(run, cubes):
+def test_light_set_and_its_robots_are_accepted_by_other_commands(run, ok, cubes):
     for robot in (cubes / "cubes-000001", cubes / "cubes-000001" / "robot.urdf"):
         assert run("show", robot)[1].startswith("cubes-000001: ")
-    code, out, _ = run("check", cubes)
-    assert code == 0
+    out = ok("check", cubes)
     assert out.count(": 0 error, 0 warning") == len(list(cubes.glob("cubes-*")))
 
 
@@ -70,16 +69,14 @@ def test_sample_writes_pictures_unless_no_picture_is_given(run):
     assert read_bundle(Path("a/cubes-000000")).dof == 2
 
 
-def test_sample_prints_the_number_of_rejected_draws(run):
-    code, out, _ = run("sample", "cubes", "-n", 5, "--light", "--where", "mass < 0.5")
-    assert code == 0
+def test_sample_prints_the_number_of_rejected_draws(ok):
+    out = ok("sample", "cubes", "-n", 5, "--light", "--where", "mass < 0.5")
     assert out.splitlines()[1].endswith(" draws rejected: where (mass < 0.5)")
 
 
-def test_sample_reports_duplicate_robots(run):
+def test_sample_reports_duplicate_robots(ok):
     Path("one.grammar").write_text("robot -> cubes\n")
-    code, out, _ = run("sample", "one.grammar", "-n", 2, "--light")
-    assert code == 0
+    out = ok("sample", "one.grammar", "-n", 2, "--light")
     assert out.splitlines()[1] == "  one-000001 has the same body as one-000000"
 
 
@@ -100,38 +97,6 @@ def test_sample_prints_its_report_as_json_and_nothing_else():
 def test_sample_does_not_depend_on_the_number_of_jobs(run, cubes):
     assert run("sample", "cubes", "-n", 4, "--light", "--jobs", 2, "--out", "two")[0] == 0
     assert tree(cubes) == tree(Path("two"))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("sample cubse", "unknown grammar 'cubse'; did you mean 'cubes'? valid: arm3, arm5"),
-        ("sample nowhere.grammar", "nowhere.grammar: no such file"),
-        ("sample cubes -n 0", "argument -n: 0: expected a whole number, 1 or more"),
-        ("sample cubes --jobs 0", "argument --jobs: 0: expected"),
-        ("sample cubes --seed -1", "argument --seed: -1: expected"),
-        ("sample cubes --where mas<3", "--where:1:1: unknown property 'mas'; did you mean 'mass'"),
-        ("sample cubes --where mass<", "--where:1:6: found the end, expected '('"),
-        ("sample cubes --library nowhere", "nowhere does not exist"),
-        ("grammar check cubse", "unknown grammar 'cubse'"),
-        ("grammar count nowhere.grammar", "nowhere.grammar: no such file"),
-        ("derive nowhere", "robot 'nowhere': there is no such bundle or URDF, and 'nowhere' is"),
-        ("derive ./nowhere", "nowhere: no such file or folder"),
-        ("derive ur5-plane ur10-plane", "ur5-plane and ur10-plane: expected one robot"),
-        ("derive ur5-plane --replay", "--replay: ur5-plane has no URDF yet; expected a robot's"),
-        ("mutate nowhere/robot", "nowhere/robot: no such file or folder"),
-        ("mutate .", "is not in a set made by morphgen sample (no "),
-        ("compose chain beads=9", "beads=9: expected 2 to 7"),
-        ("compose chain baeds=5", "no symbol 'baeds'; did you mean 'beads'?"),
-        ("compose chain bead.radius=2m", "bead.radius=2: out of range; expected 0.005 to 0.05 m"),
-        (
-            "compose chian beads=5",
-            "'chian' is neither a grammar nor of the form key=value; did you mean",
-        ),
-    ],
-)
-def test_invalid_arguments_are_rejected_in_one_line(refused, words, message):
-    assert message in refused(*words.split())
 
 
 @pytest.mark.parametrize(
@@ -219,9 +184,8 @@ def test_grammar_count_of_a_recursion(run, mine):
     assert len(run("grammar", "enumerate", mine, "--limit", 4)[1].splitlines()) == 4
 
 
-def test_grammar_enumerate_prints_derivations_that_compose(run, mine):
-    code, out, _ = run("grammar", "enumerate", mine)
-    assert code == 0
+def test_grammar_enumerate_prints_derivations_that_compose(run, ok, mine):
+    out = ok("grammar", "enumerate", mine)
     assert [line.split("ee=")[1] for line in out.splitlines()] == [
         "plane(size=0.1, thickness=0.01)]",
         "cube(size=0.1)]",
@@ -279,27 +243,25 @@ def test_derive_reproduces_the_same_bytes(run, light, category):
     assert (code, json.loads(out)) == (1, {"same": False})
 
 
-def test_mutate_writes_neighbours_and_prints_their_changes(run, cubes):
+def test_mutate_writes_neighbours_and_prints_their_changes(ok, cubes):
     words = ("mutate", cubes / "cubes-000002", "-n", 2, "--seed", 1, "--no-picture")
-    code, out, _ = run(*words)
-    assert code == 0
+    out = ok(*words)
     for index, line in enumerate(out.splitlines()):
         folder, what = line.split(": ")
         assert folder.endswith(f"set-mutants-1/cubes-000002-m{index:04d}")
         assert what.startswith("- cubes.size = ")
         assert read_bundle(Path(folder)).dof == 2
-    code, again, _ = run(*words, "--json", "--out", "other")
+    again = ok(*words, "--json", "--out", "other")
     assert [lines[0] + "; " + lines[1] for lines in json.loads(again).values()] == [
         line.split(": ")[1] for line in out.splitlines()
     ]
 
 
-def test_neighbours_meet_the_conditions_of_the_set(run, tmp_path):
+def test_neighbours_meet_the_conditions_of_the_set(run, ok, tmp_path):
     words = ("sample", "cubes", "-n", 1, "--light", "--where", "mass > 0.9", "--out", "set")
     assert run(*words)[0] == 0
     robot = "set/cubes-000000"
-    code, out, _ = run("mutate", robot, "-n", 8, "--no-picture", "--json")
-    assert code == 0
+    out = ok("mutate", robot, "-n", 8, "--no-picture", "--json")
     assert all(read_bundle(Path(folder)).mass > 0.9 for folder in json.loads(out))
 
 

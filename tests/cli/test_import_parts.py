@@ -7,7 +7,7 @@ import pytest
 
 import morphgen
 from helpers.commands import tree
-from helpers.mjcf import TWO_JOINTS, write
+from helpers.mjcf import write
 from morphgen.formats.description import find_description
 
 SITE = '<site name="tool" pos="0 0 0.2" euler="0 90 0"/>'
@@ -50,14 +50,6 @@ def test_a_tool_link_is_renamed_even_if_its_new_name_is_taken(run, tmp_path):
     assert [(frame.name, frame.link) for frame in robot.frames] == [("tool", "tool_link_")]
 
 
-def test_file_names_that_give_no_name_of_a_bundle_are_refused(refused, tmp_path):
-    for name in ("机器人.urdf", "b.urdf"):
-        (tmp_path / name).write_text('<robot name="a"><link name="base"/></robot>')
-    refusal = refused("import", "机器人.urdf", "b.urdf", "--no-picture")
-    assert "机器人.urdf: name '___': use letters" in refusal
-    assert refusal.endswith("import it alone, with --name\n")
-
-
 def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
     write(tmp_path, ARM, "my_arm.xml")
     words = ("import", "my_arm.xml", "--name", "my_arm", "--part", "arm", "--licence", "MIT")
@@ -79,7 +71,7 @@ def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
+def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, ok, tmp_path):
     write(tmp_path, ARM, "body_1.xml")
     write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.18"), "body_2.xml")
     write(tmp_path, BALL, "body_3.xml")
@@ -94,10 +86,7 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, tmp_path):
     ]
     (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
-    code, _, err = run(
-        "split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words
-    )
-    assert (code, err) == (0, "")
+    ok("split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words)
     assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
 
 
@@ -128,47 +117,6 @@ def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(ru
     code, out, _ = run("import", "a.xml", "a.xml", *words)  # a file named twice is one file
     one = json.loads(out)
     assert (code, one["folder"], one["part"]) == (0, "robots/test", "parts/test.yaml")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("a.xml", "--part", "arm"), "--part: name the robot's licence by --licence, such as MIT"),
-        (("a.xml", "--licence", "MIT"), "--licence: only with --part"),
-        (
-            ("a.xml", "--part", "arm", "--licence", "MIT", "--name", "1st"),
-            "name '1st' of a part: expected letters, digits and underscores, no digit first; "
-            "import its file alone, and choose a name by --name",
-        ),
-        (
-            ("a.xml", "--part", "ee", "--licence", "MIT"),
-            "robot 'test' has no frame 'tool', which is the flange or the tool of a part; name its "
-            "link by --tool",
-        ),
-        (
-            ("a.xml", "--part", "arm", "--licence", "MIT", "--tool", "left", "--name", "z1"),
-            "name 'z1' of a part: morphgen has a part of this name; import its file alone, and "
-            "choose another by --name",
-        ),
-        (("a.xml", "b.xml", "--name", "x"), "--name x: 2 robots cannot have one name"),
-        (
-            ("a.xml", "b/a.xml"),
-            "a.xml, b/a.xml: these would all be named 'a'; import one at a time, with --name",
-        ),
-        (
-            ("a.xml", "b.xml", "--srdf", "a.srdf"),
-            "--srdf a.srdf: is of one robot, and 2 are named; import its robot alone",
-        ),
-        (
-            ("a.xml", "b.xml", "--arg", "length"),
-            "--arg length: expected NAME=VALUE",
-        ),
-    ],
-)
-def test_invalid_requests_leave_no_part(refused, tmp_path, words, message):
-    write(tmp_path, TWO_JOINTS, "a.xml")
-    assert refused("import", *words, "--no-picture") == f"morphgen: {message}\n"
-    assert not (tmp_path / "parts").exists()
 
 
 def test_a_robot_of_the_menagerie_is_imported_with_its_licence(run, refused, tmp_path, monkeypatch):

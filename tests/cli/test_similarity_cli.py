@@ -12,6 +12,7 @@ import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
 from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
+from morphgen.benchmark.tokens import LAYOUT, robot_from_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
 
@@ -39,10 +40,9 @@ def light_set(run):
     return Path("set")
 
 
-def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
+def test_folder_of_bundles_gives_one_matrix_per_measure(ok, bundles, tmp_path):
     before = tree(tmp_path)
-    code, out, err = run(*("similarity", *ARGUMENTS))
-    assert (code, err) == (0, "")
+    out = ok(*("similarity", *ARGUMENTS))
     assert tree(tmp_path) == before
     blocks = out.rstrip("\n").split("\n\n")
     robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
@@ -61,9 +61,8 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
         assert statistics.startswith("3 pairs: mean ")
 
 
-def test_json_holds_the_matrices(run, bundles):
-    code, out, err = run("similarity", *ARGUMENTS, "--json")
-    assert (code, err) == (0, "")
+def test_json_holds_the_matrices(ok, bundles):
+    out = ok("similarity", *ARGUMENTS, "--json")
     data = json.loads(out)
     assert data["robots"] == ["arm", "lwr-claw", "lwr-plane"]
     assert data["files"] == []
@@ -76,11 +75,6 @@ def test_json_holds_the_matrices(run, bundles):
         )
 
 
-def test_one_file_for_two_pictures_is_refused(refused, bundles):
-    words = ("--heatmap", "x.png", "--map", "./x.png")
-    assert "x.png: is named for two files" in refused("similarity", "robots", *words)
-
-
 def test_tree_is_the_default_measure(run, bundles):
     _, out, _ = run("similarity", "robots", "--json")
     assert list(json.loads(out)["measures"]) == ["tree"]
@@ -88,20 +82,18 @@ def test_tree_is_the_default_measure(run, bundles):
     assert list(json.loads(out)["measures"]) == ["cosine"]
 
 
-def test_paths_can_be_mixed_and_duplicates_are_dropped(run, bundles, light_set):
+def test_paths_can_be_mixed_and_duplicates_are_dropped(ok, bundles, light_set):
     lwr = Path("robots/lwr-plane")
     paths = (lwr, lwr / "robot.urdf", light_set / "cubes-000001", light_set)
-    code, out, _ = run("similarity", *paths, "robots", "--json")
-    assert code == 0
+    out = ok("similarity", *paths, "robots", "--json")
     names = json.loads(out)["robots"]
     assert len(names) == len(set(names)) == 8
     assert names[0] == "robots/lwr-plane"  # two robots are called lwr-plane
 
 
-def test_more_than_twenty_robots_list_the_nearest_of_each(run):
+def test_more_than_twenty_robots_list_the_nearest_of_each(run, ok):
     run("sample", "stick", "-n", "21", "--light", "--out", "set", "--json")
-    code, out, _ = run("similarity", "set", "--measure", "workspace")
-    assert code == 0
+    out = ok("similarity", "set", "--measure", "workspace")
     _, header, _, *rows, statistics = out.splitlines()
     assert header.split() == ["robot", "nearest", "workspace", "mean", "of", "others"]
     values = np.array(
@@ -120,9 +112,8 @@ def test_more_than_twenty_robots_list_the_nearest_of_each(run):
     assert statistics.startswith("210 pairs: ")
 
 
-def test_csv_has_one_line_per_pair(run, bundles):
-    code, out, _ = run("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json")
-    assert code == 0
+def test_csv_has_one_line_per_pair(ok, bundles):
+    out = ok("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json")
     assert json.loads(out)["files"] == ["pairs.csv"]
     with Path("pairs.csv").open(newline="") as lines:
         rows = list(csv.DictReader(lines))
@@ -136,21 +127,15 @@ def test_csv_has_one_line_per_pair(run, bundles):
         assert [float(row[name]) for row in rows] == values.tolist()
 
 
-def test_pictures_are_reproducible(run, bundles, tmp_path):
+def test_pictures_are_reproducible(run, ok, bundles, tmp_path):
     pictures = ("--heatmap", "heat.png", "--map", "map.png")
-    code, out, _ = run("similarity", *ARGUMENTS, *pictures)
-    assert code == 0
+    out = ok("similarity", *ARGUMENTS, *pictures)
     assert out.splitlines()[-2:] == ["heat.png", "map.png"]
     first = tree(tmp_path)
     assert first["heat.png"].startswith(b"\x89PNG")
     assert first["map.png"].startswith(b"\x89PNG")
     assert run("similarity", *ARGUMENTS, *pictures)[0] == 0
     assert tree(tmp_path) == first
-
-
-def test_single_robot_is_rejected(refused, bundles):
-    assert "robots/arm is one robot; name others" in refused("similarity", "robots/arm")
-    assert "is one robot" in refused("similarity", "robots/arm", "robots/arm")
 
 
 def test_robot_without_a_tool_is_rejected_with_its_path(refused, robot_urdf, bundles):
@@ -160,31 +145,102 @@ def test_robot_without_a_tool_is_rejected_with_its_path(refused, robot_urdf, bun
     assert "morphgen import FILE --tool LINK" in error
 
 
-@pytest.mark.parametrize(
-    ("paths", "reason"),
-    [
-        (("nowhere/",), "nowhere: no such file or folder"),
-        (("empty/",), "empty holds no robot; expected a bundle, a URDF, a set"),
-        (("begun",), "begun is not a finished set: it has no index.jsonl"),
-        (("robots/notes.txt",), "notes.txt"),
-    ],
-)
-def test_paths_that_are_not_robots_are_rejected(paths, reason, refused, bundles, tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "begun").mkdir()
-    (tmp_path / "begun" / "set.json").write_text("{}")
-    assert reason in refused("similarity", *paths, "robots")
+WORDS = ("base=gantry", "ee=plane")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (("--heatmap", "a.jpg"), "--heatmap a.jpg: expected a name that ends in .png"),
-        (("--map", "a"), "--map a: expected a name that ends in .png"),
-        (("--map", "no/a.png"), "--map no/a.png: there is no folder no"),
-        (("--csv", "robots"), "--csv robots: expected a name that ends in .csv"),
-        (("--csv", "a.png"), "--csv a.png: expected a name that ends in .csv"),
-    ],
-)
-def test_unwritable_output_is_rejected_before_computing(arguments, reason, refused, bundles):
-    assert reason in refused("similarity", "robots", *arguments)
+def rows_of(table):
+    """Cells of a printed table, by the header's columns."""
+    _, rule, *rows = table.splitlines()
+    starts = [i for i in range(len(rule)) if rule[i] == "-" and (i == 0 or rule[i - 1] == " ")]
+    ends = [*starts[1:], None]
+    return [
+        [row[a:b].strip() for a, b in zip(starts, ends, strict=True)]
+        for row in rows
+        if row[:1].isdigit()
+    ]
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return write_bundle(arm(), tmp_path / "arm", picture=False).relative_to(tmp_path)
+
+
+def test_tokens_are_printed_link_by_link(ok, bundle):
+    out = ok("tokens", bundle)
+    cylinder, twice = "cylinder r 0.02, length", "0.04 | prismatic | 0 1 0"
+    assert [" | ".join(row) for row in rows_of(out)] == [
+        "0 | base |  |  | box 0.1 x 0.1 x 0.04 |  |  |  |  | ",
+        f"1 | upper | 0 |  | {cylinder} 0.24 | revolute | 0 1 0 | 0 0 0.05 | 0 0 0 | 0.200",
+        f"2 | lower | 1 |  | {cylinder} 0.24 | revolute | 1 0 0 | 0 0 0.3 | 0 0 0 | 0.250",
+        f"3 | slider | 2 | tool | {cylinder} 0.14 | prismatic | 0 0 1 | 0 0 0.3 | 0 0 0 | -0.500",
+        f"4 | left | 3 |  | {cylinder} {twice} | 0 0.05 0.2 | 0 0 0 | 0.000",
+        f"5 | right | 3 |  | {cylinder} {twice} | 0 -0.05 0.2 | 0 0 0 | 0.000",
+    ]
+    assert out.splitlines()[-1] == "arm: (6, 48), indices over 22"
+
+
+def test_robot_can_be_given_as_urdf_or_parts(run, robot_urdf):
+    code, out, _ = run("tokens", robot_urdf(arm()))
+    assert (code, len(rows_of(out))) == (0, 6)
+    assert {row[3] for row in rows_of(out)} == {""}
+    code, out, _ = run("tokens", *WORDS, "ee.size=0.2")
+    assert (code, len(rows_of(out))) == (0, 7)
+    assert rows_of(out)[-1][3:6] == ["tool", "box 0.01 x 0.2 x 0.2", "fixed"]
+    code, out, _ = run("tokens", "chain", "beads=2")
+    assert (code, len(rows_of(out))) == (0, 10)
+    drawn = [row[4].split()[0] for row in rows_of(out) if row[4]]
+    assert {*drawn} == {"cylinder", "sphere"}
+
+
+def test_options_may_stand_between_parts(run):
+    assert run("tokens", WORDS[0], "--max-links", 7, WORDS[1])[0] == 0
+
+
+def test_layout_option_prints_the_fields(run, ok, bundle):
+    out = ok("tokens", "--layout")
+    lines = out.splitlines()[2:]
+    assert [line.split("  ")[0] for line in lines] == [field.name for field in LAYOUT]
+    assert " 19:22 " in next(line for line in lines if line.startswith("joint axis"))
+    _, both, _ = run("tokens", bundle, "--layout")
+    assert both == f"{run('tokens', bundle)[1]}\n{out}"
+    _, data, _ = run("tokens", "--layout", "--json")
+    assert sum(field["size"] for field in json.loads(data)) == 48
+
+
+def test_json_option_prints_only_json(ok):
+    out = ok("tokens", *WORDS, "--json", "--max-links", 10)
+    data = json.loads(out)
+    robot = morphgen.compose(" ".join(WORDS))
+    expected = tokens(robot, token_shapes(robot), max_links=10)
+    np.testing.assert_array_equal(np.array(data["tokens"]), expected)
+    assert data["links"] == [link.name for link in robot.links]
+    assert (data["name"], data["shape"], data["max_links"]) == (robot.name, [7, 48], 10)
+    assert [field["name"] for field in data["layout"]] == [field.name for field in LAYOUT]
+
+
+def test_written_file_is_reproducible(run, ok, bundle, tmp_path):
+    before = set(tree(tmp_path))
+    out = ok("tokens", bundle, "--out", "arm.npz")
+    assert out.endswith("\narm.npz\n")
+    assert set(tree(tmp_path)) - before == {"arm.npz"}
+    first = Path("arm.npz").read_bytes()
+    assert json.loads(run("tokens", bundle, "--out", "arm.npz", "--json")[1])["file"] == "arm.npz"
+    assert Path("arm.npz").read_bytes() == first
+    with np.load("arm.npz", allow_pickle=False) as data:
+        assert data["tokens"].shape == (6, 48)
+        back, _ = robot_from_tokens(data["tokens"], "back", max_links=int(data["max_links"]))
+        assert data["links"].tolist() == [link.name for link in arm().links]
+    assert back.parents == arm().parents
+
+
+def test_interrupted_run_keeps_the_old_file(run, bundle, tmp_path, monkeypatch):
+    Path("arm.npz").write_text("old")
+    before = tree(tmp_path)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    code, out, _ = run("tokens", bundle, "--out", "arm.npz")
+    assert (code, out) == (130, "")
+    assert tree(tmp_path) == before

@@ -138,29 +138,3 @@ def test_non_local_host_prints_a_warning(tmp_path):
     _, errors = viewing.communicate(timeout=60)
     assert "warning: --host 0.0.0.0" in errors
     assert "no password" in errors
-
-
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [("some.npz", "is not an episode of morphgen view"), ("some.pt", "is not a checkpoint")],
-)
-def test_invalid_episode_and_checkpoint_files_are_rejected(refused, tmp_path, name, why):
-    (tmp_path / name).write_text("something else")
-    assert why in refused("view", tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["nowhere"], "no such file or folder, no split and no grammar"),
-        (["arm=ur6"], "unknown arm 'ur6'"),
-        (["--host", "8.8.8.8"], "cannot serve at '8.8.8.8'"),
-        (["--host", "nosuch.invalid"], "cannot serve at"),
-        (["--port", "0"], "argument --port: 0: expected a whole number, 1 to 65535"),
-        (["--library", "nowhere"], "library folder"),
-        (["--allow-origin", "null"], "--allow-origin 'null': expected a site"),
-        (["--allow-origin", "http://box/page"], "without a path"),
-    ],
-)
-def test_invalid_arguments_are_rejected(refused, words, why):
-    assert why in refused("view", *words)
