@@ -127,34 +127,10 @@ ATOMS = [
     "open",
     "range(3)",
 ]
-CALLS = [
-    "len",
-    "str",
-    "int",
-    "float",
-    "list",
-    "tuple",
-    "dict",
-    "range",
-    "sum",
-    "max",
-    "abs",
-    "round",
-    "sin",
-    "sqrt",
-    "math.factorial",
-    "math.pow",
-    "radians",
-    "eval",
-    "getattr",
-    "type",
-    "python.vars",
-    "xacro.load_yaml",
-    "xacro.fatal",
-    "sorted",
-    "map",
-    "print",
-]
+CALLS = """
+len str int float list tuple dict range sum max abs round sin sqrt math.factorial math.pow
+radians eval getattr type python.vars xacro.load_yaml xacro.fatal sorted map print
+""".split()  # noqa: SIM905
 BINARY = ["+", "-", "*", "/", "//", "%", "**", "<<", "@", "==", "<", " and ", " in ", " if x else "]
 ATTRIBUTES = ["__class__", "format", "upper", "join", "a", "mro", "gi_frame", "real", "__globals__"]
 

@@ -18,7 +18,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, positive
 from morphgen.cli.progress import bar, print_line, status
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.shipped_policies import POLICIES
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, zero_shot_policy
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
@@ -217,9 +217,7 @@ def zeroshot(args: argparse.Namespace) -> None:
     from morphgen.rl.evaluation import eval_config_of, zero_shot, zero_shot_data
     from morphgen.rl.runs.checkpoint import read_checkpoint
     from morphgen.rl.runs.robot_source import robot_source
-    from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
     from morphgen.tasks.reach import GOAL_KINDS
-    from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
     from morphgen.tasks.render.renderer import require_video_path
 
     if args.out is not None:
@@ -250,7 +248,6 @@ def zeroshot(args: argparse.Namespace) -> None:
 
 def _table(scores: Mapping[str, Score], task: str) -> str:
     from morphgen.rl.scores.scores import success_of
-    from morphgen.tasks.registry import TASKS
 
     columns = {
         "controller": list(scores),

@@ -120,7 +120,6 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
     """Return what the release lacks that its users may expect."""
     from morphgen.benchmark.release import SUBMISSIONS_DIR
     from morphgen.tasks.goals.eval_protocol import tasks_of_split
-    from morphgen.tasks.registry import TASKS
 
     notes = []
     is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))

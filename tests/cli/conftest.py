@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from helpers.commands import tree
+from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
 from morphgen.formats.urdf.write import urdf_text
@@ -102,6 +103,14 @@ def split_yaml(tmp_path):
 
     write_split(small_split(), tmp_path / "split.yaml")
     return "split.yaml"
+
+
+@pytest.fixture
+def small(tmp_path):
+    """Write a split of robots without meshes at reach as ``small.yaml``."""
+    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
+    write_split(combined(train, test, name="mine/small"), tmp_path / "small.yaml")
+    return "small.yaml"
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import mujoco
-import numpy as np
 import pytest
 
 from helpers.robots import arm
@@ -15,8 +13,6 @@ from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.files import MANIFEST
 from morphgen.formats.fits import FITS
 from morphgen.formats.srdf import read_srdf
-from morphgen.formats.urdf.read import read_urdf
-from morphgen.model.kinematics import forward_kinematics
 from morphgen.tasks.scenes.env_specs import load_robot
 
 
@@ -92,24 +88,6 @@ def test_an_exported_urdf_has_the_fits_and_so_the_goals_of_the_robot(run, tmp_pa
     (urdf.parent / FITS).write_text("[]")
     code, _, err = run("check", urdf)
     assert (code, FITS in err) == (2, True)
-
-
-def test_urdf_and_mjcf_hold_the_robot_and_its_meshes(ok, tmp_path):
-    for name in ("urdf", "mjcf"):
-        out = ok("export", "arm=xarm6", "ee=none", "--format", name, "--out", tmp_path)
-        (folder,) = tmp_path.glob(f"*-{name}")
-        assert out.strip() == str(folder)
-        assert any((folder / "meshes").iterdir())
-    (urdf,) = tmp_path.glob("*/robot.urdf")
-    (mjcf,) = tmp_path.glob("*/robot.xml")
-    robot = read_urdf(urdf, written_frames=True)
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    data = mujoco.MjData(model)
-    data.qpos[:] = robot.home
-    mujoco.mj_kinematics(model, data)
-    for link, T in zip(robot.links, forward_kinematics(robot, robot.home), strict=True):
-        np.testing.assert_allclose(data.body(link.name).xpos, T[:3, 3], atol=1e-9)
-    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-6)
 
 
 def test_files_of_a_bundle_are_written_into_it(run, tmp_path):

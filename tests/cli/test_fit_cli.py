@@ -14,7 +14,6 @@ import yaml
 from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
-from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.srdf import read_srdf
 from morphgen.formats.urdf.read import read_urdf
@@ -178,15 +177,6 @@ def urdf_of(folder, *files):
     return "robot.urdf"
 
 
-@pytest.mark.slow
-def test_repeated_fit_writes_the_same_bytes(run, box, tmp_path):
-    urdf = urdf_of(tmp_path, box)
-    words = ("--no-picture", "--configurations", "1")
-    assert run("fit", urdf, "--out", "a/robot", *words)[0] == 0
-    assert run("fit", urdf, "--out", "b/robot", *words)[0] == 0
-    assert tree(tmp_path / "a") == tree(tmp_path / "b")
-
-
 def test_picture_is_written_by_default(run, tmp_path):
     assert run("fit", "plane", "--out", "made", "--configurations", "1")[0] == 0
     assert (tmp_path / "made" / "preview.png").is_file()
@@ -232,29 +222,6 @@ def test_folder_that_is_not_a_bundle_is_rejected_before_fitting(
 @pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])
 def test_bundle_is_not_overwritten_by_its_own_fit(refused, meshed, named):
     assert "is the robot itself" in refused("fit", named, "--out", "source", "--no-picture")
-
-
-def test_robot_without_shapes_is_rejected(refused, tmp_path):
-    (tmp_path / "bare.urdf").write_text('<robot name="r"><link name="a"/></robot>')
-    assert "robot 'r': no link has a shape" in refused("fit", "bare.urdf")
-
-
-def test_robot_with_an_invalid_mesh_is_rejected_with_the_file_name(refused, tmp_path):
-    (tmp_path / "empty.stl").write_bytes(b"")
-    shape = '<visual><geometry><mesh filename="empty.stl"/></geometry></visual>'
-    (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
-    assert "empty.stl" in refused("fit", "r.urdf", "--out", "made")
-
-
-@pytest.mark.parametrize("step", ["urdf_text", "card_text"])
-def test_interrupted_fit_leaves_no_partial_bundle(run, tmp_path, monkeypatch, step):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bundle, step, interrupt)
-    code, _, err = run("fit", "plane", "--out", "made", "--no-picture", "--configurations", "1")
-    assert (code, err) == (130, "morphgen: interrupted; nothing half-written is left\n")
-    assert tree(tmp_path) == {}
 
 
 FIGURES = {
@@ -327,40 +294,6 @@ def test_enclosing_primitives_cover_the_whole_mesh(ok, angle):
     assert data["quality"]["coverage"] == 1.0
     assert data["quality"]["gap_p95"] < 1e-8
     assert data["quality"]["iou"] < 0.8
-
-
-@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "STL"])
-def test_every_mesh_format_is_read(ok, tmp_path, suffix):
-    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / f"link.{suffix}")
-    out = ok("fit", f"link.{suffix}", "--json", "--enclose")
-    (primitive,) = json.loads(out)["primitives"]
-    np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), atol=1e-5)
-
-
-MESHES = {
-    "empty.stl": b"",
-    "text.stl": b"Dear diary,\nthis is no mesh.\n",
-    "noise.stl": b"\x00\xff" * 300,
-    "none.obj": b"v 0 0 0\n",
-    "nan.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-    "inf.obj": b"v 1e999 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-    "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n",
-    "point.obj": b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n",
-}
-
-
-@pytest.mark.parametrize("name", list(MESHES))
-def test_invalid_mesh_is_rejected_with_its_file_name(refused, tmp_path, name):
-    (tmp_path / name).write_bytes(MESHES[name])
-    assert name in refused("fit", name)
-
-
-def test_binary_stl_with_nan_is_rejected_with_its_file_name(refused, tmp_path):
-    mesh = trimesh.creation.box((1, 1, 1))
-    data = bytearray(mesh.export(file_type="stl"))
-    data[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()
-    (tmp_path / "nan.stl").write_bytes(data)
-    assert "nan.stl" in refused("fit", "nan.stl")
 
 
 def test_mesh_fit_does_not_accept_out(refused, box):

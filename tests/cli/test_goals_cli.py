@@ -1,12 +1,9 @@
 """``morphgen goals``: output, failures and rejected input."""
 
 import json
-import signal
-import time
 
 import pytest
 
-from helpers.commands import start
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_folder import BuildSettings, build_split
@@ -135,23 +132,3 @@ def test_split_folder_is_accepted_as_split(run, tmp_path):
         some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True)
     ).folder
     assert run("goals", folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")
-
-
-@pytest.mark.slow
-def test_interrupt_prints_one_line_and_keeps_completed_sets(tmp_path):
-    many = [member(f"base=gantry ee=plane ee.size={60 + i}mm", f"robot-{i}") for i in range(40)]
-    (tmp_path / "many.yaml").write_text(split_text(split(many, some().test)))
-    process = start("goals", "many.yaml", XDG_CACHE_HOME=str(tmp_path / "cache"))
-    while not (stored := files(tmp_path / "cache")) and process.poll() is None:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate()
-    assert (process.returncode, out) == (130, "")
-    assert err.splitlines()[-1].endswith("morphgen: interrupted; nothing half-written is left")
-    assert "Traceback" not in err
-    assert len(stored) < 41
-    assert all(path.suffix == ".npz" for path in files(tmp_path / "cache"))
-
-
-def files(folder):
-    return [path for path in folder.rglob("*") if path.is_file()]

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.grammars import CATEGORIES
-from helpers.parts import PINCER, write_part
+from helpers.parts import write_part
 from morphgen.formats.bundle import read_bundle
 from morphgen.grammar.library import LIBRARY_VARIABLE
 
@@ -97,26 +97,6 @@ def test_sample_prints_its_report_as_json_and_nothing_else():
 def test_sample_does_not_depend_on_the_number_of_jobs(run, cubes):
     assert run("sample", "cubes", "-n", 4, "--light", "--jobs", 2, "--out", "two")[0] == 0
     assert tree(cubes) == tree(Path("two"))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("robot -> gantry plane(", "my.grammar:1:23: found the end, expected ')' or a name"),
-        ("robot -> gantry plnae", "my.grammar:1:17: 'plnae' is neither a symbol nor a part"),
-        ("robot -> cubes\nx -> cubes\ny -> cubes", "'x' cannot be reached from 'robot' (and 1 mo"),
-        ("include robot", "my.grammar:1:9: unknown grammar 'robot'"),
-    ],
-)
-def test_invalid_grammar_is_rejected_before_sampling(refused, text, message):
-    Path("my.grammar").write_text(text)
-    assert message in refused("sample", "my.grammar")
-
-
-def test_existing_set_with_another_seed_is_rejected(refused, cubes):
-    assert "set holds another set: its seed is 0, not 1" in refused(
-        "sample", "cubes", "--light", "--seed", 1, "--out", cubes
-    )
 
 
 def test_ray_option_without_the_package_is_rejected(refused, monkeypatch):
@@ -312,12 +292,3 @@ def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch, by_
     derivation = Path("robots/held/held-000001/derivation.txt").read_text()
     assert "flange: pincer=pincer(length=0." in derivation
     assert run("derive", "robots/held/held-000001", "--replay", *words)[0] == 0
-
-
-def test_template_with_a_numeric_condition_can_be_sampled(run):
-    wide = 'size="${0.02 if length > 0.2 else 0.03} 0.02'
-    xacro = PINCER.replace('size="0.02 0.02', wide)
-    assert wide in xacro
-    write_part(Path("library"), xacro=xacro)
-    Path("held.grammar").write_text("robot -> fixed ur5 pincer(length=uniform(0.15, 0.25))\n")
-    assert run("sample", "held.grammar", "-n", 2, "--light", "--library", "library")[0] == 0

@@ -68,28 +68,6 @@ def test_known_command_execution_exploit_is_rejected(refused, hostile):
 
 
 @pytest.mark.parametrize(
-    ("expression", "construct"),
-    [
-        ("python.vars(xacro.load_yaml)", "name 'vars' is not defined"),
-        ("python.type(1)", "name 'type' is not defined"),
-        ("().__class__.__base__.__subclasses__()", "'().__class__' is not allowed"),
-        ("'{0.__globals__}'.format(xacro.load_yaml)", "unterminated string"),  # ends at the }
-        ("dict(a=1).format_map", "name 'format_map' is not defined"),
-        ("'a'.format(1)", "Attribute \"'a'.format\" is not allowed"),
-        ("(lambda: 0)()", "Lambda 'lambda: 0' is not allowed"),
-        ("[f := 1, f]", "NamedExpr 'f := 1' is not allowed"),
-        ("(i for i in ()).gi_frame", "Attribute '(i for i in ()).gi_frame' is not allowed"),
-        ("xacro.load_yaml.call", "Attribute 'xacro.load_yaml.call' is not allowed"),
-        ("xacro.update(q=1)", "name 'update' is not defined"),
-        ("xacro", "its value is a function or namespace"),
-        ("open('/etc/passwd')", "name 'open' is not defined"),
-    ],
-)
-def test_disallowed_expressions_are_named_in_the_error(refused_at, expression, construct):
-    assert construct in refused_at(link(expression))
-
-
-@pytest.mark.parametrize(
     "body",
     [
         f'<link name="$(eval {"lambda: 0"})"/>',
@@ -228,22 +206,6 @@ def aliases(depth):
 def test_yaml_alias_expansion_is_limited(refused_at, hostile, content, reason):
     (hostile("").parent / "bomb.yaml").write_text(content)
     assert reason in refused_at(link("xacro.load_yaml('bomb.yaml')"))
-
-
-@pytest.mark.parametrize(
-    "expression",
-    [
-        "'a'*10**10",
-        "list(range(10**9))",
-        "[0]*10**9",
-        "10**10**10",
-        "math.factorial(10**7)",
-        "'%1000000000d' % 1",
-    ],
-)
-def test_large_expressions_are_rejected(refused_at, expression):
-    message = refused_at(f"\n{link(expression)}", line=3)
-    assert f"when evaluating expression '{expression}'" in message
 
 
 MACROS = "".join(

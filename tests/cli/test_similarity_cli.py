@@ -231,16 +231,3 @@ def test_written_file_is_reproducible(run, ok, bundle, tmp_path):
         back, _ = robot_from_tokens(data["tokens"], "back", max_links=int(data["max_links"]))
         assert data["links"].tolist() == [link.name for link in arm().links]
     assert back.parents == arm().parents
-
-
-def test_interrupted_run_keeps_the_old_file(run, bundle, tmp_path, monkeypatch):
-    Path("arm.npz").write_text("old")
-    before = tree(tmp_path)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "replace", interrupted)
-    code, out, _ = run("tokens", bundle, "--out", "arm.npz")
-    assert (code, out) == (130, "")
-    assert tree(tmp_path) == before

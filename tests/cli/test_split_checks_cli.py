@@ -12,7 +12,6 @@ from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import PAPER
-from morphgen.tasks import free_space
 from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.goals.split_goals import read_goals
 
@@ -201,31 +200,6 @@ def build_with_goals(ok, path, out="data", *more):
     return printed.splitlines()
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("own_cache")
-def test_build_with_goals_passes_verify_and_audit(run, ok, write, tmp_path):
-    path = write(reaching())
-    assert build_with_goals(run, path) == [
-        "data/mine/some: 4 robots written, 0 already existed",
-        "4 goal sets, seed 0",
-        "verify it anywhere: morphgen split verify data/mine/some",
-    ]
-    first = tree(Path("data"))
-    assert "mine/some/goals/test/planar-plane.npz" in first
-    assert read_goals("data/mine/some", "train").keys() == {m.name for m in reaching().train}
-    build_with_goals(run, path)
-    build_with_goals(run, path, "elsewhere", "--jobs", "2")
-    assert tree(Path("data")) == tree(Path("elsewhere")) == first
-    assert run("split", "verify", "data/mine/some")[0] == 0
-    out = ok("split", "audit", "data/mine/some", "--strict")
-    assert out.splitlines()[-2:] == [
-        "4 goal sets were audited, seed 0",
-        "mine/some: passed: 0 error, 0 warning, 0 accepted",
-    ]
-    data = json.loads(run("split", "audit", "data/mine/some", "--json")[1])
-    assert data["goals"] == {"sets": 4, "seed": 0}
-
-
 @pytest.mark.usefixtures("own_cache")
 def test_goal_seed_is_printed_stored_and_audited(run, write):
     lines = build_with_goals(run, write(reaching()), "data", "--goal-seed", "7")
@@ -261,29 +235,3 @@ def test_accepted_findings_do_not_fail(ok, write):
     out = ok("split", "audit", write(known(accepted=accepted)), "--goals", "--strict")
     assert "accepted goals-shared (1): three" in out.splitlines()
     assert out.splitlines()[-1] == "mine/some: passed: 0 error, 0 warning, 3 accepted"
-
-
-@pytest.mark.usefixtures("own_cache")
-def test_robot_without_goals_is_rejected_before_building(run, write, monkeypatch):
-    monkeypatch.setattr(free_space, "TRIES", 1)
-    few = [member(f"arm=arm3 ee={ee}", task="reach") for ee in ("claw", "plane")]
-    path = write(replace(reaching(), train=(*reaching().train[:2], *few)))
-    code, out, err = run("split", "build", path, "--goals")
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "train robot arm3-claw has no goal set: robot 'arm3-claw': only" in err
-    assert err.endswith("; nor has arm3-plane\n")
-    assert not Path("data").exists()
-
-
-@pytest.mark.usefixtures("own_cache")
-def test_build_without_goals_does_not_reuse_a_folder_with_goals(run, write):
-    path = write(reaching())
-    build_with_goals(run, path)
-    before = tree(Path("data"))
-    code, out, err = run("split", "build", path, "--light")
-    assert (code, out) == (2, "")
-    assert (
-        "data/mine/some was built with goals: ask for goals (--goals), delete data/mine/some/goals"
-        in err
-    )
-    assert tree(Path("data")) == before

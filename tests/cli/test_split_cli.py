@@ -170,14 +170,6 @@ def test_several_train_sizes_write_one_file_each(run, ok):
     assert Path("a-train2.yaml").is_file()
 
 
-@pytest.mark.slow
-def test_split_files_do_not_depend_on_the_number_of_jobs(run, tmp_path):
-    assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml")[0] == 0
-    before = tree(tmp_path)
-    assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml", "--jobs", 2)[0] == 0
-    assert tree(tmp_path) == before
-
-
 def test_statistics_option_adds_statistics(run):
     run(*INTERPOLATION, "--out", "a.yaml", "--statistics")
     run(*INTERPOLATION, "--out", "b.yaml")
@@ -224,12 +216,3 @@ def test_split_file_of_another_version_is_kept(run):
     path.write_text(text)
     assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
     assert path.read_text() == text
-
-
-def test_broken_split_file_is_rejected(run, refused):
-    assert run(*COMPOSITION, "--out", "a.yaml")[0] == 0
-    text = Path("a.yaml").read_text()
-    Path("a.yaml").write_text(text.replace("task: reach", "task: push", 1))
-    error = refused("split", "show", "a.yaml")
-    assert error.startswith("morphgen: a.yaml: id: ")
-    assert "the file was changed since it was written" in error

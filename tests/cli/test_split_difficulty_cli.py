@@ -7,11 +7,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import pytest
 from msgspec.structs import replace as replaced
 
-from helpers.commands import tree
-from helpers.splits import TEST, TRAIN, combined, member
+from helpers.splits import combined
 from helpers.submissions import data
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import sided_members, split_id
@@ -24,14 +22,6 @@ from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 STUDY = Path(__file__).parents[2] / "results" / "reach-30m"
 ARM3 = "interpolation/arm3/reach"
 WORDS = ("split", "difficulty")
-
-
-@pytest.fixture
-def small():
-    """Write the file of a small split at reach."""
-    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
-    Path("small.yaml").write_text(split_text(combined(train, test, name="mine/small")))
-    return "small.yaml"
 
 
 def test_table_json_and_csv_have_a_row_per_robot(ok, small):
@@ -110,19 +100,6 @@ def test_bad_input_is_refused(refused, small):
     Path("other.yaml").write_text(Path(small).read_text().replace("mine/small", ARM3))
     err = refused(*WORDS, "other.yaml", "--study", STUDY)
     assert "interpolation/arm3/reach ik: of other robots: split id " in err
-
-
-def test_an_interrupted_write_keeps_the_old_file(run, small, monkeypatch):
-    Path("a.csv").write_text("old")
-    before = tree(Path())
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", fail)
-    code, out, err = run(*WORDS, small, "--csv", "a.csv")
-    assert (code, out, err) == (2, "", "morphgen: cannot write a.csv: No space left on device\n")
-    assert tree(Path()) == before
 
 
 def test_a_release_has_the_results_of_the_submitted_baselines(run, small):

@@ -8,21 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from helpers.splits import TEST, TRAIN, combined, member
+from helpers.splits import TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.grammar.library import default_library
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
 
 RELEASE = ("split", "release", "--light", "--no-goals")
-
-
-@pytest.fixture
-def small():
-    """Write the file of a small split at reach."""
-    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
-    Path("small.yaml").write_text(split_text(combined(train, test, name="mine/small")))
-    return "small.yaml"
 
 
 def test_release_prints_archive_and_hashes_and_passes_verify(run, ok, small):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import start, tree
-from helpers.runs import ROLLOUT, RUN, SMALL, equal, weights
+from helpers.runs import ROLLOUT, RUN, SMALL
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.recorders import METRICS, read_metrics
 from morphgen.rl.runs.robot_source import specs_of
@@ -111,16 +111,6 @@ def test_the_goal_of_the_training_is_that_of_all_commands_on_its_policy(run, tmp
     words = ("finetune", folder, "--on", "train", "--envs", "4", *ROLLOUT, *quick)
     assert run(*words, "--out", "tuned")[0] == 0
     assert [c for c in read_config(tmp_path / "tuned").tasks if c.task == "reach"] == [reach]
-
-
-@pytest.mark.slow
-def test_play_uses_the_given_checkpoint(run):
-    outs = []
-    for seed in (0, 1):
-        run(*RUN, "--steps", "64", "--out", f"run{seed}", "--seed", seed, "--no-discrete")
-        words = ("play", "reach", "planar-cube", "--sim", "mujoco", "--policy", f"run{seed}")
-        outs += [run(*words)[1], run(*words)[1]]
-    assert outs[0] == outs[1] != outs[2] == outs[3]
 
 
 def test_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml):
@@ -245,17 +235,6 @@ def test_interrupted_training_can_be_resumed(run, tmp_path, cache):
     assert "continues from its last checkpoint, if there is one, with --resume" in err
     assert "Traceback" not in err
     assert sorted(tree(tmp_path / "cut")) == [CHECKPOINT, "config.json", METRICS]
-
-
-@pytest.mark.slow
-def test_resumed_run_equals_an_uninterrupted_run(run, tmp_path):
-    words = (*RUN, "--steps", "96", "--no-tensorboard")
-    for out in ("whole", "cut"):
-        assert run(*words, "--out", out)[0] == 0
-    (tmp_path / "cut" / CHECKPOINT).unlink()
-    assert run(*words, "--out", "cut", "--resume")[0] == 0
-    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
-    assert len(read_metrics(tmp_path / "cut")) == 3
 
 
 def test_study_report_of_gpu_runs_needs_no_gpu(run, split_yaml, tmp_path):
