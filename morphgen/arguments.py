@@ -38,7 +38,7 @@ def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:
     """Return the path that a text or another path names."""
     if isinstance(value, str | PathLike):
         path = Path(value)
-        if "\0" not in str(path):
+        if "\0" not in str(path):  # the system's calls raise ValueError, not OSError, for it
             return path
     raise error(f"{name} {value!r}: expected a path")
 
@@ -54,7 +54,7 @@ def whole_number(
     name: str, value: object, error: type[MorphgenError], least: int | None = None
 ) -> int:
     """Return a whole number, such as one of NumPy's, as an ``int``."""
-    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)  # True is an Integral
     if not is_whole or (least is not None and int(value) < least):  # type: ignore[call-overload]
         valid = "a whole number" if least is None else f"a whole number, {least} or more"
         raise error(f"{name} {value!r}: expected {valid}")

@@ -103,6 +103,6 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     close = close or difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
     if len(choices) > _MAX_LISTED:
-        listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))
+        listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))  # however unlike
         return f"{guess} nearest of {len(choices)}: {', '.join(listed)}"
     return f"{guess} valid: {', '.join(choices) or '(none)'}"

@@ -63,11 +63,12 @@ def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
 
 
 def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
-    context = get_context("spawn")
+    context = get_context("spawn")  # fork would copy the locks that threads of torch or tqdm hold
     stopped = context.RawValue("b", 0)
     pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (work, stopped))
     waiting = iter(chunks)
     try:
+        # A chunk waits for each worker.
         running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
         while running:
             results: list[R] = running.popleft().result()
@@ -169,7 +170,7 @@ def _end_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os._exit(1)  # sys.exit would end this thread only
 
 
 def _process_chunk(items: Sequence[Any]) -> list[Any]:
@@ -232,7 +233,7 @@ def ray_cluster(address: str | None) -> Iterator[None]:
     was_connected = ray.is_initialized()
     host, _, port = (address or "").rpartition(":")
     try:
-        if port.isdecimal():
+        if port.isdecimal():  # Ray itself waits for minutes where nothing listens
             socket.create_connection((host.removeprefix("ray://"), int(port)), RAY_TIMEOUT).close()
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
     except (OSError, OverflowError, RuntimeError, ValueError) as error:

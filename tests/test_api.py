@@ -90,8 +90,7 @@ EXAMPLES |= {f"split.{name}": getattr(LoadedSplit, name) for name in ("write", "
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == "fit")) for name in EXAMPLES],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "fit")) for name in EXAMPLES]
 )
 def test_documentation_examples_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -104,7 +104,7 @@ def similarity(
     names = [text_argument("measure", name, BenchmarkError) for name in several]
     if not names:
         raise BenchmarkError(f"no measure is named; valid: {', '.join(MEASURES)}")
-    for name in names:
+    for name in names:  # before robots are read and fitted
         get_measure(name)
     parts = default_library(library)
     loaded = [resolve_robot(robot, parts) for robot in robot_list(robots)]

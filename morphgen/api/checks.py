@@ -153,16 +153,17 @@ def conform_source(
     """Compare loaders and simulators on a file, and on its bundle; see ``conform``."""
     if source.path is not None and (source.path / CARD).is_file():
         return _conform_bundle(source.path, samples, seed)
+    # The bundle that morphgen makes of it.
     report = _conform_robot(read_source(source, library, root), samples, seed)
     if source.path is None or source.path.is_dir():
         return report
-    rows = compare_file(source.path, default_finder(root=root), samples, seed)
+    rows = compare_file(source.path, default_finder(root=root), samples, seed)  # the file as it is
     passed = report.passed and not any(row.is_unexplained for row in rows)
     return replace(report, passed=passed, rows=(*rows, *report.rows))
 
 
 def _conform_robot(robot: Robot, samples: int, seed: int) -> ConformanceReport:
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:  # loaders read files
         bundle = bundle_folder(Path(folder), robot.name)
         write_bundle(robot, bundle, checks.check(robot), picture=False)
         return _conform_bundle(bundle, samples, seed)

@@ -69,7 +69,7 @@ def compose(
     if not isinstance(request, str):
         raise CompositionError(f"{request!r}: expected words, such as ur5-plane")
     for key, value in words.items():
-        if isinstance(value, bool) or not isinstance(value, str | Real):
+        if isinstance(value, bool) or not isinstance(value, str | Real):  # True is a Real
             raise CompositionError(f"{key} {value!r}: expected a text or a number")
     if name is not None:
         name = text_argument("name", name, CompositionError)
@@ -237,6 +237,7 @@ def fit(
 
     options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover)
     parts = default_library(library)
+    # A mesh is no description of a robot.
     target = _mesh_robot(robot) or resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)
 

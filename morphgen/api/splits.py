@@ -193,13 +193,7 @@ class LoadedSplit:
         settings, config = BuildSettings(light=light, picture=picture), GoalConfig(goal_seed)
         sets = sample_split_goals(self.definition, self.library, config, jobs=jobs) if goals else ()
         report = build_with_goals(
-            self.definition,
-            Path(folder),
-            self.library,
-            settings,
-            sets,
-            config,
-            jobs=jobs,
+            self.definition, Path(folder), self.library, settings, sets, config, jobs=jobs
         )
         return report.folder
 

@@ -69,11 +69,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as interrupt:
             text = str(interrupt) or "nothing half-written is left"
             print(f"morphgen: interrupted; {text}", file=sys.stderr)
-            return 128 + (received or [signal.SIGINT])[0]
+            return 128 + (received or [signal.SIGINT])[0]  # as a shell reports a signal
         finally:
-            if sys.stdout is not None:
+            if sys.stdout is not None:  # it is None without a console, as under pythonw
                 sys.stdout.flush()
-    except BrokenPipeError:
+    except BrokenPipeError:  # the reader, such as head, has all it wanted
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:

@@ -75,6 +75,7 @@ def _findings(
     except UnsoundError as error:
         return error.findings, ()
     robot, repaired = fix(robot)
+    # A lone URDF need not have a tool.
     is_robot = source.path is None or bundle_of(source) is not None
     findings = check(robot, tool_required=is_robot)
     folder = bundle_folder(args.fix, robot.name)
@@ -85,7 +86,7 @@ def _findings(
         )
     write_bundle(robot, folder, findings)
     written[folder] = source.label
-    print(f"written: {folder}", file=sys.stderr)
+    print(f"written: {folder}", file=sys.stderr)  # stdout is for the findings, or for JSON
     return findings, repaired
 
 

@@ -60,6 +60,7 @@ def option(
     help: Its text; it ends with the default, if there is one to show.
     """
     name, _, metavar = name.partition(" ")
+    # An empty list or text is no default that a reader could type.
     default = settings.get("default")
     if default not in (None, [], "") and "default" not in help:
         shown = f"{default:,}" if isinstance(default, int) else f"{default}"
@@ -93,6 +94,7 @@ def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]
 
     def parse(text: str) -> int:
         number = _number(text)
+        # Nan and inf fail the first condition: their remainder is nan.
         if not (number % 1 == 0 and least <= number <= (math.inf if largest is None else largest)):
             raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
         return int(number)
@@ -110,7 +112,7 @@ def positive(text: str) -> float:
 
 def _number(text: str) -> float:
     """Read a number, exactly if it is whole; nan if the text is something else."""
-    for convert in (int, float):
+    for convert in (int, float):  # a float would round whole numbers above 2^53
         with suppress(ValueError):
             return convert(text)
     return math.nan
@@ -175,6 +177,7 @@ class Command:
         return self.run(args)
 
     def _texts(self) -> dict[str, Any]:
+        # Argparse leaves these two columns free, too.
         width = max(shutil.get_terminal_size().columns - 2, _MIN_HELP_WIDTH)
         summary = f"{self.summary[0].upper()}{self.summary[1:]}."
         lines = [f"  morphgen {example}" for example in self.examples]
@@ -188,6 +191,7 @@ class Command:
 def _is_given(option: Option, args: argparse.Namespace) -> bool:
     """Return whether an option has another value than its default."""
     name = option.settings.get("dest") or option.names[0].lstrip("-").replace("-", "_")
+    # Argparse does not say which options were given.
     is_flag = option.settings.get("action") == "store_true"
     return bool(getattr(args, name) != option.settings.get("default", False if is_flag else None))
 
@@ -263,6 +267,7 @@ def add_commands(
 
 def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments; words of a request may stand before and after options."""
+    # Argparse takes the words of one gap between options only.
     args, rest = parser.parse_known_args(argv)
     used = getattr(args, "parser", parser)
     unknown = next((word for word in rest if word.startswith("-")), None)

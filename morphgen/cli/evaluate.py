@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option
 from morphgen.cli.progress import training_progress
-from morphgen.cli.train import (
-    GOAL_SEED,
-    SIDES,
-    robots_to_train,
-    split_option,
-)
+from morphgen.cli.train import GOAL_SEED, SIDES, robots_to_train, split_option
 from morphgen.errors import TaskError
 from morphgen.progress import stage
 from morphgen.rl.baselines import BASELINES
@@ -253,10 +248,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
 
 
 def _given_robots(
-    args: argparse.Namespace,
-    run: RunConfig,
-    folder: Path,
-    config: EvalConfig,
+    args: argparse.Namespace, run: RunConfig, folder: Path, config: EvalConfig
 ) -> list[RobotSource]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
     from morphgen.rl.runs.robot_source import fresh_source
@@ -272,11 +264,7 @@ def _given_robots(
         )
     tasks = _with_goal(config.tasks, [run.source], args)
     fresh, line = fresh_source(
-        folder,
-        run.source,
-        GoalConfig(tasks=tasks),
-        args.seed,
-        jobs=args.workers,
+        folder, run.source, GoalConfig(tasks=tasks), args.seed, jobs=args.workers
     )
     print(f"morphgen: {line}", file=sys.stderr)
     return [fresh]

@@ -264,9 +264,7 @@ _DEFAULT = "html"
         most=MAX_SAMPLES,
     ),
     number(
-        "--seed",
-        f"seed of these configurations ({formats_with('seed')} only; default: 0)",
-        least=0,
+        "--seed", f"seed of these configurations ({formats_with('seed')} only; default: 0)", least=0
     ),
     number(
         "--spheres",
@@ -319,10 +317,7 @@ def export(args: argparse.Namespace) -> int:
 def _settings(args: argparse.Namespace) -> ExportSettings:
     """Return the values of the options that only some formats have."""
     names = [each.name for each in fields(ExportSettings) if each.name != "folders"]
-    given = {name: getattr(args, name) for name in names}
-    values = {
-        name: value for name, value in given.items() if value is not None and value is not False
-    }
+    values = opt.given(args, names)
     for name in values:
         if name not in FORMATS[args.format].options:
             raise FormatError(

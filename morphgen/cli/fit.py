@@ -6,7 +6,7 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,8 +71,7 @@ class Target:
     .needing("--max-primitives")
     .without("--all", "--spheres"),
     number(
-        "--spheres",
-        "fit N spheres to each link, and no other primitives, for planners",
+        "--spheres", "fit N spheres to each link, and no other primitives, for planners"
     ).without("--all"),
     option(
         "--cover SHARE",
@@ -115,14 +114,7 @@ def fit(args: argparse.Namespace) -> None:
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
-    options = FitOptions(
-        1 if args.max_primitives is None else args.max_primitives,
-        DEFAULT_IOU if args.iou is None else args.iou,
-        args.enclose,
-        args.seed,
-        args.spheres,
-        args.cover,
-    )
+    options = FitOptions(**opt.given(args, (each.name for each in fields(FitOptions))))
     if args.all:
         _fit_all_parts(args)
         return
@@ -147,7 +139,7 @@ def _require_own_names(targets: Sequence[Target]) -> None:
     labels: dict[str, str] = {}
     for target in targets:
         other = labels.setdefault(target.robot.name, target.label)
-        if other != target.label:
+        if other != target.label:  # one robot may be named twice
             raise FormatError(
                 f"{target.label} and {other} are both named {target.robot.name!r}; fit them one "
                 "at a time, into folders of their own"
@@ -203,6 +195,7 @@ def _folder(args: argparse.Namespace, target: Target, *, several: bool) -> Path:
     folder = bundle_folder(parent, name)
     if target.path is not None:
         source = target.path.resolve()
+        # The bundle itself, or the one that a named file is in.
         if folder.resolve() in (source, source.parent):
             raise FormatError(f"--out {args.out} is the robot itself; name another folder")
     require_replaceable(folder)
@@ -228,7 +221,7 @@ def _fit_robot(
     configurations = args.configurations or DEFAULT_CONFIGURATIONS
     with status(args, f"comparing collisions in {configurations} configurations"):
         of_primitives, of_hulls = fit.agreement(configurations, args.seed)
-    fitted = replace(fit.robot, name=folder.name)
+    fitted = replace(fit.robot, name=folder.name)  # a bundle's folder has the name of its robot
     findings = check(fitted, tool_required=not target.is_part)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:

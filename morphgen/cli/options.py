@@ -124,6 +124,14 @@ def table(
     return tabulate(rows, headers, tablefmt, floatfmt=floatfmt, disable_numparse=disable_numparse)
 
 
+def given(args: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """Return the values of options by name, without those that are empty or off."""
+    values = {name: getattr(args, name, None) for name in names}
+    empty = (None, (), [], "")
+    # 0 equals False, and is a value.
+    return {name: x for name, x in values.items() if x not in empty and x is not False}
+
+
 def library_of(args: argparse.Namespace) -> Library:
     """Return the library with the folders of ``--library``."""
     from morphgen.grammar.library import default_library

@@ -108,7 +108,7 @@ def play(args: argparse.Namespace) -> None:
     with closing(env), status(args, "running the episodes"):
         frames = play(env, controller, args.episodes, args.seed, report)
         if args.out is None:
-            deque(frames, maxlen=0)
+            deque(frames, maxlen=0)  # runs the episodes and keeps no frame
         else:
             write_video(frames, args.out, FPS)
             print_line(str(args.out))
@@ -160,6 +160,7 @@ def speed(args: argparse.Namespace) -> None:
         )
     with closing(batch), status(args, "measuring"):
         step = SIMULATORS[sim].native_step
+        # Other processes would not be timed.
         native_steps = [(import_module(step[0]), step[1])] if step and args.workers == 1 else []
         result = measure_speed(batch, args.seconds, own=native_steps)
 

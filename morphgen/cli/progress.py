@@ -54,7 +54,7 @@ class Bar:
         raise_if_interrupted()
         if total is not None:
             self._shown.total = total
-        self._shown.update(done - self._shown.n)
+        self._shown.update(done - self._shown.n)  # tqdm counts steps, reports are sums
 
     def add(self, count: int = 1) -> None:
         """Show that more items are finished."""
@@ -260,9 +260,11 @@ def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics, metric: str) -> N
 
 
 def _print_update(name: str, report: UpdateMetrics, num_updates: int, metric: str) -> None:
+    # The last update always has its line.
     if report.update % max(num_updates // TRAINING_LINES, 1) and report.update < num_updates:
         return
     updates_left = num_updates - report.update
+    # Every update has equally many transitions.
     seconds_left = updates_left * report.transitions / report.update / report.steps_per_second
     print(
         f"{name}: update {report.update} of {num_updates}, {report.transitions:,} steps, "

@@ -174,6 +174,7 @@ def sample(args: argparse.Namespace) -> None:
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]
+        # The most frequent first.
         rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
         lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
         lines += [f"  {name} has the same body as {same}" for name, same in report.duplicates]
@@ -290,7 +291,7 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
     from morphgen.grammar.robot_set import light_urdf
 
     robot = compose(derivation, library, folder.resolve().name)
-    if not (folder / CARD).is_file():
+    if not (folder / CARD).is_file():  # a light set has no meshes and no card
         return light_urdf(robot)
     card = _card(folder)
     if "convex" in card:
@@ -314,7 +315,7 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
             robot = as_spheres(robot, library.folders, spheres=number, cover=cover)
         else:
             robot = with_geometry(robot, "primitive", library.folders)
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch:  # a URDF names its meshes relative to its bundle
         bundle = write_bundle(robot, Path(scratch) / robot.name, picture=False)
         return (bundle / URDF).read_text(encoding="utf-8")
 

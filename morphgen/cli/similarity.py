@@ -118,7 +118,7 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
 
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
     table = _matrix_table if len(names) <= LARGEST_MATRIX else _nearest_table
-    pairs = values[np.triu_indices(len(values), 1)]
+    pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
     low, median, high = np.percentile(pairs, (0, 50, 100))
     return (
         f"{_title(measure)}; {better} is more alike\n{table(names, measure, values)}\n"
@@ -138,8 +138,8 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
     from morphgen.benchmark.similarity import to_distances
 
     distance = to_distances(values, measure)
-    np.fill_diagonal(distance, np.inf)
-    means = (values.sum(axis=1) - values.diagonal()) / (len(names) - 1)
+    np.fill_diagonal(distance, np.inf)  # no robot is its own nearest
+    means = (values.sum(axis=1) - values.diagonal()) / (len(names) - 1)  # without the robot itself
     rows = [
         (name, names[nearest], values[i, nearest], means[i])
         for i, (name, nearest) in enumerate(zip(names, distance.argmin(axis=1), strict=True))
@@ -180,6 +180,7 @@ def _csv(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     rows.writerow(("robot", "other", *matrices))
     for i, robot in enumerate(names):
         for j in range(i + 1, len(names)):
+            # The digits from which the same number is read.
             rows.writerow((robot, names[j], *(repr(float(m[i, j])) for m in matrices.values())))
     return text.getvalue().encode()
 

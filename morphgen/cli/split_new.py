@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Command, Option, flag, number, option, repeated
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 def new_split(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
+    from morphgen.api.splits import NewSplit
     from morphgen.api.splits import split as choose
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
     from morphgen.benchmark.split import split_id
@@ -30,9 +31,10 @@ def new_split(args: argparse.Namespace) -> None:
         raise BenchmarkError(
             f"--train {args.train}: expected a whole number, or several such as 10,30,100"
         ) from error
-    total = sizes[-1] + args.test if sizes else None
+    total = sizes[-1] + args.test if sizes else None  # smaller splits are parts of the largest
+    choice = opt.given(args, NewSplit.__annotations__)
     with bar(args, "sampling", total=total):
-        loaded = choose(args.name or "", train=sizes, library=args.library, **_choice(args))
+        loaded = choose(args.name or "", train=sizes, library=args.library, **choice)
     splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)
@@ -50,35 +52,15 @@ def new_split(args: argparse.Namespace) -> None:
         for split, path, licenced in zip(splits, paths, parts, strict=True)
     ]
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
-    lines += _hold_out_notes(splits[-1], library)
+    lines += _hold_out_notes(splits[-1], library)  # the largest has all train robots
     if limits := restriction_line(parts[-1]):  # of the largest split
         lines.append(f"  {limits}")
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 
-def _choice(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a regime under the names of the arguments of ``morphgen.split``."""
-    choice = {
-        "regime": args.regime,
-        "test": args.test,
-        "task": _names(args.task),
-        "obstacles": args.obstacles,
-        "seed": args.seed,
-        "statistics": args.statistics,
-        "jobs": args.jobs,
-        "robots": getattr(args, "patterns", ()),
-    }
-    if args.max_links is not None:
-        choice["max_links"] = args.max_links
-    for key in ("hold_out", "hull", "similarity"):
-        choice[key] = getattr(args, key, None) or ()
-    for key in ("grammar", "train_category", "test_category"):
-        choice[key] = _names(getattr(args, key, ""))
-    return {key: value for key, value in choice.items() if value != ()}
-
-
 def _names(text: str) -> tuple[str, ...]:
+    """Read names that are separated by commas; a type for argparse."""
     return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
@@ -128,7 +110,7 @@ def split_options(train: str, train_default: str = "") -> tuple[Option, ...]:
             default=train,
         ),
         option("--test N", "number of test robots", int, default=1),
-        option("--task TASK,...", "one task, or several with commas", default="reach"),
+        option("--task TASK,...", "one task, or several with commas", _names, default="reach"),
         flag("--obstacles", "tasks have obstacles"),
         opt.SEED,
         number(
@@ -157,6 +139,7 @@ REGIMES = (
             option(
                 "--grammar",
                 "name of a grammar (see: morphgen grammar list), or its file",
+                _names,
                 required=True,
             ),
             option(
@@ -179,7 +162,7 @@ REGIMES = (
             repeated(
                 "--from WORDS",
                 "words of morphgen compose with choices in braces and wildcards",
-                dest="patterns",
+                dest="robots",
                 required=True,
                 default=None,
             ),
@@ -203,6 +186,7 @@ REGIMES = (
                 option(
                     f"--{side}-category GRAMMAR,...",
                     f"names or files of grammars whose robots are {side} robots, in turn",
+                    _names,
                     required=True,
                 )
                 for side in ("train", "test")
@@ -238,11 +222,12 @@ new = Command(
             "--from WORDS",
             "robots to draw from: words of morphgen compose with choices in braces and wildcards "
             "(default: 'arm=* ee=*')",
-            dest="patterns",
+            dest="robots",
         ),
         option(
             "--grammar GRAMMAR,...",
             "draw robots from these grammars instead, or besides those of --from",
+            _names,
             default="",
         ),
         *split_options("10"),

@@ -65,7 +65,7 @@ def release(args: argparse.Namespace) -> None:
     from morphgen.tasks.goals.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
     from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
 
-    require_writable_folder(args.out)
+    require_writable_folder(args.out)  # before the audit and the goals, which take minutes
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
     extra: dict[str, bytes] = {}
@@ -89,13 +89,7 @@ def release(args: argparse.Namespace) -> None:
     )
     with bar(args, "releasing"):
         report = release_split(
-            split,
-            args.out,
-            library,
-            request,
-            extra=extra,
-            results=results,
-            jobs=args.jobs,
+            split, args.out, library, request, extra=extra, results=results, jobs=args.jobs
         )
     notes = _notes(args, split, extra)
     data = {
@@ -157,11 +151,7 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 )
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
-    from morphgen.rl.scores.leaderboard import (
-        ranking_data,
-        ranking_table,
-        score_submission,
-    )
+    from morphgen.rl.scores.leaderboard import ranking_data, ranking_table, score_submission
     from morphgen.rl.scores.submission import check_submission, read_submission, require_same_random
     from morphgen.tasks.goals.eval_protocol import expected_robots
 
@@ -182,7 +172,7 @@ def score(args: argparse.Namespace) -> None:
     tasks = sorted({each.member.task for each in expected})
     relative = [task for task in tasks if TASKS[task].relative_to_random]
     warnings = []
-    if relative and random is None:
+    if relative and random is None:  # edited scores of random would lift all others
         require_same_random(named)
         warnings.append(
             "random_score was not checked: there is no reference submission of random, so that an "
@@ -227,11 +217,7 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
     from importlib.metadata import version
 
-    from morphgen.benchmark.release import (
-        is_release,
-        opened_folder,
-        read_release,
-    )
+    from morphgen.benchmark.release import is_release, opened_folder, read_release
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import SPLIT_FILE, is_archive
     from morphgen.benchmark.verify import require_unchanged

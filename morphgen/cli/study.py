@@ -97,6 +97,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
     sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
+    # A study has no such options, which robots_to_train and run_config read.
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
     finetune = _finetune(args.finetune)
@@ -136,7 +137,7 @@ def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) 
             require_runnable(finetuning_run(cell, config, steps))
         except TaskError as error:
             raise TaskError(f"--finetune {steps}: {error}") from error
-    is_on_gpu = args.device != "cpu" and args.ray is None
+    is_on_gpu = args.device != "cpu" and args.ray is None  # with Ray, other machines have the GPUs
     if is_on_gpu and not all(map(is_done, parts)):
         require_device(args.device)  # policies are evaluated on the CPU
 

@@ -322,10 +322,11 @@ def train(args: argparse.Namespace) -> None:
             source = other_side(robots_to_train(args.words, args), args.on)
         else:
             source = robots_to_draw(args)
-    config = run_config(source, spec, args)
+    config = run_config(source, spec, args)  # before robots are drawn, which takes minutes
     _require_used(config, args)
     if source.grammars:
         config = _drawn(config, args)
+    # Positions came first and have no suffix.
     name = _folder_name(source) + "-pose" * (args.goal == "pose")
     folder = args.out or Path("runs") / name / str(spec) / f"seed{args.seed}"
     run_training(folder, config, args)
@@ -340,13 +341,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
         execution = execution_config(args)
         if config.source.grammars and not SIMULATORS[config.sim].takes_workers:
             execution = replace(execution, workers=1)  # those of --workers have drawn the robots
-        subruns = train(
-            folder,
-            config,
-            resume=args.resume,
-            execution=execution,
-            show=show.training,
-        )
+        subruns = train(folder, config, resume=args.resume, execution=execution, show=show.training)
     for subrun in subruns:
         if (subrun.folder / CHECKPOINT).is_file():
             print(subrun.folder / CHECKPOINT)

@@ -85,7 +85,7 @@ def _wait(host: str, viewer: Viewer) -> None:
         for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
         deadline = threading.Timer(STOP_GRACE, _give_up, (viewer,))
-        deadline.daemon = True
+        deadline.daemon = True  # it must not keep alive the process that it is to end
         deadline.start()
         viewer.stop()
 

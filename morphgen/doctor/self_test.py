@@ -207,7 +207,7 @@ def _simulator(name: str, simulator: str, robot: Robot) -> Entry:
         moved = (simulation.q - home).abs().max().item()
     finally:
         simulation.close()
-    if not 0 < moved < STEP:
+    if not 0 < moved < STEP:  # motors need longer than one control step of 20 ms
         text = f"a step towards {STEP} rad moved the joints of {robot.name} by {moved:.3g} rad"
         return Entry(name, "error", text, {"moved": moved})
     return Entry(name, "ok", f"one control step of {robot.name}", {"moved": moved})
@@ -216,7 +216,7 @@ def _simulator(name: str, simulator: str, robot: Robot) -> Entry:
 def _picture(robot: Robot, bundle: Path) -> Entry:
     """Draw the robot as for ``preview.png``."""
     picture = np.asarray(render(robot, bundle / MJCF, size=PICTURE_SIZE))
-    if picture.min() == picture.max():
+    if picture.min() == picture.max():  # one colour: a driver without errors may still draw nothing
         return Entry("picture", "error", "the renderer draws nothing; say --no-picture")
     return Entry("picture", "ok", "drawn by MuJoCo without a display")
 

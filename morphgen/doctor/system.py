@@ -56,6 +56,7 @@ def _gpu() -> Entry:
         why = "torch was built without CUDA" if build is None else f"no device for CUDA {build}"
         return Entry("gpu", "ok", f"none ({why}); everything runs on the CPU", {"devices": []})
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    # A device that is listed may lack kernels for its architecture.
     torch.ones(2, device="cuda").sum().item()
     text = f"{', '.join(names)} with CUDA {torch.version.cuda}; --device cuda works"
     return Entry("gpu", "ok", text, {"devices": names, "cuda": torch.version.cuda})
@@ -64,6 +65,7 @@ def _gpu() -> Entry:
 def _cache() -> Entry:
     """Describe the folder of goal sets, fits and thumbnails that need not be made again."""
     folder = user_cache_path("morphgen")
+    # The cache is created at its first use.
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     sizes = {
         entry.name: sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())

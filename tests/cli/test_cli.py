@@ -319,7 +319,7 @@ def test_check_and_show_read_an_mjcf(run, ok, tmp_path):
     path = write(tmp_path, TWO_JOINTS)
     out = ok("check", path, "--json")
     assert {f["code"] for f in json.loads(out)[str(path)]["findings"]} == {
-        *("effort-missing", "velocity-missing", "self-collision"),
+        *("effort-missing", "velocity-missing", "self-collision")
     }
     code, out, _ = run("show", "robot.xml")
     assert (code, out.splitlines()[0]) == (0, "test: 3 links, 2 DoF, 12.57 kg")

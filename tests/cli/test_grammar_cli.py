@@ -48,10 +48,7 @@ def test_sample_creates_a_set_and_prints_its_size(run, tmp_path):
 
 def test_sample_reads_a_grammar_file(run, mine):
     assert run("sample", mine, "-n", 2, "--light")[0] == 0
-    assert [record["name"] for record in records("robots/mine")] == [
-        "mine-000000",
-        "mine-000001",
-    ]
+    assert [record["name"] for record in records("robots/mine")] == ["mine-000000", "mine-000001"]
 
 
 def test_light_set_and_its_robots_are_accepted_by_other_commands(run, ok, cubes):
@@ -132,10 +129,7 @@ def test_grammar_count_prints_structures_and_random_values(run, mine):
     code, out, _ = run("grammar", "count", mine)
     assert (code, out.splitlines()) == (
         0,
-        [
-            "mine: 2 structures, 1 values drawn",
-            "  continuous  ee: plane.size = uniform(5cm, 15cm)",
-        ],
+        ["mine: 2 structures, 1 values drawn", "  continuous  ee: plane.size = uniform(5cm, 15cm)"],
     )
     assert json.loads(run("grammar", "count", mine, "--json")[1]) == {
         "structures": 2,

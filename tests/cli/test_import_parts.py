@@ -82,7 +82,7 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, ok, tmp_pa
     assert "body_3.xml: joint" in err
     assert "type ball" in err
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
-        *("body_1.yaml", "body_2.yaml"),
+        *("body_1.yaml", "body_2.yaml")
     ]
     (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")

@@ -26,8 +26,7 @@ REPORT = UpdateMetrics(
 
 @pytest.mark.parametrize("on_terminal", [True, False])
 @pytest.mark.parametrize(
-    ("unstable", "line"),
-    [((0, 0, 0), ""), ((0, 2, 0), "2 of 21"), ((1, 0, 4), "5 of 21")],
+    ("unstable", "line"), [((0, 0, 0), ""), ((0, 2, 0), "2 of 21"), ((1, 0, 4), "5 of 21")]
 )
 def test_diverged_episodes_are_one_line_at_the_end(
     on_terminal, unstable, line, capsys, monkeypatch
