@@ -94,39 +94,11 @@ STRANGE = [
     "A" * 3000,
 ]
 
-ATOMS = [
-    "1",
-    "0",
-    "2.5",
-    "-1",
-    "10**9",
-    "1e308",
-    "'a'",
-    "''",
-    "[]",
-    "[1, 2]",
-    "{}",
-    "{'a': 1}",
-    "()",
-    "True",
-    "None",
-    "pi",
-    "x",
-    "math",
-    "math.pi",
-    "xacro",
-    "xacro.load_yaml",
-    "python",
-    "python.type",
-    "__import__",
-    "load_yaml('x.yaml')",
-    "'%s'",
-    "'{0.__class__}'",
-    "lambda: 1",
-    "...",
-    "open",
-    "range(3)",
-]
+ATOMS = (  # noqa: SIM905
+    "1;0;2.5;-1;10**9;1e308;'a';'';[];[1, 2];{};{'a': 1};();True;None;pi;x;math;math.pi;xacro;"
+    "xacro.load_yaml;python;python.type;__import__;load_yaml('x.yaml');'%s';'{0.__class__}';"
+    "lambda: 1;...;open;range(3)"
+).split(";")
 CALLS = """
 len str int float list tuple dict range sum max abs round sin sqrt math.factorial math.pow
 radians eval getattr type python.vars xacro.load_yaml xacro.fatal sorted map print

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option
+from morphgen.cli.progress import note
 from morphgen.errors import FormatError, one_line
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _findings(
         )
     write_bundle(robot, folder, findings)
     written[folder] = source.label
-    print(f"written: {folder}", file=sys.stderr)  # stdout is for the findings, or for JSON
+    note(f"written: {folder}")  # stdout is for the findings, or for JSON
     return findings, repaired
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option
-from morphgen.cli.progress import training_progress
+from morphgen.cli.progress import note, training_progress
 from morphgen.cli.train import GOAL_SEED, SIDES, robots_to_train, split_option
 from morphgen.errors import TaskError
 from morphgen.progress import stage
@@ -205,10 +204,8 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     for file in files:
         run, learner = read_checkpoint(file)
         if learner["update"] < run.num_updates:
-            print(
-                f"morphgen: {file} is not finished: update {learner['update']} of "
-                f"{run.num_updates}",
-                file=sys.stderr,
+            note(
+                f"morphgen: {file} is not finished: update {learner['update']} of {run.num_updates}"
             )
     if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
         run = read_config(path)
@@ -266,7 +263,7 @@ def _given_robots(
     fresh, line = fresh_source(
         folder, run.source, GoalConfig(tasks=tasks), args.seed, jobs=args.workers
     )
-    print(f"morphgen: {line}", file=sys.stderr)
+    note(f"morphgen: {line}")
     return [fresh]
 
 
@@ -283,11 +280,11 @@ def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
 
     if not (folder / FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"
-        print(f"morphgen: {folder} has no {FILE}: {unknown}", file=sys.stderr)
+        note(f"morphgen: {folder} has no {FILE}: {unknown}")
         return
     names = [name for source in sources for name in trained_on(folder, source)]
     if names:
-        print(f"morphgen: the policy was trained on {', '.join(names)}", file=sys.stderr)
+        note(f"morphgen: the policy was trained on {', '.join(names)}")
 
 
 def _sides(args: argparse.Namespace, *, has_test: bool) -> tuple[Side, ...]:

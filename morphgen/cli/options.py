@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from morphgen.cli.command import Option, flag, number, option, repeated
+from morphgen.cli.progress import note, track
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
@@ -127,7 +127,7 @@ def table(
 def given(args: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
     """Return the values of options by name, without those that are empty or off."""
     values = {name: getattr(args, name, None) for name in names}
-    empty = (None, (), [], "")
+    empty: tuple[object, ...] = (None, (), [], "")
     # 0 equals False, and is a value.
     return {name: x for name, x in values.items() if x not in empty and x is not False}
 
@@ -156,7 +156,6 @@ def sources_of(
 
 def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
     """Return the robots that the arguments name, one or several, with their sources."""
-    from morphgen.cli.progress import track
     from morphgen.grammar.robot_source import read_source
 
     library, sources = library_of(args), sources_of(args)
@@ -175,8 +174,6 @@ def for_each_robot(
         The results by the label of the source, and the class and message of the errors by the
         label of those that failed, which are printed. With any of these, the exit code is 2.
     """
-    from morphgen.cli.progress import track
-
     results: dict[str, T] = {}
     refused: dict[str, dict[str, str]] = {}
 
@@ -201,7 +198,7 @@ def refusal(error: MorphgenError, label: str, name: str) -> dict[str, str]:
     reason = one_line(str(error))
     if name not in reason:
         reason = f"{label}: {reason}"
-    print(f"morphgen: {reason}", file=sys.stderr)
+    note(f"morphgen: {reason}")
     return {"error": type(error).__name__, "message": reason}
 
 

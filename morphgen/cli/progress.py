@@ -138,6 +138,11 @@ def track(
             shown.add()
 
 
+def note(text: str) -> None:
+    """Print a line that is no part of the command's result, which alone goes to stdout."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def print_line(line: str) -> None:
     """Print a line above the bars that are shown."""
     from tqdm import tqdm
@@ -187,7 +192,7 @@ class TrainingProgress:
                 self._last_line = now
             if total and done < total and now - self._last_line > GOAL_LINE_INTERVAL:
                 self._last_line = now
-                print(f"goal sets: {done} of {total} robots", file=sys.stderr, flush=True)
+                note(f"goal sets: {done} of {total} robots")
             return
         if self._goal_bar is None:
             self.close()
@@ -266,12 +271,10 @@ def _print_update(name: str, report: UpdateMetrics, num_updates: int, metric: st
     updates_left = num_updates - report.update
     # Every update has equally many transitions.
     seconds_left = updates_left * report.transitions / report.update / report.steps_per_second
-    print(
+    note(
         f"{name}: update {report.update} of {num_updates}, {report.transitions:,} steps, "
         f"{metric} {getattr(report, metric):.2f}, success {_success(report)}, "
-        f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left",
-        file=sys.stderr,
-        flush=True,
+        f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
     )
 
 
@@ -282,7 +285,7 @@ def _print_each_minute(name: str) -> Progress:
         nonlocal last
         if time.monotonic() - last > LINE_INTERVAL:
             last = time.monotonic()
-            print(f"{name}: {done:.0f} of {total} episodes", file=sys.stderr, flush=True)
+            note(f"{name}: {done:.0f} of {total} episodes")
 
     return update
 
@@ -295,11 +298,9 @@ def _counted(report: UpdateMetrics, diverged: Counter[str]) -> UpdateMetrics:
 
 def _print_divergence(name: str, counts: Counter[str]) -> None:
     if counts["diverged"]:
-        print(
+        note(
             f"{name}: {counts['diverged']} of {counts['episodes']} episodes ended because their "
-            "simulation diverged",
-            file=sys.stderr,
-            flush=True,
+            "simulation diverged"
         )
 
 

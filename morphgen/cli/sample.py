@@ -358,6 +358,5 @@ def _card(folder: Path) -> dict[str, Any]:
 
 
 def _require_folder(folder: Path) -> None:
-
     if not folder.exists():
         raise FormatError(f"{folder}: no such file or folder")

@@ -300,7 +300,6 @@ def _numbers(values: Sequence[float], digits: int = 3) -> str:
 
 
 def _layout_text() -> str:
-
     from morphgen.benchmark.tokens import LAYOUT
 
     rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]

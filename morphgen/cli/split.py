@@ -237,7 +237,6 @@ def _audit_goals(
 
 
 def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
-
     from morphgen.benchmark.similarity import MEASURES
 
     nearest: dict[str, list[str]] = {}
@@ -512,7 +511,6 @@ def show(args: argparse.Namespace) -> None:
 
 
 def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
-
     from morphgen.benchmark.split import SIDES, split_id
 
     lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]

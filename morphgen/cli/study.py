@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option
-from morphgen.cli.progress import training_progress
+from morphgen.cli.progress import note, training_progress
 from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.agents import AGENTS
@@ -188,7 +187,7 @@ def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
             seed = "" if cell.seed is None else f" seed {cell.seed}"
             state = f"failed: {outcome.error}" if outcome.error else "done"
             line = f"{done} of {len(cells)}: {cell.split} {cell.agent}{seed} {state}"
-            print(line, file=sys.stderr, flush=True)
+            note(line)
             failures += bool(outcome.error)
     return failures
 

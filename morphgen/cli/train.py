@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, repeated
-from morphgen.cli.progress import status, training_progress
+from morphgen.cli.progress import note, status, training_progress
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS, preset_of
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
@@ -210,7 +210,7 @@ def draw_robots(
         robots = draw(source, config, jobs=args.workers)
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
-        print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
+        note(f"morphgen: robots that were skipped: {reasons}")
     held_out = (read_split(name).max_links for name in source.held_out)
     max_links = args.max_links or default_max_links([robots.most_links, *held_out])
     return replace(source, drawn_hash=robots.hash), max_links
@@ -352,7 +352,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
             text = f"stopped after {args.minutes} minutes{what}; it continues with --resume"
         else:
             text = _next_command(folder, config)
-        print(text, file=sys.stderr)
+        note(text)
 
 
 def _next_command(folder: Path, config: RunConfig) -> str:

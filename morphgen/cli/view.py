@@ -6,7 +6,6 @@ import argparse
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 import warnings
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli.command import command, option, repeated, whole_number
 from morphgen.cli.options import LIBRARY
+from morphgen.cli.progress import note
 from morphgen.processes import STOP_SIGNALS
 
 if TYPE_CHECKING:
@@ -72,10 +72,9 @@ def _wait(host: str, viewer: Viewer) -> None:
     """Print the address, and wait until the server is interrupted."""
     try:
         if host not in LOCAL_HOSTS:
-            print(
+            note(
                 f"morphgen: warning: --host {host}: whoever can reach this machine can use this "
-                "page, see the robots of this folder and write into it; there is no password",
-                file=sys.stderr,
+                "page, see the robots of this folder and write into it; there is no password"
             )
         name = f"[{host}]" if ":" in host else host
         print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)

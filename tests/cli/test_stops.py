@@ -168,11 +168,6 @@ def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
 
 
 @pytest.mark.slow
-def test_ctrl_c_as_the_first_worker_starts_prints_one_line(tmp_path):
-    check(tmp_path, "sample", 0.0)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sample", "goals", "split"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_the_end_of_a_session_stops_workers_as_ctrl_c_does(tmp_path, name, number):
