@@ -150,6 +150,15 @@ def test_a_robot_that_cannot_be_read_does_not_stop_others(run, command):
     assert f"morphgen: {rows[1]['message']}" == first
 
 
+def test_a_missing_folder_does_not_stop_other_exports(run):
+    code, out, err = run("export", "gone/", "prims", "--format", "urdf")
+    assert (code, out, err) == (
+        2,
+        "prims-urdf\n",
+        "morphgen: gone/: gone: no such file or folder\n",
+    )
+
+
 def test_a_file_of_any_suffix_is_a_robot(run):
     assert run("compose", "base=gantry", "ee=plane", "--no-picture")[0] == 0
     Path("robots/gantry-plane/robot.xml").rename("gantry.mjcf")

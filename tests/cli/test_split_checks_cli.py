@@ -195,15 +195,10 @@ def known(**more):
     return replace(reaching(**more), test=(*reaching().test, twin))
 
 
-def build_with_goals(ok, path, out="data", *more):
-    printed = ok("split", "build", path, "--light", "--goals", "--out", out, *more)
-    return printed.splitlines()
-
-
 @pytest.mark.usefixtures("own_cache")
-def test_goal_seed_is_printed_stored_and_audited(run, write):
-    lines = build_with_goals(run, write(reaching()), "data", "--goal-seed", "7")
-    assert lines[1] == "4 goal sets, seed 7"
+def test_goal_seed_is_printed_stored_and_audited(run, ok, write):
+    out = ok("split", "build", write(reaching()), "--light", "--goals", "--goal-seed", "7")
+    assert out.splitlines()[1] == "4 goal sets, seed 7"
     assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}
     assert run("split", "audit", "data/mine/some")[0] == 0
     code, out, _ = run("split", "audit", "data/mine/some", "--goal-seed", "0")
