@@ -9,7 +9,7 @@ import pytest
 from helpers.commands import tree
 from helpers.simulators import PYBULLET
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.shipped_policies import POLICIES, ZERO_SHOT, ShippedPolicy, policies_for
+from morphgen.rl.shipped_policies import POLICIES, ShippedPolicy, policies_for
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 LINE = re.compile(
@@ -122,7 +122,7 @@ def test_each_variant_has_a_policy_and_controllers_to_compare(options, controlle
 
 def test_results_are_beside_controllers_that_do_not_learn(ok):
     rows = json.loads(ok("zeroshot", "ur5-stick", "--episodes", "2", "--json"))
-    assert [row["controller"] for row in rows] == [ZERO_SHOT.name, "ik", "jacobian", "random"]
+    assert [row["controller"] for row in rows] == ["zero-shot", "ik", "jacobian", "random"]
     for row in rows:
         assert row["episodes"] == 2
         assert row["success"]["low"] <= row["success"]["value"] <= row["success"]["high"]
@@ -135,12 +135,13 @@ def test_a_shipped_policy_is_named_like_a_checkpoint(ok, run, tmp_path):
     assert score["episodes"] == 1
     few = ["--steps", "64", "--envs", "2", "--set", "num_steps=8", "--set", "minibatches=2"]
     assert run("finetune", *words, *few, "--no-tensorboard", "--out", tmp_path)[0] == 0
-    assert read_checkpoint(tmp_path / "checkpoint.pt")[0].initial_checkpoint == str(ZERO_SHOT.file)
+    tuned, _ = read_checkpoint(tmp_path / "checkpoint.pt")
+    assert tuned.initial_checkpoint == str(POLICIES["zero-shot"].file)
 
 
 def test_other_packages_register_policies(monkeypatch, ok):
     monkeypatch.setattr(POLICIES, "_loaded", {})
-    POLICIES.register(ShippedPolicy("mine", ZERO_SHOT.file, ("reach",)))
+    POLICIES.register(ShippedPolicy("mine", POLICIES["zero-shot"].file, ("reach",)))
     poses = ("zero-shot-pose", "zero-shot-pose-obstacles")
     assert policies_for("reach")[-5:] == ("zero-shot", "zero-shot-obstacles", *poses, "mine")
     words = ["arm=arm3", "ee=stick", "--policy", "mine", "--sim", "mujoco"]
