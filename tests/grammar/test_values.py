@@ -64,6 +64,7 @@ def test_arithmetic_keeps_units(text, expected):
     ("text", "message"),
     [
         ("1m + 1kg", "1:4: (1m + 1kg) mixes units m and kg"),
+        ("1m * 2m", "1:4: (1m * 2m) multiplies m by m"),
         ("1 / 2m", "1:3: (1 / 2m) divides a pure number by m"),
         ("r - turn", "1:3: (r - turn) mixes units m and rad"),
         ("uniform(1m, 2kg)", "1:1: uniform(1m, 2kg) mixes units kg and m"),
