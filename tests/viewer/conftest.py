@@ -68,6 +68,12 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
+def files(folder):
+    """The files of a viewer in the folder."""
+    return FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
+
+
+@pytest.fixture
 def access(tmp_path):
     """The files of a viewer without uploads."""
     uploads = tmp_path / "uploads"

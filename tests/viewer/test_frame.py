@@ -108,6 +108,8 @@ def test_a_script_chooses_robots(viewer):
         script.send("open", "?gallery=robots/prims", visit=1)
         client.until(lambda: any(n == 1 and query.endswith(B) for n, query in client.addresses))
         script.send("drop", A)
+        script.send("download", "")
+        client.shows("robots.zip")
         script.send("clear", "")
         client.until(lambda: client.addresses[-1] == (1, "?gallery=robots/prims"))
         script.send("choose", "x" * MAX_CHOSEN)

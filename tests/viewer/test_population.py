@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Link, Robot
@@ -28,11 +27,6 @@ from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
 from morphgen.viewer.scene.robot import robot_bounds
 from morphgen.viewer.scene.stage import View, fit_camera, project_points
-
-
-@pytest.fixture
-def files(folder):
-    return FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
 
 
 @pytest.fixture

@@ -7,11 +7,9 @@ import pytest
 from helpers.pages import field, press
 from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
-from morphgen.grammar.library import default_library
 from morphgen.viewer.app.address import parse_address
 from morphgen.viewer.pages.gallery import choose_sides
 from morphgen.viewer.robot_rows import Row
-from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.splits import make_member, save_split
 
 SPLIT = "extrapolation/primitives/reach"
@@ -63,9 +61,8 @@ def test_new_split_is_saved_from_the_shown_robots(see, folder):
     page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
 
 
-def test_robots_of_a_set_become_members(folder, monkeypatch):
+def test_robots_of_a_set_become_members(folder, files, monkeypatch):
     monkeypatch.chdir(folder)
-    files = FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
     members = [
         make_member(f"robots/prims/prims-{i:06d}", "prims", "push", False, files) for i in range(4)
     ]
@@ -84,8 +81,7 @@ def test_filter_separates_train_and_test_robots():
         choose_sides(rows, rows[2:5], 4, 1)
 
 
-def test_empty_sides_and_invalid_names_are_rejected(folder):
-    files = FileAccess((), (folder.resolve(),), folder / "none")
+def test_empty_sides_and_invalid_names_are_rejected(files):
     with pytest.raises(BenchmarkError, match="0 train and 0 test"):
         save_split("mine", "interpolation", [], [], files)
     with pytest.raises(BenchmarkError, match="use letters"):

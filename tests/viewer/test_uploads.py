@@ -361,6 +361,8 @@ def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
 def test_a_picture_of_too_many_pixels_is_none(tmp_path):
     Image.new("1", (6000, 6000)).save(tmp_path / "preview.png")
     assert thumbnail_of_picture(tmp_path / "preview.png") == ""
+    Image.new("RGB", (400, 300)).save(tmp_path / "preview.png")
+    assert thumbnail_of_picture(tmp_path / "preview.png").startswith("data:image/jpeg;base64,")
 
 
 @pytest.mark.parametrize("change", [str.lower, str.upper, str.title])
