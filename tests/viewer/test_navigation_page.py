@@ -106,6 +106,8 @@ def test_the_theme_changes_without_a_new_page(same):
     page.locator('html[data-mantine-color-scheme="dark"]').wait_for(state="attached")
     page.wait_for_url(re.compile(r"compare=robots/some-arm&joint1=0\.5$"))
     assert page.evaluate("window.mark") is True
+    page.reload()  # the browser remembers it
+    page.locator('html[data-mantine-color-scheme="dark"]').wait_for(state="attached")
 
 
 def test_the_open_tab_is_in_the_address_and_back_returns_to_it(same):
