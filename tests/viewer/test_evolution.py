@@ -80,7 +80,8 @@ def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_vie
         client.shows("to go on with it")
         client.change(buttons, "mutants")
         client.shows('data-do="adopt" data-value="8"')
-        client.until(lambda: "evolve=1" in client.text)
+        client.until(lambda: client.addresses[-1][1].endswith("&evolve=1"))
+        assert "&choices=" in client.addresses[-1][1]
 
 
 def test_mutants_of_a_robot_without_a_grammar_need_no_other_button(shared_viewer):

@@ -483,10 +483,11 @@ def _show_generation(tab: EvolveTab) -> None:
 
 def _show_in_address(tab: EvolveTab) -> None:
     """Show in the address which mutants there are, and the choices that gave their parent."""
-    state = {"evolve": str(tab.seed.value) if tab.generation else ""}
+    state = {}
     if tab.generation and tab.parent is not None:
-        state |= {"choices": pack_choices(tab.parent.choices), "seed": "", "number": ""}
-    tab.session.address = tab.session.address.with_state(**state)
+        state = {"choices": pack_choices(tab.parent.choices), "seed": "", "number": ""}
+    evolve = str(tab.seed.value) if tab.generation else ""
+    tab.session.address = tab.session.address.with_state(**state, evolve=evolve)
     tab.session.show_address(tab.session.title)
 
 
