@@ -483,7 +483,7 @@ def _show_generation(tab: EvolveTab) -> None:
 
 def _show_in_address(tab: EvolveTab) -> None:
     """Show in the address which mutants there are, and the choices that gave their parent."""
-    state = {}
+    state: dict[str, str] = {}
     if tab.generation and tab.parent is not None:
         state = {"choices": pack_choices(tab.parent.choices), "seed": "", "number": ""}
     evolve = str(tab.seed.value) if tab.generation else ""
