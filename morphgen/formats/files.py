@@ -169,12 +169,12 @@ def _replace(path: Path, content: str | bytes) -> None:
 def locked_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other runs; the lock ends with its process."""
     lock = FileLock(folder / LOCK)
-    try:
-        with writing(f"to {folder}"):
+    with writing(f"to {folder}"):
+        try:
             lock.acquire(timeout=0)
-    except Timeout as error:
-        why = "is being written by another run; wait until it ends"
-        raise FormatError(f"{folder} {why}") from error
+        except Timeout as error:  # an OSError, too, which `writing` would report otherwise
+            why = "is being written by another run; wait until it ends"
+            raise FormatError(f"{folder} {why}") from error
     try:
         yield
     finally:

@@ -19,9 +19,9 @@ from typing import Any
 import torch
 
 from morphgen.benchmark.tokens import MAX_LINKS
-from morphgen.errors import FormatError, MorphgenError, TaskError, nearest, shortened
+from morphgen.errors import MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, partial_path, write_atomic
+from morphgen.formats.files import LOCK, partial_path, write_atomic, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
@@ -404,11 +404,9 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file of a run in place of its last version, in a folder that is made for it."""
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, content)
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
 
 def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:

@@ -1,13 +1,9 @@
 """Training writes a run's folder, and resumes after an interruption at any time."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -339,30 +335,6 @@ def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(tmp_path
     write_checkpoint(tmp_path, config, learner)
     with pytest.raises(TaskError, match="other observations: links 30, here 23"):
         train(tmp_path, config, resume=True, execution=QUIET)
-
-
-@pytest.mark.slow
-def test_training_and_evaluation_do_not_need_pybullet(tmp_path):
-    code = (
-        "import sys; sys.modules['pybullet'] = None\n"
-        "from pathlib import Path\n"
-        "from morphgen.rl.evaluation import evaluate_run\n"
-        "from morphgen.rl.runs.training import train\n"
-        "from helpers.runs import EVAL, QUIET, small_config\n"
-        "folder = Path(sys.argv[1])\n"
-        "train(folder, small_config(total_timesteps=32), execution=QUIET)\n"
-        "(score,) = evaluate_run(folder, 'train', EVAL, 'deterministic')\n"
-        "print(score.episodes)\n"
-    )
-    environment = {"PYTHONPATH": str(Path(__file__).parents[1])}
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "run")],
-        capture_output=True,
-        text=True,
-        env=os.environ | environment,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "2\n", "")
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["sim"] == "mujoco"
 
 
 def arm_of_three_joints():
