@@ -1,8 +1,13 @@
-"""The end of a test session."""
+"""Settings of hypothesis, and the end of a test session."""
 
 import gc
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# Tests do not fail because other work makes the machine slow.
+settings.register_profile("any load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any load")
 
 
 @pytest.hookimpl(trylast=True)
