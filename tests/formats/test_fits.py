@@ -113,16 +113,11 @@ def test_a_malformed_file_is_a_one_line_error(tmp_path, fault):
 
 def test_a_changed_file_is_reloaded(tmp_path):
     path = write(tmp_path, fits_text({"one": ARM}))
+    read_stored_fits([tmp_path]).clear()  # changes no cache
     assert read_stored_fits([tmp_path]) == {"one": ARM}
     path.write_text(fits_text({"one": HAND}), encoding="utf-8")
     os.utime(path, ns=(1, 1))
     assert read_stored_fits([tmp_path]) == {"one": HAND}
-
-
-def test_modifying_the_result_does_not_affect_the_cache(tmp_path):
-    write(tmp_path, fits_text({"one": ARM}))
-    read_stored_fits([tmp_path]).clear()
-    assert read_stored_fits([tmp_path]) == {"one": ARM}
 
 
 @pytest.fixture
@@ -138,13 +133,6 @@ def test_the_same_content_under_another_name_has_the_same_key(mesh, tmp_path):
     shutil.copy(mesh.path, copy.path)
     os.utime(copy.path, ns=(1, 1))
     assert shapes_key([Shape(copy, TILTED)]) == shapes_key([Shape(mesh, TILTED)])
-
-
-def test_different_content_has_a_different_key(mesh):
-    before = shapes_key([Shape(mesh)])
-    trimesh.creation.box((0.1, 0.2, 0.4)).export(mesh.path)
-    os.utime(mesh.path, ns=(1, 1))
-    assert shapes_key([Shape(mesh)]) != before
 
 
 def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):

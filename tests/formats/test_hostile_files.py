@@ -1,8 +1,6 @@
 """Malicious input files: `check`, `show` and `import` fail with one line and leave no files."""
 
-import json
 import os
-import re
 import struct
 import subprocess
 import sys
@@ -11,9 +9,8 @@ import pytest
 
 from morphgen.cli import main
 
-BOX = '<link name="a"><collision><geometry>{}</geometry></collision></link>'
-MESH = '<robot name="r">' + BOX.format('<mesh filename="{}"/>') + "</robot>"
-SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+BOX = '<robot name="r"><link name="a"><collision><geometry>{}</geometry></collision></link></robot>'
+MESH = BOX.format('<mesh filename="{}"/>')
 
 
 def chain(links):
@@ -35,24 +32,14 @@ def entities(depth):
 SOUND = '<robot name="r"><link name="a"/></robot>'
 URDFS = {
     "empty": b"",
-    "blank": b" \n ",
     "nul": b"<robot name='r'>\0</robot>",
-    "only nul": b"\0" * 1000,
     "truncated": SOUND[:25].encode(),
     "truncated after a prefix": b'<robot name="r"><drake:x><link name="a',
     "latin-1 called utf-8": '<robot name="é"/>'.encode("latin-1"),
     "utf-16 without a mark": SOUND.encode("utf-16-le"),
     "utf-16 with the wrong mark": b"\xff\xfe" + SOUND.encode("utf-16-be"),
     "binary": bytes(range(256)) * 100,
-    "json": b'{"robot": 1}',
-    "html": b"<!DOCTYPE html><html><body/></html>",
-    "sdf": b'<sdf version="1.6"><model name="x"/></sdf>',
     "entity bomb": (entities(10) + '<robot name="&e9;"/>').encode(),
-    "external entity": b'<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="&x;"/>',
-    "external dtd": b'<!DOCTYPE r SYSTEM "http://localhost:1/x.dtd">' + SOUND.encode(),
-    "bomb behind a blank": (
-        '\n<?xml version="0.0"?>' + entities(10) + '<robot a:b="1" name="&e9;"/>'
-    ).encode(),
     "deep": b"<robot>" * 100_000,
     "many prefixes": b"<r>" + b"".join(b"<p%d:x/>" % i for i in range(5000)) + b"</r>",
     "many attributes": b"<robot " + b" ".join(b'a%d="1"' % i for i in range(200_000)) + b">",
@@ -66,66 +53,9 @@ URDFS = {
         '<robot name="r"><link name="a">' + "<collision/>" * 20_000 + "</link></robot>"
     ).encode(),
     "unknown links": chain(900).replace('child link="', 'child link="x').encode(),
-    "nan": ('<robot name="r">' + BOX.format('<sphere radius="nan"/>') + "</robot>").encode(),
-    "inf": ('<robot name="r">' + BOX.format('<sphere radius="inf"/>') + "</robot>").encode(),
-    "1e999": ('<robot name="r">' + BOX.format('<box size="1 1 1e999"/>') + "</robot>").encode(),
-    "many digits": (
-        '<robot name="r">' + BOX.format(f'<sphere radius="{"9" * 100_000}"/>') + "</robot>"
-    ).encode(),
-    "negative": ('<robot name="r">' + BOX.format('<sphere radius="-1"/>') + "</robot>").encode(),
-    "mesh of the system": MESH.format("/etc/passwd").encode(),
-    "mesh of the system by URI": MESH.format("file:///etc/passwd").encode(),
-    "mesh above": MESH.format("../../../../../../../../etc/passwd").encode(),
-    "device mesh": MESH.format("/dev/zero").encode(),
-    "folder mesh": MESH.format(".").encode(),
+    "many digits": BOX.format(f'<sphere radius="{"9" * 100_000}"/>').encode(),
     "nul in a mesh's name": MESH.format("%00.stl").encode(),
     "long mesh name": MESH.format("m" * 5000 + ".stl").encode(),
-    "mesh from the net": MESH.format("http://localhost:1/m.stl").encode(),
-}
-
-
-def gltf(**more):
-    """A glTF document of one mesh."""
-    primitive = {"attributes": {"POSITION": 0}}
-    document = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
-    return json.dumps({**document, "meshes": [{"primitives": [primitive]}], **more}).encode()
-
-
-def collada_bomb(levels):
-    """A scene of 2^levels triangles."""
-    nodes = "".join(
-        f'<node id="n{i}">' + f'<instance_node url="#n{i - 1}"/>' * 2 + "</node>"
-        for i in range(1, levels)
-    )
-    scene = (
-        f'<visual_scene id="s"><node><instance_node url="#n{levels - 1}"/></node></visual_scene>'
-    )
-    return (
-        '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset/>'
-        f'<library_nodes><node id="n0"/>{nodes}</library_nodes>'
-        f"<library_visual_scenes>{scene}</library_visual_scenes>"
-        '<scene><instance_visual_scene url="#s"/></scene></COLLADA>'
-    ).encode()
-
-
-PLY = "ply\nformat {} 1.0\nelement vertex 2000000000\nproperty float x\nend_header\n0 0 0\n"
-MESHES = {
-    "count.stl": b"x" * 80 + struct.pack("<I", 2**32 - 1) + b"\0" * 500,
-    "nan.stl": b"x" * 80 + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0),
-    "binary.ply": PLY.format("binary_little_endian").encode(),
-    "entity.dae": (entities(10) + "<COLLADA>&e9;</COLLADA>").encode(),
-    "entity16.dae": (entities(2) + "<COLLADA>&e1;</COLLADA>").encode("utf-16"),
-    "nodes.dae": collada_bomb(40),
-    "deep.dae": b"<COLLADA>" + b"<a>" * 100_000,
-    "zeros.gltf": gltf(accessors=[{"componentType": 5126, "count": 2 * 10**9, "type": "VEC3"}]),
-    "above.gltf": gltf(
-        accessors=[{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        bufferViews=[{"buffer": 0, "byteLength": 36}],
-        buffers=[{"uri": "../secret.bin", "byteLength": 36}],
-    ),
-    "deep.gltf": b'{"a":' + b"[" * 100_000,
-    "deep.glb": b"glTF" + struct.pack("<IIII", 2, 100_020, 100_000, 0) + b"[" * 100_000,
-    "length.glb": b"glTF" + struct.pack("<IIII", 2, 2**32 - 1, 2**32 - 1, 0) + b"{}",
 }
 
 
@@ -157,35 +87,17 @@ def test_a_hostile_urdf_is_a_one_line_error(name, tmp_path, capsys):
     refused(path, capsys, tmp_path)
 
 
-@pytest.mark.parametrize("name", MESHES)
-def test_a_hostile_mesh_is_a_one_line_error(name, tmp_path, capsys):
-    (tmp_path / "robot").mkdir()
-    (tmp_path / "secret.bin").write_bytes(struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0))
-    path = tmp_path / "robot" / "x.urdf"
-    path.write_text(MESH.format(name))
-    (path.parent / name).write_bytes(MESHES[name])
-    code = main(["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"])
-    printed, errors = capsys.readouterr()
-    assert code == 2, printed
+def test_an_unreadable_mesh_is_a_one_line_error(tmp_path, capsys):
+    path = tmp_path / "x.urdf"
+    path.write_text(MESH.format("count.stl"))
+    (tmp_path / "count.stl").write_bytes(b"x" * 80 + struct.pack("<I", 2**32 - 1) + bytes(500))
+    assert main(["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"]) == 2
+    errors = capsys.readouterr().err
     assert len(errors.splitlines()) == 1
-    assert name in errors
+    assert "count.stl" in errors
     assert main(["check", str(path)]) == 1
     assert "mesh-unreadable" in capsys.readouterr().out
     assert not (tmp_path / "out" / "r").exists()
-
-
-@pytest.mark.parametrize("library", ["pipe.mtl", "/dev/zero", "../../../../../../dev/zero", "."])
-def test_an_obj_reads_materials_from_its_own_folder_only(library, tmp_path, capsys):
-    os.mkfifo(tmp_path / "pipe.mtl")
-    (tmp_path / "m.obj").write_text(f"mtllib {library}\nusemtl red\n{SOLID}")
-    path = tmp_path / "x.urdf"
-    path.write_text(MESH.format("m.obj"))
-    assert main(["check", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert re.findall("(?:info|warning|error) mesh[^:]*", printed) == [
-        "info mesh-left-out at link a"
-    ]
-    assert f"material file {library!r}: " in printed
 
 
 def test_files_that_are_not_regular_are_not_opened(tmp_path, capsys):
@@ -213,14 +125,7 @@ CARDS = {
     "levels": '{"format": ' + "[" * 500 + "]" * 500 + "}",
     "digits": '{"format": ' + "9" * 5000 + "}",
     "not text": b"\xff\xfe\x00",
-    "overflow": json.dumps({"format": 1, "frames": {}, "home": {}, "ignore_pairs": [10**400]}),
-    "repairs": json.dumps(
-        {"format": 1, "frames": {}, "home": {}, "ignore_pairs": [], "repairs": 5, "hashes": {}}
-    ),
-    "accepted": json.dumps(
-        {"format": 1, "frames": {}, "home": {}, "ignore_pairs": [], "accepted": [1], "hashes": {}}
-    ),
-    "frame with a line break": json.dumps({"format": 1, "frames": {"a\n\x9b2J": {}}}),
+    "frame with a line break": '{"format": 1, "frames": {"a\\n\\u009b2J": {}}}',
     "infinite": '{"format": Infinity}',
 }
 

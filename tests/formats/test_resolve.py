@@ -1,5 +1,7 @@
 """Resolving mesh and include references to files, without leaving the permitted folders."""
 
+from contextlib import nullcontext
+
 import pytest
 
 from morphgen.errors import FormatError
@@ -7,12 +9,10 @@ from morphgen.formats.resolve import (
     PackageFinder,
     default_finder,
     distribution_file,
-    is_installed,
     require_allowed_text,
     resolve_uri,
 )
 from morphgen.formats.xacro.evaluator import RefusedError
-from morphgen.grammar.library import default_library
 
 NOWHERE = PackageFinder()
 
@@ -99,29 +99,15 @@ def test_a_plain_folder_above_the_description_is_no_package(tmp_path):
     assert resolve_uri("package://secret/part.stl", urdf, NOWHERE).is_file()
 
 
-def test_a_folder_given_for_a_package_takes_precedence(tmp_path, urdf):
-    touch(urdf.parent.parent / "a.stl")
-    mine = touch(tmp_path / "mine" / "a.stl")
-    finder = default_finder(packages={"arm_description": tmp_path / "mine"})
-    assert resolve_uri("package://arm_description/a.stl", urdf, finder) == mine
-
-
-def test_relative_paths_start_at_the_folder_of_the_description(urdf, tmp_path, monkeypatch):
+def test_paths_start_at_the_folder_of_the_description_and_stay_near(urdf, tmp_path, monkeypatch):
     own_file = touch(urdf.parent / "a.stl")
     beside = touch(urdf.parent.parent / "meshes" / "b.stl")
-    touch(tmp_path / "elsewhere" / "a.stl")
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    assert resolve_uri("a.stl", urdf, NOWHERE) == own_file
-    assert resolve_uri("file://a.stl", urdf, NOWHERE) == own_file
-    assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
-
-
-def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(tmp_path, urdf):
-    own_file = touch(urdf.parent.parent / "meshes" / "a.stl")
     packaged = touch(tmp_path / "opt" / "hand_description" / "a.stl")
-    private = touch(tmp_path / "private" / "a.stl")
-    assert resolve_uri(str(own_file), urdf, NOWHERE) == own_file
-    assert resolve_uri(own_file.as_uri(), urdf, NOWHERE) == own_file
+    private = touch(tmp_path / "elsewhere" / "a.stl")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for uri in ("a.stl", "file://a.stl", str(own_file), own_file.as_uri()):
+        assert resolve_uri(uri, urdf, NOWHERE) == own_file
+    assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
     assert resolve_uri(packaged.as_uri(), urdf, NOWHERE) == packaged
     assert "leaves" in failure(private.as_uri(), urdf)
     assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
@@ -135,7 +121,11 @@ def test_ros_environment_is_searched_after_given_roots(tmp_path, urdf, monkeypat
     assert resolve_uri("package://one/a.stl", urdf, default_finder()) == classic
     assert resolve_uri("package://two/a.stl", urdf, default_finder()) == ament
     mine = touch(tmp_path / "mine" / "one" / "a.stl")
-    assert resolve_uri("package://one/a.stl", urdf, default_finder([tmp_path / "mine"])) == mine
+    for finder in (
+        default_finder([tmp_path / "mine"]),
+        default_finder(packages={"one": tmp_path / "mine" / "one"}),
+    ):
+        assert resolve_uri("package://one/a.stl", urdf, finder) == mine
 
 
 def test_distribution_files_are_found_and_missing_ones_are_errors(monkeypatch):
@@ -199,36 +189,24 @@ def test_a_root_extends_the_permitted_tree(tmp_path):
         default_finder(root=tmp_path / "nowhere")
 
 
-def refused_text(path, base, finder=NOWHERE):
-    try:
-        require_allowed_text(path, finder, base, base)
-    except RefusedError:
-        return True
-    return False
-
-
-def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path):
-    download = touch(tmp_path / "home" / "downloads" / "x.xacro")
-    nested = touch(tmp_path / "home" / "downloads" / "urdf" / "x.xacro")
-    near = touch(tmp_path / "home" / "secret.yaml")
-    own_file = touch(tmp_path / "home" / "downloads" / "config" / "a.yaml")
-    package = touch(tmp_path / "ws" / "arm" / "config" / "a.yaml")
+@pytest.mark.parametrize(
+    ("file", "finder", "is_allowed"),
+    [
+        ("downloads/config/a.yaml", {}, True),
+        ("ws/arm/a.yaml", {}, True),
+        ("secret.yaml", {}, False),
+        ("hand_description/a.yaml", {}, False),
+        ("secret.yaml", {"root": "."}, True),
+        ("hand_description/a.yaml", {"roots": ["."]}, True),
+    ],
+)
+def test_text_files_are_limited_to_own_folder_packages_and_roots(
+    file, finder, is_allowed, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     touch(tmp_path / "ws" / "arm" / "package.xml", "<package><name>arm</name></package>")
-    described = touch(tmp_path / "home" / "hand_description" / "a.yaml")
-    assert not refused_text(own_file, download)
-    assert not refused_text(own_file, nested)
-    assert not refused_text(package, download)
-    assert refused_text(near, download)
-    assert refused_text(near, nested)
-    assert refused_text(described, download)
-    assert not refused_text(near, download, default_finder(root=tmp_path / "home"))
-    assert not refused_text(described, download, default_finder([tmp_path / "home"]))
-
-
-def test_installed_files_are_distinguished_from_user_files(tmp_path):
-    file = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
-    assert is_installed(file)
-    assert is_installed(default_library().manifest("plane").path)
-    (tmp_path / "link.xacro").symlink_to(file)
-    assert is_installed(tmp_path / "link.xacro")
-    assert not is_installed(touch(tmp_path / "x.xacro"))
+    path, finder = touch(tmp_path / file), default_finder(**finder)
+    for place in ("downloads", "downloads/urdf"):
+        origin = touch(tmp_path / place / "x.xacro")
+        with nullcontext() if is_allowed else pytest.raises(RefusedError):
+            require_allowed_text(path, finder, origin, origin)

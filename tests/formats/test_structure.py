@@ -45,7 +45,6 @@ FAULTS = [
     ("attribute-missing", ('<mass value="1"/>', "<mass/>"), 5),
     ("attribute-missing", ('izz="1"', ""), 6),
     ("attribute-missing", (' size="1 1 1"', ""), 7),
-    ("attribute-missing", (' length="2"', ""), 9),
     ("attribute-missing", (' filename="m.stl"', ""), 8),
     ("attribute-missing", ('<parent link="a"/>', "<parent/>"), 12),
     ("attribute-missing", ('joint="j" ', ""), 17),
@@ -58,15 +57,11 @@ FAULTS = [
     ("number-malformed", ('xyz="0 0 1"', 'xyz="0 0 up"'), 13),
     ("number-malformed", ('upper="1e0"', 'upper="inf"'), 13),
     ("number-malformed", ('upper="1e0"', 'upper="1e999"'), 13),
-    ("number-malformed", ('effort="1"', 'effort="1_0"'), 13),
     ("number-malformed", ('velocity=".5"', 'velocity="0,5"'), 13),
-    ("number-malformed", ('damping="0.1"', 'damping="${d}"'), 14),
-    ("number-malformed", ('multiplier="-1."', 'multiplier="--1"'), 17),
     ("number-malformed", ('<mass value="1"', '<mass value="1kg"'), 5),
     ("number-count", ('xyz="0 0 0.1"', 'xyz="0 0.1"'), 5),
     ("number-count", ('size="1 1 1"', 'size=""'), 7),
     ("number-count", ('scale="-1 1 1"', 'scale="1 1"'), 8),
-    ("number-count", ('effort="1"', 'effort=""'), 13),
     ("number-count", ('"0.5 0.5 0.5 1"', '"0.5 0.5 0.5"'), 2),
     ("number-commas", ('xyz="0 0 0.1"', 'xyz="0,0,0.1"'), 5),
     ("size-not-positive", ('size="1 1 1"', 'size="1 -1 1"'), 7),
@@ -82,25 +77,19 @@ FAULTS = [
     ("disconnected", ('<link name="c"/>', '<link name="c"/>\n<link name="d"/>'), 16),
     ("mimic-cycle", ('mimic joint="j"', 'mimic joint="k"'), 16),
     ("joint-type-unsupported", ('type="continuous"', 'type="floating"'), 16),
-    ("joint-type-unsupported", ('type="continuous"', 'type="planar"'), 16),
-    ("joint-type-unknown", ('type="revolute"', 'type="hinge"'), 12),
+    ("joint-type-unknown", ('type="revolute"', 'type="revolut"'), 12),
     ("text-invalid", ('link name="c"', 'link name="c&#10;d"'), 15),
     ("text-invalid", ('robot name="r"', 'robot name="r&#x202e;"'), 1),
     ("text-invalid", ('joint name="k"', f'joint name="{1001 * "k"}"'), 16),
 ]
 
+XACRO = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>'
 SUSPICIOUS = [
     ("number-commas", ('size="1 1 1"', 'size="1, 1, 1"')),
     ("number-commas", ('scale="-1 1 1"', 'scale="1,1,1"')),
     ("element-repeated", ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><axis xyz="1 0 0"/>')),
     ("element-repeated", ('<box size="1 1 1"/>', '<box size="1 1 1"/><sphere radius="1"/>')),
-    (
-        "xacro-unexpanded",
-        (
-            '<robot name="r">',
-            '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>',
-        ),
-    ),
+    ("xacro-unexpanded", ('<robot name="r">', XACRO)),
 ]
 
 
@@ -142,6 +131,9 @@ def test_faults_are_reported_with_their_line(code, change, line):
     assert faults, findings(changed(change))
     assert faults[0].severity == "error"
     assert faults[0].where.startswith(f"r.urdf:{line} ")
+    if code == "joint-type-unknown":
+        assert faults[0].where.endswith("joint 'j'")
+        assert "did you mean 'revolute'" in faults[0].fix
     assert faults[0].fix
     assert "\n" not in faults[0].why + faults[0].fix
 
@@ -153,22 +145,9 @@ def test_recoverable_faults_are_warnings_and_load(code, change):
     load(changed(change))
 
 
-def test_findings_name_the_enclosing_link_or_joint():
-    (finding,) = findings(SOUND.replace('<sphere radius="1"/>', '<sphere radius="0"/>'))
-    assert finding.where == "r.urdf:10 link 'b'"
-
-
-def test_a_near_match_is_suggested():
-    (finding, *_) = findings(SOUND.replace("revolute", "revolut"))
-    assert "did you mean 'revolute'" in finding.fix
-
-
 def test_an_unexpanded_xacro_is_reported_instead_of_the_faults_it_causes():
-    text = SOUND.replace(
-        '<robot name="r">',
-        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>',
-    ).replace('damping="0.1"', 'damping="${d}"')
-    (finding,) = findings(text)
+    text = SOUND.replace('<robot name="r">', XACRO)
+    (finding,) = findings(text.replace('damping="0.1"', 'damping="${d}"'))
     assert (finding.code, finding.severity) == ("xacro-unexpanded", "error")
 
 

@@ -47,40 +47,34 @@ def origin(tmp_path):
     return tmp_path / "part.xacro"
 
 
-def test_arguments_have_defaults_that_the_caller_can_override(origin):
-    body = '<xacro:arg name="n" default="3"/><link name="l$(arg n)"/>'
-    assert expanded(body, origin) == [{"name": "l3"}]
-    assert expanded(body, origin, n="7") == [{"name": "l7"}]
+LENGTH = '<xacro:arg name="length" default="1"/><link name="l"/>'
+ARGUMENT = '<xacro:arg name="n" default="3"/><link name="l$(arg n)"/>'
+CHAIN = """
+  <xacro:property name="n" value="2"/>
+  <xacro:macro name="chain" params="i">
+    <link name="l${'%.3f' % (pi * i)}"/>
+    <xacro:if value="${i &lt; n}"><xacro:chain i="${i + 1}"/></xacro:if>
+  </xacro:macro>
+  <xacro:chain i="0"/>"""
 
 
-def test_macros_properties_conditions_and_python_work(origin):
-    body = """
-      <xacro:property name="n" value="2"/>
-      <xacro:macro name="chain" params="i">
-        <link name="l${i}" x="${'%.3f' % (pi * i)}"/>
-        <xacro:if value="${i &lt; n}"><xacro:chain i="${i + 1}"/></xacro:if>
-      </xacro:macro>
-      <xacro:chain i="0"/>"""
-    names = [link["name"] for link in expanded(body, origin)]
-    assert names == ["l0", "l1", "l2"]
-
-
-def test_an_undeclared_argument_is_an_error_that_suggests_the_nearest(origin):
-    body = '<xacro:arg name="length" default="1"/><link name="l"/>'
-    message = failure(body, origin, lenght="2")
-    assert "'lenght'" in message
-    assert "did you mean 'length'" in message
-
-
-def test_an_argument_declared_in_a_skipped_branch_is_valid(origin):
-    body = '<xacro:if value="false"><xacro:arg name="a" default="1"/></xacro:if><link name="l"/>'
-    assert expanded(body, origin, a="2") == [{"name": "l"}]
-
-
-def test_an_argument_without_default_is_required(origin):
-    body = '<link name="$(arg prefix)link"/>'
-    assert "'prefix'" in failure(body, origin)
-    assert expanded(body, origin, prefix="left_") == [{"name": "left_link"}]
+@pytest.mark.parametrize(
+    ("body", "args", "names"),
+    [
+        (ARGUMENT, {}, ["l3"]),
+        (ARGUMENT, {"n": "7"}, ["l7"]),
+        ('<link name="$(arg prefix)link"/>', {"prefix": "left_"}, ["left_link"]),
+        (f'<xacro:if value="false">{ARGUMENT}</xacro:if><link name="a"/>', {"n": "2"}, ["a"]),
+        (CHAIN, {}, ["l0.000", "l3.142", "l6.283"]),
+        ('<xacro:include filename="no.xacro" optional="true"/><link name="a"/>', {}, ["a"]),
+        ("<link name=\"${xacro.load_yaml('p.yaml').arm.reach}\"/>", {}, ["0.5"]),
+        ('<link name="$(optenv EXTRA usual)"/>', {}, ["usual"]),
+    ],
+)
+def test_documents_are_expanded(body, args, names, origin, tmp_path, monkeypatch):
+    monkeypatch.setenv("EXTRA", "surprise")
+    (tmp_path / "p.yaml").write_text("arm: {reach: !millimeters 500}\n")
+    assert expanded(body, origin, **args) == [{"name": name} for name in names]
 
 
 def test_calls_share_no_state(origin):
@@ -109,40 +103,6 @@ def test_find_searches_around_the_file_and_in_roots(tmp_path, origin):
         str(tmp_path / "near_description"),
         str(tmp_path / "far" / "far_description"),
     ]
-    assert "'lost'" in failure('<link name="$(find lost)"/>', origin)
-
-
-def test_a_missing_include_names_both_files(origin):
-    message = failure('<xacro:include filename="lost.xacro"/>', origin)
-    assert str(origin) in message
-    assert "lost.xacro" in message
-
-
-def test_an_optional_include_may_be_missing(origin):
-    body = '<xacro:include filename="lost.xacro" optional="true"/><link name="l"/>'
-    assert expanded(body, origin) == [{"name": "l"}]
-
-
-def test_broken_xml_in_an_include_is_reported_with_its_line(tmp_path, origin):
-    (tmp_path / "broken.xacro").write_text("<robot>\n\n<link></robot>")
-    message = failure('<xacro:include filename="broken.xacro"/>', origin)
-    assert message.startswith(f"{tmp_path / 'broken.xacro'}:3:")
-
-
-def test_a_doctype_in_an_include_is_refused(tmp_path, origin):
-    (tmp_path / "bomb.xacro").write_text('<!DOCTYPE r [<!ENTITY a "b">]><r>&a;</r>')
-    assert "DOCTYPE" in failure('<xacro:include filename="bomb.xacro"/>', origin)
-
-
-def test_a_file_that_includes_itself_is_an_error(origin):
-    body = '<xacro:include filename="part.xacro"/>'
-    origin.write_text(robot(body))
-    assert "endless" in failure(body, origin)
-
-
-def test_a_macro_that_calls_itself_without_end_is_an_error(origin):
-    body = '<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>'
-    assert "endless" in failure(body, origin)
 
 
 @pytest.mark.parametrize(
@@ -161,21 +121,21 @@ def test_a_macro_that_calls_itself_without_end_is_an_error(origin):
         ('<link name="$(cwd)"/>', "xacro:arg"),
         ('<link name="$(nope x)"/>', "valid: arg"),
         ("<link name=\"${load_yaml('lost.yaml')}\"/>", "lost.yaml"),
+        ('<link name="$(find lost)"/>', "'lost'"),
+        ('<link name="$(arg prefix)"/>', "'prefix'"),
+        ('<xacro:include filename="lost.xacro"/>', "lost.xacro"),
+        ('<xacro:include filename="broken.xacro"/>', "broken.xacro:3:"),
+        ('<xacro:include filename="bomb.xacro"/>', "DOCTYPE"),
     ],
 )
-def test_errors_are_one_line_that_names_the_file(body, reason, origin):
+def test_errors_are_one_line_that_names_the_file(body, reason, origin, tmp_path):
+    (tmp_path / "broken.xacro").write_text("<robot>\n\n<link></robot>")
+    (tmp_path / "bomb.xacro").write_text('<!DOCTYPE r [<!ENTITY a "b">]><r>&a;</r>')
     assert reason in failure(body, origin)
 
 
-def test_the_environment_is_not_read(origin, monkeypatch):
-    monkeypatch.setenv("EXTRA", "surprise")
-    assert expanded('<link name="$(optenv EXTRA usual)"/>', origin) == [{"name": "usual"}]
-
-
-def test_yaml_can_be_loaded_with_units(tmp_path, origin):
-    (tmp_path / "p.yaml").write_text("arm: {reach: !millimeters 500}\n")
-    body = "<link name=\"${xacro.load_yaml('p.yaml').arm.reach}\"/>"
-    assert expanded(body, origin) == [{"name": "0.5"}]
+def test_an_undeclared_argument_is_an_error_that_suggests_the_nearest(origin):
+    assert "'lenght'; did you mean 'length'" in failure(LENGTH, origin, lenght="2")
 
 
 def test_warnings_are_not_printed(origin, capfd):

@@ -348,6 +348,17 @@ def many_nodes():
     return gltf(nodes=[{"mesh": 0}] * 6000, scenes=[{"nodes": [*range(6000)]}])
 
 
+def nested_nodes(levels):
+    """A COLLADA scene of 2^levels nodes."""
+    nodes = "".join(
+        f'<node id="n{i}">' + f'<instance_node url="#n{i - 1}"/>' * 2 + "</node>"
+        for i in range(1, levels)
+    )
+    last = f'<visual_scene id="s"><node><instance_node url="#n{levels - 1}"/></node>'
+    library = f'<library_nodes><node id="n0"/>{nodes}</library_nodes><library_visual_scenes>'
+    return dae(n=("<library_visual_scenes>", library), s=('<visual_scene id="s">', last))
+
+
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 REFUSED: dict[str, tuple[Any, str]] = {
     # more entries than bytes
@@ -387,6 +398,15 @@ REFUSED: dict[str, tuple[Any, str]] = {
                + "</visual_scene>")),
         "nodes; at most 20000 are read",
     ),
+    "nodes.dae": (nested_nodes(40), "nodes; at most 20000 are read"),
+    "entity.dae": (dae(x=("<COLLADA", '<!DOCTYPE r [<!ENTITY e "a">]><COLLADA')), "DOCTYPE"),
+    "deep.dae": (b"<COLLADA>" + b"<a>" * 100_000, "depth"),
+    "deep.gltf": (b'{"a":' + b"[" * 100_000, "not a readable gltf mesh"),
+    "deep.glb": (
+        b"glTF" + struct.pack("<IIII", 2, 100_020, 100_000, 0x4E4F534A) + b"[" * 100_000,
+        "not a readable glb mesh",
+    ),
+    "length.glb": (b"glTF" + struct.pack("<IIII", 2, 2**32 - 1, 2**32 - 1, 0) + b"{}", "truncated"),
     "triangles.dae": (
         dae_with(f'<polylist count="1">{INPUT}<vcount>3000000</vcount><p>0 1 2</p></polylist>'),
         "2999998 triangles; at most 1000000",
