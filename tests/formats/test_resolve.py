@@ -1,6 +1,7 @@
 """Resolving mesh and include references to files, without leaving the permitted folders."""
 
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
@@ -196,8 +197,8 @@ def test_a_root_extends_the_permitted_tree(tmp_path):
         ("ws/arm/a.yaml", {}, True),
         ("secret.yaml", {}, False),
         ("hand_description/a.yaml", {}, False),
-        ("secret.yaml", {"root": "."}, True),
-        ("hand_description/a.yaml", {"roots": ["."]}, True),
+        ("secret.yaml", {"root": Path()}, True),
+        ("hand_description/a.yaml", {"roots": [Path()]}, True),
     ],
 )
 def test_text_files_are_limited_to_own_folder_packages_and_roots(
