@@ -12,10 +12,10 @@ from typing import Protocol, runtime_checkable
 
 
 class Progress(Protocol):
-    """Function that receives the number of finished items, and of all; None if it is unknown."""
+    """Function that receives the number of finished items, and of all items if it is known."""
 
     def __call__(self, done: float, total: int | None, /) -> None:
-        """Receive the numbers."""
+        """Receive the numbers; a fraction counts what is done of an item."""
 
 
 @runtime_checkable
@@ -31,7 +31,7 @@ _listener: ContextVar[Progress | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def show_progress(listener: Progress | None) -> Iterator[None]:
-    """Send the reports of this block, or of a decorated function, to a listener, if there is one.
+    """Send the reports of this block, or of a decorated function, to a listener; None silences it.
 
     Examples:
         >>> with show_progress(lambda done, total: print(done, "of", total)):

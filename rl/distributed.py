@@ -2,7 +2,7 @@
 
 ``torchrun`` starts the processes. Each collects rollouts in its own environments. Gradients are
 averaged before every step of the optimiser, so that all processes keep the same weights; process 0
-alone writes files.
+alone writes files. The metrics of an update, which they merge, stand here, too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import distributed
 
 from morphgen.errors import TaskError
 
-Metrics = dict[str, Any]  # fields of a report by name
+Metrics = dict[str, Any]  # metrics of one process's rollout by name
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class UpdateMetrics:
     terms: dict[str, float]  # mean of each reward term
     policy_loss: float  # clipped policy loss
     value_loss: float  # half the squared error, or `matching_loss` if the critic predicts symlogs
-    entropy: float  # entropy of a robot's action distribution [nats]
+    entropy: float  # of a robot's actions, or of a joint's with `joint_entropy` [nats]
     kl: float  # divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)
     clip_fraction: float  # share of the probability ratios outside of the clip range
     actor_gradient: float  # norm of the actor's gradient before clipping

@@ -17,8 +17,8 @@ from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS
 from morphgen.tasks.task import STANDARD_FIELDS
 
 MIN_LOG_STD, MAX_LOG_STD, INITIAL_LOG_STD = -4.0, 0.5, -0.7
-"""Log of the Gaussian's standard deviation: its bounds, and its initial value. 0.5 is half of a
-joint's step per control step."""
+"""Log of the Gaussian's standard deviation: its bounds, and its initial value. The initial
+deviation, exp(-0.7) = 0.5, is half of a joint's step per control step."""
 REST = BINS.index(0.0)  # the bin that moves nothing
 
 

@@ -39,7 +39,7 @@ OFTEN = 0.02  # fraction of these in which two links must touch for their plane 
 class JointPlane:
     """Plane of one or two joints in which free configurations form several components."""
 
-    pairs: tuple[Pair, ...]  # pairs of links that touch between the components
+    pairs: tuple[Pair, ...]  # links whose contact separates the components
     joints: tuple[int, ...]  # indices of the independent joints, one or two
     lower: Array  # lower end of the grid for each joint [rad or m]
     upper: Array  # upper end of the grid for each joint [rad or m]
@@ -138,7 +138,8 @@ _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
     ("continuous", (0.0, 0.0, 1.0)),
     ("continuous", (0.0, 1.0, 0.0)),
     ("continuous", (1.0, 0.0, 0.0)),
-)  # kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll
+)
+"""Kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll."""
 _AWAY = (0.0, 0.0, 1e4, 0.0, 0.0, 0.0)
 """Positions of the block's virtual joints without a pose of the block: far above everything."""
 
@@ -263,7 +264,7 @@ class FreeSpace:
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
-        if not np.isfinite(q).all():  # nothing collides there, which is not to be free
+        if not np.isfinite(q).all():  # NaN collides with nothing, and would be free
             raise ValueError(f"q of {robot.name} is not finite")
         slides = np.zeros((len(q), len(self._obstacles)))
         return np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)

@@ -54,8 +54,11 @@ def measure_speed(
 
     The measurement covers whole episodes: the cost of contacts depends on the time since they
     began, and a faster simulator would otherwise get further into them. The seed gives all
-    simulators the same episodes, since some cost a tenth more than others. The clock [s] by default
-    waits for the batch's device first, which otherwise runs behind the calls.
+    simulators the same episodes, since some cost a tenth more than others.
+
+    seconds: Least duration [s]; an episode that began is finished.
+    own: Objects and names of the simulator's native functions, whose time is counted apart.
+    clock: By default one [s] that waits for a GPU, whose work ends after the call.
     """
     if clock is None:
         clock = time.perf_counter if is_host(batch.device) else _time_on_gpu
@@ -80,7 +83,7 @@ def measure_speed(
             for owner, name in functions:
                 stack.enter_context(_timed(owner, name, part, spent, clock))
         start = clock()
-        while steps % episode or clock() - start < seconds:
+        while steps % episode or clock() - start < seconds:  # whole episodes
             batch.step(actions[steps % episode])
             steps += 1
         total = clock() - start

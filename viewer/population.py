@@ -64,12 +64,12 @@ Prototype = Box | Cylinder | Sphere | Mesh  # geometry of which instances are sc
 class Instances:
     """The shapes of all robots; m instances."""
 
-    prototypes: dict[Prototype, slice]  # instances of each prototype
+    prototypes: dict[Prototype, slice]  # rows of the instances of each prototype
     robot: NDArray[np.intp]  # robot of each instance, shape (m,)
     link: NDArray[np.intp]  # link of each instance within its robot, shape (m,)
     T_link_shape: NDArray[np.float32]  # pose of each instance on its link, shape (m, 4, 4)
     scale: NDArray[np.float32]  # factors along the prototype's axes, shape (m, 3)
-    colour: NDArray[np.uint8]  # colour, shape (m, 3)
+    colour: NDArray[np.uint8]  # red, green, blue, shape (m, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,13 +286,14 @@ def surface(prototype: Prototype) -> Triangles:
             return mesh_arrays(trimesh.graph.smooth_shade(simple, angle=SHARP_ANGLE))
 
 
-MAX_ROBOTS = 1000  # largest population
+MAX_ROBOTS = 1000  # largest population [robots]
 NUM_SAMPLED = 100  # robots that are sampled from a grammar by default
 _CHUNK = 20  # robots of one call of a worker
 ASPECT = 0.7  # width of an arrangement by its depth: seen from the front above, it fills a window
 _MAX_LABELS = 16  # labels beside rows: more would cover each other
-_WORD_GAP, _LABEL_GAP = 0.2, 0.3  # in median widths; between labels and rows [m]
-_QUANTILE = 0.8  # of a row's depths; the largest robots cover those behind a little
+_WORD_GAP = 0.2  # gap between neighbours [median widths]
+_LABEL_GAP = 0.3  # gap between labels and rows [m]
+_QUANTILE = 0.8  # share of a row's robots that its depth holds; others cover those behind a little
 
 
 @dataclass(frozen=True)

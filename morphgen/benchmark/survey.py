@@ -1,6 +1,6 @@
 """Compose and measure all robots of a split, and compare each test robot with each train robot.
 
-The audit, the statistics and the difficulty of a split are computed from this survey.
+The audit is computed from this survey, and so are the statistics and the difficulty below.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def survey_split(
     total = len(members) + n
     with part_of(total):
         robots = list(parallel_map(partial(_measure, library, split.max_links), members, jobs))
-    # Each of them has 74 kB, most of it the density of the workspace.
+    # Workers get the features alone: 74 kB a robot, most of it the density of the workspace.
     known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
     with part_of(total, len(members)):
         compare = partial(_compare, known[:n], known[n:], within_train)

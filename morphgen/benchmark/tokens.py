@@ -85,7 +85,7 @@ POSITION = Field(
 )
 LAYOUT = (INDEX, PARENT, TOOL_FLAG, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITION)
 """The fields of a token, in order."""
-LAYOUT_ARRAYS: Mapping[str, Any] = {  # np.savez takes a bool among its arrays, for mypy
+LAYOUT_ARRAYS: Mapping[str, Any] = {  # Any: to mypy, np.savez could get a bool
     "layout": np.array([field.name for field in LAYOUT]),
     "columns": np.array([(field.start, field.columns.stop) for field in LAYOUT]),
 }
@@ -154,8 +154,8 @@ def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = 
 def encode_position(x: Array) -> Array:
     """Encode normalized joint positions x (...) as eight sines and eight cosines, shape (..., 16).
 
-    As in NeRF (Mildenhall et al. 2020, equation 4), but the lowest frequency is pi/2 instead of pi,
-    with which both limits, x = -1 and x = 1, would have the same code.
+    As in NeRF (Mildenhall et al. 2020, equation 4), but the lowest frequency is pi/2: with pi,
+    both limits, x = -1 and x = 1, would have the same code.
     """
     angles = x[..., None] * FREQUENCIES
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
@@ -348,7 +348,7 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
 def robot_from_tokens(
     tokens: ArrayLike, name: str, *, max_links: int = MAX_LINKS
 ) -> tuple[Robot, dict[str, Shape]]:
-    """Decode tokens (n_links, 48) of a robot to it and its primitives by link name.
+    """Decode tokens (n_links, 48) and return the robot and its primitives by link name.
 
     Links are named ``link0``, ``link1`` ..., and joints ``joint1`` ... after their child links.
     The primitives become collision shapes. Movable joints are independent and have limits (-1, 1),

@@ -1,8 +1,8 @@
 """Checks of a robot: findings with a code, a severity and a remedy, and the safe repairs.
 
 An ``error`` means that a simulator rejects the robot or simulates something other than the file
-describes; a ``warning``, that something is suspicious; an ``info``, a limitation of some loader
-that a bundle already works around.
+describes; a ``warning``, that something is suspicious; an ``info``, something to know:
+a limitation of a loader that a bundle works around, or a finding that a part accepts.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _apply_accepted(finding: Finding, robot: Robot) -> Finding:
     A finding about two links is accepted if either of them accepts it.
     """
     accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
-    for name in finding.where.partition(" ")[2].split(", "):
+    for name in finding.where.partition(" ")[2].split(", "):  # kind, then names
         reason = accepted.get(name, {}).get(finding.code)
         if reason is not None:
             return replace(finding, severity="info", why=f"{finding.why}; accepted: {reason}")

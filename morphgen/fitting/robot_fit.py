@@ -65,7 +65,7 @@ class FitReport:
 
     @property
     def mean(self) -> Quality | None:
-        """Mean quality over the links, but the largest Hausdorff distance; None without links."""
+        """Means over the links, of Hausdorff distances the largest; None without links."""
         if not self.links:
             return None
         values = {
@@ -154,6 +154,7 @@ def fit_links(
 
 
 def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> LinkFit | FitError:
+    """Return the error instead: a link without a fit does not end the fits of the others."""
     shapes, solid = work
     try:
         return fit_shapes(shapes, options, solid=solid)
@@ -162,7 +163,10 @@ def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Link
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Return the parts that have meshes, except those that are another part at another scale."""
+    """Return the parts that have meshes and are no other part at another scale.
+
+    With ``missing``, only those with a link whose fit is not stored.
+    """
     stored = read_stored_fits(library.folders) if missing else {}
     return [
         manifest

@@ -96,8 +96,8 @@ def difference(a: Derivation, b: Derivation) -> list[str]:
 
 
 def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
-    line = Derivation(node.label, node.part, node.parameters)
-    yield "  " * depth + (f"{port}: " if port else "") + str(line)
+    alone = Derivation(node.label, node.part, node.parameters)
+    yield "  " * depth + (f"{port}: " if port else "") + str(alone)
     for name, child in node.children:
         yield from _outline(child, name, depth + 1)
 
@@ -115,12 +115,12 @@ def _flat(derivation: Derivation) -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
-    return Lark(_SYNTAX, parser="lalr", start="node", maybe_placeholders=False)  # linear time
+    return Lark(_SYNTAX, parser="lalr", start="node", maybe_placeholders=False)  # linear
 
 
 @v_args(inline=True)
 class _Builder(Transformer_NonRecursive[Token, Any]):
-    """Converts Lark's tree without recursion; a method per rule of the syntax."""
+    """Converts Lark's tree without recursion, however deep; a method per rule of the syntax."""
 
     def __init__(self, origin: str) -> None:
         super().__init__()

@@ -56,7 +56,7 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
 
 
 def with_inertia(link: Link, density: float) -> Link:
-    """Return the link with the mass properties of its collision shapes, or else its visuals."""
+    """Return the link with the mass properties of its collision shapes, else visuals, if any."""
     shapes = link.collisions or link.visuals
     return replace(link, inertial=inertial_from_density(shapes, density)) if shapes else link
 
@@ -85,7 +85,7 @@ def _union_moments(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Array
     if not any(
         np.all(a[0] < b[1]) and np.all(b[0] < a[1]) for a, b in itertools.combinations(boxes, 2)
     ):
-        return total
+        return total  # boxes apart: nothing counts twice, and closed forms are exact
     import manifold3d  # here, because it is seldom needed and takes time to load
 
     # Closed forms are exact, but booleans are not defined on them: subtract only the overlap,

@@ -328,7 +328,7 @@ class PushPlanner:
         return q
 
 
-# All lengths are in edges of the block.
+# Lengths of the next constants are in edges of the block.
 SHIFTS = np.arange(0.05, 2.0, 0.1)
 """Distances that the block is moved towards the robot to find their contact."""
 BISECTIONS = 5  # bisections of the interval between two of these shifts

@@ -51,11 +51,12 @@ def push_region(
 
     - Free robots, whose tool slides along two horizontal directions: the edge is in metres, x in
       ``config.free_x``.
-    - Arms, whose tool slides along none and leaves every plane: the edge is relative to the
+    - Arms, whose tool slides along none and changes its height: the edge is relative to the
       effective reach, x in ``config.arm_x`` effective reaches beyond the shoulder.
-    - All others, such as a rod on one slide or a chain of links in a plane: x is anywhere the tool
-      can be at the height of the block while slides are at home; feasibility tests decide where it
-      can push. The edge is in metres if the tool slides, else relative to the effective reach.
+    - All others, such as a rod on one slide or a chain in a horizontal plane: x is anywhere the
+      tool can be at the height of the block while slides are at home; feasibility tests decide
+      where it can push. The edge is in metres if the tool slides, else relative to the effective
+      reach.
 
     y at the start is at most ``config.start_depth`` below ``config.start``, and the line is at
     ``config.line``; both are scaled down in proportion for robots that reach less than 0.4 m. That
@@ -129,11 +130,12 @@ def _num_slide_directions(robot: Robot) -> int:
     """Return the number of horizontal directions along which the tool slides, at home."""
     _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
-        directions[k + 1, :2]
+        directions[k + 1, :2]  # joint k moves link k + 1
         for k in robot.joint_chain(robot.frame(TOOL).link)
         if robot.joints[k].kind == "prismatic"
     ]
-    return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0  # parallel: one
+    # Parallel slides count once.
+    return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0
 
 
 def _tool_x_range(robot: Robot, ground: float, edge: float) -> tuple[float, float]:
@@ -150,7 +152,8 @@ def _tool_x_range(robot: Robot, ground: float, edge: float) -> tuple[float, floa
 
 BEHIND = (0.1, 0.4, 0.8, 1.2, 1.6)
 """Distances of the tool behind the block's rearmost point, in block edges, in the order of trial.
-They exceed the radius of the largest sphere, whose tool is at its bottom."""
+The largest exceeds the radius of the largest end-effector `sphere`, which reaches further forward
+than its tool, its lowest point."""
 CLOSE = 1e-3  # largest distance of a tool from its goal along x and along y [m]
 NEAREST = (1, 2, 3, 6)
 """Numbers of nearest sampled configurations from which inverse kinematics starts, in turn."""
@@ -264,7 +267,7 @@ def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bo
     step = _SPACING * space.scene.block.size[1]
     parts = int((line - blocks[:, 1].min()) / step) + 2
     turned = blocks.copy()
-    turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)  # a pushed block may turn: its widest ways
+    turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)  # and turned: a push may turn a block
     poses = np.tile(np.stack([blocks, turned]), (parts, 1, 1, 1))
     advance = step * np.arange(parts)[:, None]
     poses[..., 1] = np.minimum(blocks[:, 1] + advance, line)[:, None]

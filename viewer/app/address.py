@@ -41,8 +41,9 @@ MAX_PACKED = 4000  # longest packed text [characters]; some mail programs cut lo
 MAX_UNPACKED = 200_000  # longest unpacked text [bytes]: a short address cannot fill the memory
 ROBOT = "robot"  # page of a robot; on the page `play`, each robot of the rollout
 CHOSEN = "chosen"  # page of chosen robots; on other pages, each robot in the tray
-MAX_COMPARED, MAX_PLAYED = 4, 9  # robots that are compared, and that do a task, at once
-MAX_CHOSEN = 3000  # longest URIs of all chosen robots together in an address [characters]
+MAX_COMPARED = 4  # most robots that are compared at once
+MAX_PLAYED = 9  # most robots that do a task at once
+MAX_CHOSEN = 3000  # most characters that the URIs of all chosen robots take in an address
 
 
 class AddressError(MorphgenError):

@@ -27,7 +27,7 @@ from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_uri import FileAccess
 
 DEFAULT_WIDTH = 1400  # width of a window that a browser does not tell [pixels]
-ADDRESS_DELAY = 0.5  # of URL updates after a move [s]; Safari allows at most 100 updates in 30 s
+ADDRESS_DELAY = 0.5  # delay of URL updates after a move [s]; Safari allows 100 updates in 30 s
 URL_TIMEOUT = 20.0  # time in which a browser has to report its URL [s]
 
 _READ_LOCATION = """

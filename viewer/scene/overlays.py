@@ -23,7 +23,7 @@ from morphgen.viewer.scene.robot import RobotView, robot_extent
 from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, grown_triangles, triangles
 
 NUM_POINTS = 200_000  # configurations that are sampled for a workspace
-_SHELL_SUBDIVISIONS = 3  # of the icosahedron whose 642 vertices are the shell's directions
+_SHELL_SUBDIVISIONS = 3  # divisions of an icosahedron: 642 vertices, the shell's directions
 _CELLS = 48  # cells of a slice along the longest side of the workspace
 
 

@@ -25,7 +25,7 @@ Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]  # vertices (n, 3) [m
 
 GREY: Rgb = (176, 182, 190)  # colour of shapes without their own
 SHARP_ANGLE = np.radians(35.0)  # larger angles are drawn as edges; tuned by eye on real arms
-_MAX_SMOOTHED_FACES = 150_000  # of larger meshes, a search for edges would take seconds
+_MAX_SMOOTHED_FACES = 150_000  # to find the edges of larger meshes would take seconds
 
 
 def shape_colour(shape: Shape) -> Rgb:
@@ -121,7 +121,7 @@ _LIGHT: Literal["studio"] = "studio"  # environment map of viser: soft boxes in 
 _LIGHT_INTENSITY, _KEY_INTENSITY = 0.35, 0.75
 """Factor on the environment map, and intensity of the light that casts shadows; tuned by eye, so
 that white robots keep their edges."""
-_KEY_POSITION = (0.9, -1.0, 2.4)  # of the light with shadows: above the camera's shoulder
+_KEY_POSITION = (0.9, -1.0, 2.4)  # the light with shadows is above the camera's shoulder
 _GRID: Rgb = (150, 157, 166)  # visible on light and on dark backgrounds
 _SHADOW_OPACITY = 0.3
 _FADE = 5.0  # distance at which the ground has faded, in sizes of what stands on it

@@ -1,7 +1,7 @@
-"""Mesh files for shapes of an MJCF that have none: vertices in the document, and ellipsoids.
+"""Compile an MJCF within limits, and write mesh files for its shapes that have none.
 
-The files are kept in the user's cache under a hash of their content, because a robot names its
-meshes by their files.
+Such shapes are vertices in the document, and ellipsoids. The files are kept in the user's cache
+under a hash of their content, because a robot names its meshes by their files.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from morphgen.model.scene_files import MAX_COORDINATE, MAX_FACES
 _REFUSALS = (ValueError, mujoco.FatalError)  # exceptions by which MuJoCo refuses a document
 MAX_CONVEX_FACES = 50_000
 """Largest number of triangles of a mesh whose inertia is that of its convex hull."""
-_FEWEST = 4  # smallest number of vertices of a convex hull that MuJoCo accepts
+_FEWEST_HULL_VERTICES = 4  # smallest number of vertices of a convex hull that MuJoCo accepts
 _ARRAYS = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "dof_damping", "dof_frictionloss", "key_qpos"),
@@ -75,7 +75,8 @@ def compile_document(
                 )
             asset = spec.mesh(name)
             if asset.inertia != mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX:
-                asset.maxhullvert = _FEWEST  # the hull, which a robot does not have, takes long
+                # No robot uses this hull, and a full one takes long.
+                asset.maxhullvert = _FEWEST_HULL_VERTICES
             elif len(triangles.faces) > MAX_CONVEX_FACES:
                 raise document.error(
                     f"mesh {name!r} has inertia convex and {len(triangles.faces)} triangles; at "
@@ -90,8 +91,9 @@ def compile_document(
     # MuJoCo compiles NaN and numbers whose products overflow.
     for array in _ARRAYS:
         values = getattr(model, array)
-        if not (np.abs(values) <= MAX_NUMBER).all():
-            worst = values[~(np.abs(values) <= MAX_NUMBER)][0]
+        bad = ~(np.abs(values) <= MAX_NUMBER)  # not `>`, which is False for NaN
+        if bad.any():
+            worst = values[bad][0]
             raise document.error(
                 f"{array} of the compiled model has the value {worst:g}; expected numbers up to "
                 f"{MAX_NUMBER:g}"
