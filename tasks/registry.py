@@ -28,7 +28,8 @@ COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry
 CHANNELS = (
     *KINEMATIC_CHANNELS,
     *("velocity", "previous_action", "tree", "points", "no_state"),
-)  # channels of observations that can be asked for by name; `no_state` hides what it names
+)
+"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
 
 
 class Named(Protocol):
@@ -42,7 +43,8 @@ class Named(Protocol):
 T = TypeVar("T", bound=Named)
 _RESERVED = frozenset(
     {"tokens", "links", "actions", "velocity", "previous_action", "tool", "points", "obstacles"}
-)  # entries of observations that are no fields of tasks
+)
+"""Entries of observations that are no fields of tasks."""
 
 
 class Registry(Generic[T]):
@@ -181,7 +183,8 @@ TASKS: Registry[Task[Any, Any]] = Registry(
     "morphgen.tasks",
     {"reach": "morphgen.tasks.reach.task:REACH", "push": "morphgen.tasks.push.task:PUSH"},
     _require_task,
-)  # Tasks; see `morphgen.tasks.task.Task`
+)
+"""Tasks; see ``morphgen.tasks.task.Task``."""
 SIMULATORS: Registry[Simulator] = Registry(
     "simulator",
     "morphgen.simulators",
@@ -191,7 +194,8 @@ SIMULATORS: Registry[Simulator] = Registry(
         "warp": "morphgen.tasks.sim.warp_sim:SIMULATOR",
         "kinematic": "morphgen.tasks.sim.kinematic:SIMULATOR",
     },
-)  # Simulators; see `morphgen.tasks.sim.base.Simulator`
+)
+"""Simulators; see ``morphgen.tasks.sim.base.Simulator``."""
 DEFAULT_SIMULATOR = "mujoco"
 """Simulator to use unless one is named. Every installation has it, so that a command gives the same
 episodes everywhere."""

@@ -100,9 +100,7 @@ class RobotPage:
     q: Array  # independent joint positions, shape (dof,) [rad or m]
     sliders: list[viser.GuiSliderHandle[float]] = field(default_factory=list)
     """Sliders in the order of q."""
-    slider_scales: list[float] = field(
-        default_factory=list
-    )  # units per unit of q: 57.3 for degrees
+    slider_scales: list[float] = field(default_factory=list)  # slider's unit per unit of q
     slider_values: list[float] = field(default_factory=list)  # values when last read or set
     slider_box: viser.GuiFolderHandle | None = None  # holds the folders of sliders
     slider_folders: list[viser.GuiFolderHandle] = field(default_factory=list)
