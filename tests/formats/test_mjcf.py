@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.mjcf import inertia_in_mujoco
 from helpers.robots import arm, rod
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf.write import FLAT_THICKNESS, mjcf_text, to_spec
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import movable_positions
-from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Inertial, Joint, Link, Robot
 
 
 def no_file(mesh):
@@ -44,12 +44,9 @@ def test_inertias_keep_their_digits():
     link = Link("bead", Inertial.from_matrix(0.0123456789, (0.1, 0.2, 1 / 3), matrix))
     model = compiled(hinged(link))
     body = model.body("bead")
-    R = np.empty(9)
-    mujoco.mju_quat2Mat(R, body.iquat)
-    R = R.reshape(3, 3)
     assert body.mass[0] == pytest.approx(0.0123456789, rel=1e-9)
     assert body.ipos == pytest.approx((0.1, 0.2, 1 / 3), abs=1e-9)
-    assert R @ np.diag(body.inertia) @ R.T == pytest.approx(matrix, abs=1e-6 * 3e-8)
+    assert inertia_in_mujoco(model, "bead") == pytest.approx(matrix, abs=1e-6 * 3e-8)
 
 
 def test_the_spec_equals_the_text():
@@ -87,55 +84,6 @@ def test_continuous_and_unlimited_joints_have_no_range():
         assert model.jnt_limited.tolist() == [0]
         assert model.actuator_ctrllimited.tolist() == [0]
         assert model.actuator_forcelimited.tolist() == [0]
-
-
-def test_home_is_a_keyframe_with_mimic_joints_that_the_actuators_hold():
-    robot = arm()
-    model = compiled(robot)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
-    assert data.ctrl == pytest.approx(robot.home)
-    for k, q in zip(robot.movable_joints, movable_positions(robot, robot.home), strict=True):
-        assert data.joint(robot.joints[k].name).qpos[0] == pytest.approx(q)
-    model.opt.gravity[:] = 0
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    for _ in range(200):
-        mujoco.mj_step(model, data)
-    assert data.ctrl == pytest.approx([data.joint(robot.joints[k].name).qpos[0] for k in
-                                       robot.independent_joints], abs=1e-3)  # fmt: skip
-
-
-def test_the_keyframe_of_a_branching_robot_has_the_joint_order_of_mujoco():
-    links = tuple(rod(name) for name in ("root", "left", "right", "left_tip", "right_tip"))
-    joints = tuple(
-        Joint(child, "revolute", parent, child, Pose((x, 0, 0.3)), (0, 1, 0), (-2.0, 2.0))
-        for parent, child, x in (
-            ("root", "left", -0.2),
-            ("root", "right", 0.2),
-            ("left", "left_tip", 0.0),
-            ("right", "right_tip", 0.0),
-        )
-    )
-    robot = Robot("tree", links, joints, home=(0.1, 0.2, 0.3, 0.4))
-    model = compiled(robot)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    assert [data.joint(j.name).qpos[0] for j in joints] == pytest.approx(robot.home)
-    assert [data.actuator(j.name).ctrl[0] for j in joints] == pytest.approx(robot.home)
-
-
-def test_mimic_joints_follow_through_chains():
-    links = tuple(rod(name) for name in "abcd")
-    limits = {"limits": (-2.0, 2.0)}
-    joints = (
-        Joint("lead", "revolute", "a", "b", **limits),
-        Joint("follow", "revolute", "b", "c", mimic=Mimic("lead", -0.5, 0.2), **limits),
-        Joint("last", "revolute", "c", "d", mimic=Mimic("follow", 2.0, 0.1), **limits),
-    )
-    model = compiled(Robot("chain", links, joints, home=(0.4,)))
-    assert model.neq == 2
-    assert {model.joint(i).name for i in model.eq_obj2id.tolist()} == {"lead"}
-    assert model.eq_data[:, :3] == pytest.approx(np.array([[0.2, -0.5, 0], [0.5, -1.0, 0]]))
 
 
 def test_a_root_named_world_is_the_world_body():
@@ -197,10 +145,12 @@ def test_meshes_with_the_same_file_stem_have_unique_names(tmp_path):
     assert to_spec(single("body", visuals=tuple(shapes))).compile().nmesh == 2
 
 
-def test_flat_visual_meshes_compile(flat):
+def test_flat_visual_meshes_compile(flat, tmp_path):
     assert to_spec(meshed(flat, collision=False)).compile().nmeshface == 2
     written = mjcf_text(meshed(flat, collision=False), lambda mesh: str(mesh.path))
     assert mujoco.MjModel.from_xml_string(written).nmeshface == 2
+    triangle = export(trimesh.Trimesh(np.eye(3), [[0, 1, 2]]), tmp_path / "triangle.stl")
+    assert to_spec(meshed(triangle, collision=False)).compile().nmesh == 1
 
 
 def test_flat_collision_meshes_get_a_thickness(flat):
@@ -208,12 +158,6 @@ def test_flat_collision_meshes_get_a_thickness(flat):
     written = mujoco.MjModel.from_xml_string(mjcf_text(robot, no_file))
     for model in (written, to_spec(robot).compile()):
         assert min(np.ptp(model.mesh_vert, axis=0)) == pytest.approx(FLAT_THICKNESS, rel=1e-3)
-
-
-def test_a_mesh_of_one_triangle_compiles(tmp_path):
-    path = tmp_path / "triangle.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
-    assert to_spec(meshed(path, collision=False)).compile().nmesh == 1
 
 
 @pytest.mark.slow

@@ -6,8 +6,9 @@ from importlib.resources import files
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
-from helpers.mjcf import read, write
+from helpers.mjcf import inertia_in_mujoco, read, write
 from morphgen.errors import MeshError
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.mjcf.read import read_mjcf
@@ -47,17 +48,18 @@ def mujoco_support(model, geom):
     return (points @ directions().T).max(axis=0)
 
 
-def assert_as_in_mujoco(robot, path):
-    """Compare mass, inertia and the support function of all meshes of a robot of one link."""
-    model = mujoco.MjModel.from_xml_path(str(path))
+def assert_mass_as_in_mujoco(robot, model):
     inertial = robot.root.inertial
     assert inertial.mass == pytest.approx(model.body_mass[1])
     np.testing.assert_allclose(inertial.com, model.body_ipos[1], atol=1e-9)
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, model.body_iquat[1])
-    R = R.reshape(3, 3)
-    expected = R @ np.diag(model.body_inertia[1]) @ R.T
+    expected = inertia_in_mujoco(model, 1)
     np.testing.assert_allclose(inertial.matrix, expected, atol=1e-6 * model.body_inertia[1].max())
+
+
+def assert_as_in_mujoco(robot, path):
+    """Compare mass, inertia and the support function of all meshes of a robot of one link."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert_mass_as_in_mujoco(robot, model)
     meshes = [s for s in robot.root.collisions if isinstance(s.geometry, Mesh)]
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     geoms = np.flatnonzero(is_mesh & (model.geom_contype > 0))
@@ -88,6 +90,27 @@ def test_vertices_in_the_document_become_files_of_the_bundle(tmp_path):
     names = {file.name.rpartition("-")[0] for file in (bundle / "meshes").iterdir()}
     assert names == {"cloud_1", "faces"}
     assert_as_in_mujoco(read_bundle(bundle), bundle / "robot.xml")
+
+
+def test_mesh_files_lie_where_mujoco_has_them(tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
+    box.apply_translation((0.5, -0.2, 0.1))
+    (tmp_path / "meshes").mkdir()
+    box.export(tmp_path / "meshes" / "box.stl")
+    path = write(
+        tmp_path,
+        """<compiler meshdir="meshes"/><asset>
+          <mesh file="box.stl" scale="1 2 -1" refpos="0.1 0.2 0.3"/>
+          <mesh name="turned" file="box.stl" scale="2 2 2" refpos="0 1 0" refquat="1 1 0 0"/>
+        </asset><worldbody><body name="base">
+          <geom type="mesh" mesh="box" pos="0.1 0.2 0.3" euler="10 20 30"/>
+          <geom type="mesh" mesh="turned" pos="0 0 1" euler="0 0 30"/>
+        </body></worldbody>""",
+    )
+    robot = read_mjcf(path)
+    assert_as_in_mujoco(robot, path)
+    assert robot.root.collisions[0].geometry.scale == (1.0, 2.0, -1.0)
 
 
 def test_the_same_vertices_have_the_same_file(tmp_path, cache):
@@ -176,19 +199,7 @@ def test_an_ellipsoid_is_a_convex_mesh_of_its_volume_and_keeps_its_mass(tmp_path
     T = egg.T_link_shape.matrix
     exact = np.linalg.norm(directions() @ T[:3, :3] * radii, axis=1) + directions() @ T[:3, 3]
     assert np.abs(shape_support(egg) - exact).max() < 0.012 * radii.max()
-    # The inertia about the body's origin is that of the solids, not of the mesh.
-    masses = np.array((500 * volume, 1000 * 4 / 3 * np.pi * 0.1**3))
-    squares = np.stack([radii**2, np.full(3, 0.01)])
-    inertia = np.zeros((3, 3))
-    for mass, square, R, p in zip(
-        masses, squares, (T[:3, :3], np.eye(3)), (T[:3, 3], np.zeros(3)), strict=True
-    ):
-        inertia += R @ np.diag(mass / 5 * (square.sum() - square)) @ R.T
-        inertia += mass * (p @ p * np.eye(3) - np.outer(p, p))
-    inertial = robot.root.inertial
-    com = np.array(inertial.com)
-    at_origin = inertial.matrix + inertial.mass * (com @ com * np.eye(3) - np.outer(com, com))
-    assert inertial.mass == pytest.approx(masses.sum())
-    np.testing.assert_allclose(at_origin, inertia, rtol=1e-6, atol=1e-9)
+    # The mass and the inertia are those of the solids, not of the meshes.
+    assert_mass_as_in_mujoco(robot, mujoco.MjModel.from_xml_path(str(path)))
     (finding,) = robot.source_findings
     assert (finding.code, finding.where) == ("ellipsoid-mesh", "robot.xml: geom 'egg'")

@@ -3,21 +3,20 @@
 import mujoco
 import numpy as np
 import pytest
-import trimesh
 
 from helpers.composed import composed
 from helpers.mjcf import TWO_JOINTS, read, refusal, write
-from helpers.robots import arm
+from helpers.robots import arm, rod
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.mjcf.write import mjcf_text
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Sphere
+from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Sphere
 from morphgen.model.kinematics import (
     forward_kinematics,
     movable_positions,
     random_configurations,
 )
-from morphgen.model.mesh import load_mesh
+from morphgen.model.robot import Joint, Robot
 
 
 def positions(robot, q):
@@ -54,6 +53,17 @@ def assert_poses_agree(robot, path, seed=0):
                 continue
             np.testing.assert_allclose(T[:3, 3], data.site(frame.name).xpos, atol=1e-9)
             np.testing.assert_allclose(T[:3, :3].ravel(), data.site(frame.name).xmat, atol=1e-9)
+
+
+def assert_held_as_in_mujoco(robot, path, qpos):
+    """Compare the centres of mass at home with those of MuJoCo at a configuration."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    for T, link in zip(forward_kinematics(robot, robot.home), robot.links, strict=True):
+        com = T @ [*link.inertial.com, 1]
+        np.testing.assert_allclose(com[:3], data.body(link.name).xipos, atol=1e-12)
 
 
 def assert_same(robot, other):
@@ -108,11 +118,22 @@ def assert_same_poses(robot, other):
             )
 
 
-def test_written_arm_with_a_mimic_joint_reads_the_same(tmp_path):
-    robot = arm()
-    path = tmp_path / "arm.xml"
-    path.write_text(mjcf_text(robot, lambda mesh: ""), encoding="utf-8")
-    assert_same(robot, read_mjcf(path))
+def branching():
+    """A tree whose joints are in another order than MuJoCo's, which is depth first."""
+    places = {"left": ("root", -0.2), "right": ("root", 0.2), "left_tip": ("left", 0.0)}
+    links = tuple(rod(name) for name in ("root", *places, "right_tip"))
+    joints = tuple(
+        Joint(child, "revolute", parent, child, Pose((x, 0, 0.3)), (0, 1, 0), (-2.0, 2.0))
+        for child, (parent, x) in {**places, "right_tip": ("right", 0.0)}.items()
+    )
+    return Robot("tree", links, joints, home=(0.1, 0.2, 0.3, 0.4))
+
+
+@pytest.mark.parametrize("make", [arm, branching])
+def test_written_robots_read_the_same(make, tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(mjcf_text(make(), lambda mesh: ""), encoding="utf-8")
+    assert_same(make(), read_mjcf(path))
 
 
 @pytest.mark.parametrize(
@@ -189,41 +210,6 @@ def test_defaults_degrees_and_several_joints_of_a_body_agree_with_mujoco(tmp_pat
     assert (tool.link, tool.T_link_frame) == ("tip", robot.frame("grip_site").T_link_frame)
 
 
-def test_meshes_lie_where_mujoco_has_them(tmp_path):
-    box = trimesh.creation.box((0.1, 0.2, 0.3))
-    box.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
-    box.apply_translation((0.5, -0.2, 0.1))
-    (tmp_path / "meshes").mkdir()
-    box.export(tmp_path / "meshes" / "box.stl")
-    path = write(
-        tmp_path,
-        """
-        <compiler meshdir="meshes"/>
-        <asset>
-          <mesh file="box.stl" scale="1 2 -1" refpos="0.1 0.2 0.3"/>
-          <mesh name="turned" file="box.stl" scale="2 2 2" refpos="0 1 0" refquat="1 1 0 0"/>
-        </asset>
-        <worldbody><body name="base">
-          <geom type="mesh" mesh="box" pos="0.1 0.2 0.3" euler="10 20 30"/>
-          <geom type="mesh" mesh="turned" pos="0 0 1" euler="0 0 30"/>
-        </body></worldbody>""",
-    )
-    robot = read_mjcf(path)
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    for geom, shape in enumerate(robot.root.collisions):
-        mesh = model.mesh(model.geom_dataid[geom])
-        vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
-        in_world = vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-        assert isinstance(shape.geometry, Mesh)
-        T = shape.T_link_shape.matrix
-        own = load_mesh(shape.geometry).vertices @ T[:3, :3].T + T[:3, 3]
-        distances = np.linalg.norm(own[:, None] - in_world[None], axis=2).min(axis=1)
-        assert distances.max() < 1e-6
-    assert robot.root.collisions[0].geometry.scale == (1.0, 2.0, -1.0)
-
-
 def test_visual_and_collision_geoms_are_told_apart(tmp_path):
     robot = read(
         tmp_path,
@@ -276,12 +262,8 @@ def test_joint_equalities_become_mimic_and_fixed_joints(tmp_path):
     assert robot.home == (0.5,)
     assert robot.ignore_pairs == (("left", "right"),)
     assert robot.joints[0].effort == 6.0
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    data.joint("c").qpos[0] = 0.3 + 0.4
-    mujoco.mj_kinematics(model, data)
-    held = forward_kinematics(robot, robot.home)[3] @ [*robot.link("held").inertial.com, 1]
-    np.testing.assert_allclose(held[:3], data.body("held").xipos, atol=1e-12)
+    follower = 0.1 + 0.5 - 2 * (0.5 - 0.2)  # from its reference, as the leader
+    assert_held_as_in_mujoco(robot, path, (0.5, follower, 0.3 + 0.4))
 
 
 def test_fixed_tendon_of_two_joints_held_by_an_equality_is_a_mimic(tmp_path):
@@ -306,14 +288,7 @@ def test_joint_that_follows_a_held_joint_is_held(tmp_path):
     )
     robot = read_mjcf(path)
     assert robot.dof == 0
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    data.qpos[:] = (0.3, 0.7)
-    mujoco.mj_kinematics(model, data)
-    T_root_link = forward_kinematics(robot, robot.home)
-    for i in (1, 2):
-        com = T_root_link[i] @ [*robot.links[i].inertial.com, 1]
-        np.testing.assert_allclose(com[:3], data.body(robot.links[i].name).xipos, atol=1e-12)
+    assert_held_as_in_mujoco(robot, path, (0.3, 0.7))
 
 
 def test_free_base_becomes_the_root(tmp_path):

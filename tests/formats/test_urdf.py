@@ -9,10 +9,9 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_robot
 from morphgen.formats.rounding import format_number
-from morphgen.formats.urdf.read import UnsoundError, read_urdf, with_frames
+from morphgen.formats.urdf.read import UnsoundError, read_urdf
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
-from morphgen.model.kinematics import frame_pose, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
 
 
@@ -24,19 +23,6 @@ def written(robot, folder):
     path = folder / "robot.urdf"
     path.write_text(urdf_text(robot, no_mesh))
     return path
-
-
-def test_a_robot_round_trips_through_urdf(tmp_path):
-    robot = arm()
-    back = with_frames(read_urdf(written(robot, tmp_path)), ["tool"])
-    assert [link.name for link in back.links] == [link.name for link in robot.links]
-    assert [joint.name for joint in back.joints] == [joint.name for joint in robot.joints]
-    assert back.joints[-1].mimic == robot.joints[-1].mimic
-    assert back.joints[0].limits == robot.joints[0].limits
-    assert back.joints[0].effort == robot.joints[0].effort
-    assert back.mass == pytest.approx(robot.mass, rel=1e-11)
-    q = random_configurations(robot, 50, np.random.default_rng(0))
-    np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
 
 
 def text_file(folder, text):

@@ -38,6 +38,7 @@ def urdf(base="", tip="", more="", origin="", com=""):
 
 def reading(text: str, folder: Path, **options: bool) -> Robot:
     path = folder / "r.urdf"
+    folder.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return read(path, **options)
 
@@ -154,22 +155,33 @@ def mesh_file(path):
 def test_meshes_of_an_unknown_package_are_found_around_the_file(tmp_path, uri, folder, root):
     home = tmp_path / "a" / "b"
     mesh = mesh_file(home / folder / "a.stl")
-    path = home / "r.urdf"
-    path.write_text(urdf(base=MESH.format(uri)))
-    robot = read(path, root=None if root is None else home / root)
+    root = None if root is None else home / root
+    robot = reading(urdf(base=MESH.format(uri)), home, root=root)
     assert robot.links[0].visuals[0].geometry.path.samefile(mesh)
     assert codes(robot) == ["mesh-beside"]
 
 
-@pytest.mark.parametrize("rest", ["../secret/a.stl", "../../secret/a.stl", "%2e%2e/secret/a.stl"])
-def test_meshes_of_an_unknown_package_do_not_leave_the_files_folders(tmp_path, rest):
-    mesh_file(tmp_path / "secret" / "a.stl")
+@pytest.mark.parametrize(
+    ("uri", "folder"),
+    [
+        ("package://unknown/../secret/a.stl", None),
+        ("package://unknown/../../secret/a.stl", None),
+        ("package://unknown/%2e%2e/secret/a.stl", None),
+        ("package://unknown/link/a.stl", None),
+        ("a.stl", "{secret}"),
+        ("a.stl", "../../secret"),
+        ("a.stl", "link"),
+    ],
+)
+def test_meshes_do_not_leave_the_files_folders(tmp_path, uri, folder):
+    """By the path in an unknown package, or by MuJoCo's folder of meshes."""
+    secret = mesh_file(tmp_path / "secret" / "a.stl").parent
     home = tmp_path / "a" / "b"
     home.mkdir(parents=True)
-    (home / "link").symlink_to(tmp_path / "secret")
-    for uri in (f"package://unknown/{rest}", "package://unknown/link/a.stl"):
-        with pytest.raises(FormatError):
-            reading(urdf(base=MESH.format(uri)), home)
+    (home / "link").symlink_to(secret)
+    compiler = f'<mujoco><compiler meshdir="{folder}"/></mujoco>'.format(secret=secret)
+    with pytest.raises(FormatError):
+        reading(urdf(base=MESH.format(uri), more=compiler if folder else ""), home)
 
 
 @pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", None])
@@ -187,10 +199,8 @@ def test_a_mesh_of_an_installed_package_is_a_finding_and_on_the_card(
         (share / package / "package.xml").write_text(manifest)
         monkeypatch.setenv(variable, str(tmp_path / "site"))
     home = tmp_path / "mine"
-    home.mkdir()
     path = home / "r.urdf"
-    path.write_text(urdf(base=MESH.format(f"package://{package}/{rest}")))
-    robot = read(path)
+    robot = reading(urdf(base=MESH.format(f"package://{package}/{rest}")), home)
     assert codes(robot) == ["mesh-from-package"]
     assert str(robot.links[0].visuals[0].geometry.path) in robot.source_findings[0].why
     assert main(["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"]) in (0, 1)
@@ -204,21 +214,15 @@ def test_a_mesh_of_an_installed_package_is_a_finding_and_on_the_card(
         assert codes(robot) == ["mesh-beside"]
 
 
-def missing_meshes(folder, uri):
-    mesh_file(folder / "here.stl")
-    path = folder / "r.urdf"
-    base = MESH.format(uri) * 2 + MESH.format("here.stl")
-    path.write_text(urdf(base=base, tip=MESH.format("gone.stl").replace("visual", "collision")))
-    return path
-
-
 @pytest.mark.parametrize(
     "uri", ["package://no/a.stl", "no/a.stl", "file:///no/a.stl", "../../a.stl"]
 )
 def test_missing_meshes_are_left_out_on_request(tmp_path, uri):
-    path = missing_meshes(tmp_path / "a" / "b", uri)
+    path = mesh_file(tmp_path / "a" / "b" / "here.stl").with_name("r.urdf")
+    base = MESH.format(uri) * 2 + MESH.format("here.stl")
+    text = urdf(base=base, tip=MESH.format("gone.stl").replace("visual", "collision"))
     with pytest.raises(FormatError):
-        read(path)
+        reading(text, path.parent)
     robot = read(path, skip_missing_meshes=True)
     assert [len(link.visuals) for link in robot.links] == [1, 0]
     assert robot.links[1].collisions == ()
@@ -249,18 +253,6 @@ def test_the_mesh_folder_of_mujoco_applies_to_a_urdf(tmp_path, compiler, uri, pl
     robot = reading(urdf(base=MESH.format(uri), more=more), home)
     assert robot.links[0].visuals[0].geometry.path.samefile(mesh)
     assert codes(robot) in ([], ["mesh-beside"])
-
-
-@pytest.mark.parametrize("folder", ["/secret", "../../secret", "link"])
-def test_the_mesh_folder_of_mujoco_does_not_leave_the_files_folders(tmp_path, folder):
-    mesh_file(tmp_path / "secret" / "a.stl")
-    home = tmp_path / "a" / "b"
-    home.mkdir(parents=True)
-    (home / "link").symlink_to(tmp_path / "secret")
-    place = f"{tmp_path}{folder}" if folder[0] == "/" else folder
-    more = f'<mujoco><compiler meshdir="{place}"/></mujoco>'
-    with pytest.raises(FormatError):
-        reading(urdf(base=MESH.format("a.stl"), more=more), home)
 
 
 def free(kind, parent, child):

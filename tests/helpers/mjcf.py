@@ -1,5 +1,7 @@
 """Write small MJCF files and read them."""
 
+import mujoco
+import numpy as np
 import pytest
 
 from morphgen.errors import FormatError
@@ -30,3 +32,11 @@ def refusal(folder, content, **kwargs):
     with pytest.raises(FormatError) as error:
         read(folder, content, **kwargs)
     return str(error.value).removeprefix(f"{folder / 'robot.xml'}: ")
+
+
+def inertia_in_mujoco(model, body):
+    """Return the inertia of a body about its centre of mass in the axes of the body, (3, 3)."""
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, model.body(body).iquat)
+    R = R.reshape(3, 3)
+    return R @ np.diag(model.body(body).inertia) @ R.T
