@@ -1,38 +1,71 @@
-"""Conduct of all simulations on the CPU: states, targets, resets, divergence, blocks and errors."""
+"""Conduct of all simulations on the CPU, which agree where the targets are the same."""
 
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.joint_targets import held
+from helpers.joint_targets import SECOND, held, smooth_walk
 from helpers.resets import reset_envs
-from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
-from helpers.simulators import PYBULLET
+from helpers.robots import finger
+from helpers.scenes import (
+    PAPER_ROBOTS,
+    mixed_scenes,
+    push_scene,
+    reach_scene,
+    real_arm_scene,
+    robot,
+)
+from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, joint_limits
+from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
 from morphgen.tasks.registry import SIMULATORS
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.base import (
+    CONTROL_PERIOD,
+    GRAVITY,
+    SUBSTEPS,
+    TIMESTEP,
+    Block,
+    Contacts,
+    Scene,
+)
+from morphgen.tasks.sim.motor_law import GAIN
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 ALL, WITH_CONTACTS = ("kinematic", "mujoco", PYBULLET), ("mujoco", PYBULLET)
 NOTHING_TOUCHES = Contacts(False, False)
 
 
 @pytest.fixture
-def load(sim, opened):
-    """Create simulations of scenes, reset to their homes."""
+def load_in(opened):
+    """Create simulations of scenes in a simulator, reset to their homes."""
 
-    def of(*scenes, contacts=None):
-        loaded = opened(SIMULATORS[sim].load(scenes, contacts, 1, torch.device("cpu")))
+    def of(name, *scenes, contacts=None):
+        loaded = opened(SIMULATORS[name].load(scenes, contacts, 1, torch.device("cpu")))
         put_home(loaded)
         return loaded
 
     return of
+
+
+@pytest.fixture
+def load(sim, load_in):
+    """Create simulations in the simulator of the test."""
+    return partial(load_in, sim)
+
+
+@pytest.fixture
+def load_both(load_in):
+    """Create simulations in MuJoCo and in PyBullet."""
+    return lambda *args, **options: [
+        load_in(name, *args, **options) for name in ("mujoco", "pybullet")
+    ]
 
 
 @pytest.fixture
@@ -275,3 +308,153 @@ def test_a_block_without_mass_stays_where_a_reset_puts_it(load):
     held(sim, 20)
     torch.testing.assert_close(sim.block_pose, pose)
     assert not sim.block_velocity.any()
+
+
+SOME = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3", "prims", "chain beads=2")
+
+
+@needs_pybullet
+@pytest.mark.parametrize(
+    "words", [*SOME, *(pytest.param(words, marks=pytest.mark.slow) for words in PAPER_ROBOTS)]
+)
+def test_tool_paths_agree_in_free_space(load_both, words):
+    body = robot(words)
+    home = frame_pose(body, body.home)[:3, 3]
+    for seed in range(3):
+        paths = []
+        for sim in load_both(Scene(body, ground=None), contacts=NOTHING_TOUCHES):
+            path = []
+            for target in torch.from_numpy(smooth_walk(body, seed)).float():
+                sim.step(target[None])
+                path.append(sim.q[0].double().numpy().copy())
+            paths.append(frame_pose(body, np.array(path))[:, :3, 3])
+        apart = np.linalg.norm(paths[0] - paths[1], axis=1)
+        assert apart.max() < 0.01, f"seed {seed}: {1e3 * apart.max():.1f} mm"
+        assert np.linalg.norm(paths[0] - home, axis=1).max() > 0.05
+
+
+def assert_blocks_agree(sims):
+    ends = [sim.block_pose[0] for sim in sims]
+    assert (ends[0][:3] - ends[1][:3]).norm() < 0.02
+    assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
+
+
+@needs_pybullet
+@pytest.mark.parametrize(
+    ("edge", "mass", "turn"),
+    [(0.15, 0.1, (0, 0, 0.4)), (0.15, 0.1, (0.2, 0.1, 0.0)), (0.06, 0.5, (0.0, 0.3, 1.0))],
+)
+def test_dropped_blocks_come_to_rest_at_the_same_pose(load_both, edge, mass, turn):
+    start = Pose.from_xyz_rpy((0.3, -0.4, edge + 0.05), turn)
+    sims = load_both(Scene(robot("prims"), Pose((5, 0, 0)), Block((edge,) * 3, start, mass)))
+    for sim in sims:
+        held(sim, 2 * SECOND)
+        assert sim.block_velocity.abs().max() < 0.01
+        assert sim.block_pose[0, 2].item() == pytest.approx(edge / 2, abs=1e-3)
+    assert_blocks_agree(sims)
+
+
+@needs_pybullet
+@pytest.mark.parametrize("friction", [0.5, 1.0])
+@pytest.mark.parametrize("aside", [0.0, 0.03])
+def test_pushed_blocks_move_the_same_distance(load_both, friction, aside):
+    """The gantry's vertical plate pushes the block at 0.2 m/s without touching the ground."""
+    scene = replace(push_scene(friction=friction), obstacles=())
+    body = replace(scene.robot, home=(aside, -0.2, 0.62, np.pi / 2, 0.0))
+    sims = load_both(replace(scene, robot=body))
+    for sim in sims:
+        target = sim.q.clone()
+        for _ in range(2 * SECOND):
+            target[0, 1] += 0.2 * CONTROL_PERIOD
+            sim.step(target)
+    assert sims[0].block_pose[0, 1] > 0.2
+    assert_blocks_agree(sims)
+
+
+EDGE = 0.08
+
+
+def pushed(load, block_mass, speed, way, finger_mass=2.0):
+    """Return the simulation, and rows of the lag of the finger, rise and tilt of the block."""
+    block = Block((EDGE, EDGE, EDGE), Pose((0.0, 0.0, EDGE / 2)), block_mass)
+    body = replace(finger(finger_mass), home=(-EDGE / 2 - 0.011, 0.3 * EDGE))
+    sim, rows = load(Scene(body, block=block)), []
+    q = sim.q.clone()
+    for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
+        q[:, 0] += speed * CONTROL_PERIOD
+        sim.step(q)
+        _, _, z, _, x, y, _ = sim.block_pose[0].tolist()
+        tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
+        rows.append((float(q[0, 0] - sim.q[0, 0]), z - EDGE / 2, tilt))
+    return sim, np.array(rows)
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+@pytest.mark.parametrize(("block_mass", "finger_mass"), [(3.0, 2.0), (6.0, 2.0), (6.0, 4.0)])
+def test_finger_deflection_matches_its_stiffness(load, block_mass, finger_mass):
+    speed = 0.02
+    _, rows = pushed(load, block_mass, speed, 0.06, finger_mass)
+    deflection = block_mass * GRAVITY / (GAIN * BANDWIDTH**2 * (finger_mass + 0.2))
+    free = 2 * speed / BANDWIDTH
+    assert rows[len(rows) // 2 :, 0].mean() == pytest.approx(free + deflection, rel=0.35)
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_pushed_block_stays_on_the_ground(load):
+    sim, rows = pushed(load, 0.1, 0.3, 0.25)
+    assert sim.block_pose[0, 1] > 0.2
+    assert rows[:, 1].max() < 1e-3
+    assert np.degrees(rows[:, 2].max()) < 3
+
+
+ARM = "arm=arm3 ee=claw"
+
+
+@pytest.mark.parametrize(
+    ("request_", "roll", "count"),
+    [(ARM, 0.0, 2), (ARM, 0.1, 1), ("arm=ur5 ee=plane", 0.0, None), ("planar_arm", 0.0, None)],
+)
+def test_level_links_have_constant_height_and_tilt(request_, roll, count):
+    body, T_world_root = robot(request_), Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0))
+    drawn = np.random.default_rng(0).uniform(*joint_limits(body).T, (9, body.dof))
+    T_world_link = T_world_root.matrix @ np.array([forward_kinematics(body, q) for q in drawn])
+    moved = np.ptp(T_world_link[:, :, 2], axis=0).max(axis=1)
+    steady = {link.name for link, by in zip(body.links, moved, strict=True) if by < 1e-9}
+    assert ground_contact_links(body, T_world_root) == steady
+    assert count is None or len(steady) == count
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_turntable_on_the_ground_does_not_disturb_the_arm(load):
+    """The disc of arm3 rests on the ground and no joint changes its height."""
+    block = Block((0.1, 0.1, 0.1), Pose((0.0, -0.7, 0.05)), mass=0.1)
+    bodies = [
+        replace(robot(ARM), home=(turn, *robot(ARM).home[1:]))
+        for turn in np.linspace(0.2, 2.0, 16).tolist()
+    ]
+    paths = []
+    for contacts in (Contacts(self_collision=False), NOTHING_TOUCHES):
+        sim, path = load(*(Scene(body, block=block) for body in bodies), contacts=contacts), []
+        turned = sim.q.clone()
+        for _ in range(15):
+            turned[:, 0] += 0.05
+            turned[:, 3] -= 0.03
+            sim.step(turned)
+            path.append(sim.q.clone())
+        paths.append(torch.stack(path))
+    torch.testing.assert_close(*paths, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_links_on_a_turntable_collide_with_obstacles(load):
+    """The horizontally stretched arm is stopped by a post."""
+    body = robot("arm=arm3 ee=claw arm.length=0.3")
+    body = replace(body, home=(body.home[0], 0.0, 0.0, 0.0, *body.home[4:]))
+    post = Block((0.05, 0.05, 0.4), Pose((0.25, 0.35, 0.2)))
+    for obstacles in ((), (post,)):
+        sim = load(Scene(body, obstacles=obstacles), contacts=Contacts(self_collision=False))
+        turned = sim.q.clone()
+        for _ in range(39):
+            turned[0, 0] = min(float(turned[0, 0]) + 0.05, 3.1)
+            sim.step(turned)
+        assert (sim.q[0, 0] > 3.0) == (not obstacles)
