@@ -1,6 +1,7 @@
 """Paths of joint targets for comparisons of simulators."""
 
 import numpy as np
+import torch
 
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN
@@ -55,3 +56,11 @@ def held(sim, steps):
     for _ in range(steps):
         sim.step(q)
     return sim
+
+
+def drive(sim, steps=25, seed=0):
+    """Step with random targets that do not depend on an environment's index."""
+    start = sim.q.clone()
+    for k in range(steps):
+        change = np.random.default_rng([seed, k]).uniform(-0.3, 0.3, 32)
+        sim.step(start + torch.from_numpy(change).float()[: start.shape[1]])

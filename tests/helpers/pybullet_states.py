@@ -4,7 +4,7 @@ import numpy as np
 import pybullet
 import torch
 
-from helpers.resets import reset_envs
+from helpers.resets import homes, reset_envs, state
 
 PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 """The gantry's plate upright behind the block, off the ground."""
@@ -12,14 +12,11 @@ PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 
 def starts(simulation):
     """Return start states at home or behind the block, with blocks at their scene poses."""
-    q = torch.zeros_like(simulation.q)
-    pose = torch.zeros_like(simulation.block_pose)
+    q, poses = homes(simulation)
     for env, scene in enumerate(simulation.scenes):
-        values = PUSHING if scene.block and scene.robot.name == "prims" else scene.robot.home
-        q[env, : scene.robot.dof] = torch.tensor(values)
-        if scene.block:
-            pose[env] = torch.tensor([*scene.block.pose.position, *scene.block.pose.quaternion])
-    return q, pose
+        if scene.block and scene.robot.name == "prims":
+            q[env, : len(PUSHING)] = torch.tensor(PUSHING)
+    return q, poses
 
 
 def reset(simulation, q=None, pose=None, envs=None):
@@ -34,12 +31,6 @@ def reset(simulation, q=None, pose=None, envs=None):
 def client_of(simulation, env=0):
     """The PyBullet client of an environment."""
     return simulation._local_batches[0]._loaded[env]
-
-
-def state(simulation):
-    """Return copies of all reported state."""
-    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
-    return torch.cat(parts, dim=1).clone()
 
 
 def wander(simulation, q, steps, seed=0, size=0.03, ahead=0.0):

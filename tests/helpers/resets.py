@@ -1,4 +1,4 @@
-"""Resets of some environments of a simulation, by their indices."""
+"""Resets of some environments of a simulation, and its state."""
 
 import torch
 
@@ -18,3 +18,26 @@ def reset_envs(simulation, envs, q, block_pose=None, obstacle_poses=None):
     block_pose = torch.zeros(len(rows), 7) if block_pose is None else block_pose
     obstacles = () if obstacle_poses is None else (of_all(obstacle_poses),)
     simulation.reset(mask, of_all(q), of_all(block_pose), *obstacles)
+
+
+def homes(simulation):
+    """Return the joint positions at home and the poses of the blocks, (n, J) and (n, 7)."""
+    q, poses = torch.zeros_like(simulation.q), torch.zeros_like(simulation.block_pose)
+    for env, scene in enumerate(simulation.scenes):
+        q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
+        if scene.block is not None:
+            poses[env] = torch.tensor((*scene.block.pose.position, *scene.block.pose.quaternion))
+    return q, poses
+
+
+def put_home(simulation, envs=None):
+    """Reset all environments, or some of them, to their homes."""
+    envs = list(range(len(simulation.scenes)) if envs is None else envs)
+    q, poses = homes(simulation)
+    reset_envs(simulation, envs, q[envs], poses[envs])
+
+
+def state(simulation):
+    """Return copies of all reported state, a row for each environment."""
+    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
+    return torch.cat(parts, dim=1).clone()

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from helpers.commands import heed_ctrl_c
+from helpers.resets import state
 from helpers.robots import arm, finger
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError
@@ -32,7 +33,7 @@ from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
-from helpers.pybullet_states import PUSHING, client_of, reset, state, touching, wander
+from helpers.pybullet_states import PUSHING, client_of, reset, touching, wander
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
 from morphgen.tasks.sim.bullet_batch import FRICTION, OVERSPEED
@@ -494,12 +495,9 @@ def test_joint_forces_of_an_arm_are_coupled():
     np.testing.assert_allclose(limits(body, error), wanted, rtol=1e-12)
 
 
-def test_force_is_zero_at_rest_and_never_exceeds_the_effort():
+def test_force_is_zero_at_rest_and_limited_by_effort_and_speed_limit():
     assert (limits(finger(), 0.0) == 0).all()
     assert (limits(finger(), 0.05, effort=3.0) == 3).all()
-
-
-def test_position_error_is_limited_by_the_speed_limit():
     fast = 2.0
     assert (limits(finger(), 50.0) == limits(finger(), LAG * fast)).all()
 

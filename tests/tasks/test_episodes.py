@@ -9,11 +9,9 @@ import torch
 import morphgen
 from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
-from helpers.resets import reset_envs
 from helpers.scenes import robot
 from helpers.stub_simulation import StubSimulation
 from morphgen.errors import TaskError
-from morphgen.model.geometry import Pose
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.ik import InverseKinematics
@@ -29,8 +27,6 @@ from morphgen.tasks.render.renderer import render_state
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim import base
-from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 REACH = ReachConfig(num_goals=6, max_episode_steps=9, train_layouts=3, eval_layouts=1)
 PUSH = PushConfig(num_goals=6, max_episode_steps=11, train_layouts=3, eval_layouts=1)
@@ -270,17 +266,6 @@ MANY_REACH = ReachConfig(num_goals=20, train_layouts=4, eval_layouts=2)
 MANY_PUSH = PushConfig(num_goals=20, train_layouts=4, eval_layouts=2)
 
 
-def in_pybullet(scenes):
-    """Create a PyBullet simulation; skip the test where PyBullet is missing."""
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
-    from morphgen.tasks.sim.bullet import BulletSimulation
-
-    return BulletSimulation(scenes)
-
-
-SIMULATIONS = {"mujoco": lambda scenes: MujocoSimulation(scenes), "pybullet": in_pybullet}
-
-
 @pytest.fixture(scope="module")
 def layout_specs(cache):
     arm, gantry = robot("arm3"), robot("prims")
@@ -366,58 +351,6 @@ def _distance(points, box):
     T = box.pose.inverse().matrix
     local = np.abs(points @ T[:3, :3].T + T[:3, 3]) - np.array(box.size) / 2
     return np.abs(local.max(axis=1))
-
-
-@pytest.mark.parametrize("name", SIMULATIONS)
-def test_a_simulated_robot_meets_obstacles_where_they_were_moved(name):
-    """A cube with edges of 0.11 m on slides moves towards a wall."""
-    wall = Block((0.1, 1.0, 1.0), Pose((5.0, 0.0, 0.5)))
-    scene = Scene(robot("cubes"), obstacles=(wall,))
-    simulation = SIMULATIONS[name]([scene] * 2)
-    zeros, q = torch.zeros(2, 7), torch.zeros(2, 2)
-    near, far = (torch.tensor([[[x, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]]]) for x in (0.4, 5.0))
-
-    def positions():
-        for _ in range(60):
-            simulation.step(torch.tensor([[0.9, 0.0]] * 2))
-        return simulation.q[:, 0].tolist()
-
-    both = [0, 1]
-    reset_envs(simulation, both, q, zeros, torch.cat([near, far]))
-    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
-    reset_envs(simulation, both, q, zeros)  # obstacles stay
-    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
-    reset_envs(simulation, [1], q[1:], zeros[1:], near)
-    reset_envs(simulation, [0], q[:1], zeros[:1], far)
-    assert positions() == pytest.approx([0.9, 0.295], abs=0.01)
-    with pytest.raises(ValueError, match="obstacles"):
-        simulation.reset(torch.ones(2, dtype=torch.bool), q, zeros, near)
-    with pytest.raises(ValueError, match="obstacles"):
-        reset_envs(simulation, both, q, zeros, torch.full((2, 1, 7), np.nan))
-    simulation.close()
-
-
-@pytest.mark.parametrize("name", SIMULATIONS)
-def test_a_moved_obstacle_gives_the_bits_of_a_loaded_one(name):
-    """A cube on slides pushes a block against a turned wall."""
-    pose = Pose.from_xyz_rpy((0.5, 0.25, 0.125), (0.0, 0.0, 0.5))
-    here, there = (Block((0.125, 0.5, 0.25), p) for p in (pose, Pose((0.5, 4.0, 0.125))))
-    block = Block((0.125, 0.125, 0.125), Pose((0.25, 0.25, 0.0625)), mass=0.1)
-    scenes = [Scene(robot("cubes"), block=block, obstacles=(box,)) for box in (here, there)]
-    loaded, moved = (SIMULATIONS[name]([scene]) for scene in scenes)
-    row = np.array([*pose.position, *pose.quaternion], np.float32)
-    poses, start = torch.from_numpy(row)[None, None], torch.tensor([[0.0, 0.25]])
-    block_pose = torch.tensor([[0.25, 0.25, 0.0625, 1.0, 0.0, 0.0, 0.0]])
-    for simulation in (loaded, moved):
-        reset_envs(simulation, [0], start, block_pose, poses)
-    for step in range(50):
-        for simulation in (loaded, moved):
-            simulation.step(torch.tensor([[0.02 * step, 0.25]]))
-    assert torch.equal(loaded.q, moved.q)
-    assert torch.equal(loaded.block_pose, moved.block_pose)
-    assert loaded.block_pose[0, 0] > 0.3
-    for simulation in (loaded, moved):
-        simulation.close()
 
 
 def test_baselines_plan_around_the_current_obstacles(build_layouts, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.audit import audit
+from morphgen.model.geometry import Pose
 from morphgen.tasks.goals.goal_audit import NEAR, audit_goals, with_goal_findings
 from morphgen.tasks.goals.split_goals import SplitGoals, sample_split_goals
 from morphgen.tasks.push.config import PushConfig
@@ -251,15 +252,8 @@ def test_single_nearby_goal_of_the_same_robot_is_a_leak(cache):
     def shifted_codes(by, turned=0.0):
         poses[2] = goal
         poses[2, 0] += by
-        half = turned / 2
-        w, x, y, z = goal[3:]
-        spin = np.array([np.cos(half), np.sin(half), 0, 0])
-        poses[2, 3:] = [
-            w * spin[0] - x * spin[1],
-            x * spin[0] + w * spin[1],
-            y * spin[0] + z * spin[1],
-            z * spin[0] - y * spin[1],
-        ]
+        spin = Pose.from_xyz_rpy(rpy=(turned, 0.0, 0.0))
+        poses[2, 3:] = (Pose(quaternion=tuple(goal[3:])) @ spin).quaternion
         wrong = changed(sets, ("test", "twin"), {"poses": poses})
         return [why for why in audit_reasons(which, wrong) if why.startswith("train robot")]
 

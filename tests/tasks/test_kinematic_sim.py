@@ -1,5 +1,6 @@
 """Kinematic simulation: agreement with MuJoCo, limits, and batches on the CPU and on a GPU."""
 
+import itertools
 from contextlib import closing
 from dataclasses import replace
 
@@ -77,20 +78,13 @@ def largest_tool_distance(body, a, b):
     return np.linalg.norm(tools[0] - tools[1], axis=1).max()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("words", PAPER_ROBOTS)
-def test_tools_of_the_papers_robots_stay_within_a_centimetre_of_mujoco(words):
-    body = robot(words)
-    for seed in range(3):
-        targets = random_walk(body, seed)
-        ours, mujoco = (
-            in_free_space(each, body, targets) for each in (KinematicSimulation, MujocoSimulation)
-        )
-        assert largest_tool_distance(body, ours, mujoco) < NEAR
-
-
-@pytest.mark.parametrize("words", ROBOTS)
-@pytest.mark.parametrize("path", [smooth_walk, full_speed])
+@pytest.mark.parametrize(
+    ("words", "path"),
+    [
+        *itertools.product(ROBOTS, (smooth_walk, full_speed)),
+        *(pytest.param(each, random_walk, marks=pytest.mark.slow) for each in PAPER_ROBOTS),
+    ],
+)
 def test_all_links_stay_within_a_centimetre_of_mujoco(words, path):
     body = robot(words)
     for seed in range(3):
@@ -100,7 +94,7 @@ def test_all_links_stay_within_a_centimetre_of_mujoco(words, path):
             for simulation in (KinematicSimulation, MujocoSimulation)
         )
         assert np.linalg.norm(ours - mujoco, axis=-1).max() < NEAR
-        assert np.linalg.norm(mujoco - mujoco[0], axis=-1).max() > 0.05
+        assert np.linalg.norm(mujoco - mujoco[0], axis=-1).max() > 3 * NEAR
 
 
 @pytest.mark.parametrize("words", ["cubes", MIXED])
@@ -185,7 +179,6 @@ def test_scenes_with_something_to_touch_are_refused(scene, thing):
     KinematicSimulation([reach_scene()], NO_CONTACTS)
 
 
-REVOLUTE, PRISMATIC = "arm=ur5 ee=plane", "prims"
 CONFIG = replace(ReachConfig(), num_goals=20)
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.joint_targets import held
-from helpers.resets import reset_envs
+from helpers.joint_targets import drive, held
+from helpers.resets import homes, put_home, reset_envs, state
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs, untested_pairs
@@ -32,32 +32,6 @@ from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
-OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
-
-
-def outputs(sim, env=0):
-    """Return the reported state of an environment without padding."""
-    dof = sim.scenes[env].robot.dof
-    return [
-        getattr(sim, name)[env, : dof if name.startswith("q") else None].clone() for name in OUTPUTS
-    ]
-
-
-def same_bits(a, b):
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def drive(sim, steps=25, seed=0):
-    """Step with random targets that do not depend on an environment's index."""
-    start = sim.q.clone()
-    for k in range(steps):
-        rng = np.random.default_rng([seed, k])
-        sim.step(start + torch.from_numpy(rng.uniform(-0.3, 0.3, 32)).float()[: start.shape[1]])
-
-
-def put_back(sim, envs, home):
-    q, pose = home
-    reset_envs(sim, envs, q[envs], pose[envs])
 
 
 def test_mimic_joints_root_poses_and_joint_order_are_kept():
@@ -80,7 +54,7 @@ def test_results_are_bit_identical_for_any_thread_count():
     for sim in (alone, *batches):
         drive(sim, 30)
     for batch in batches:
-        assert all(same_bits(outputs(batch, i), outputs(alone, i)) for i in range(15))
+        assert torch.equal(state(batch), state(alone))
         batch.close()
 
 
@@ -111,19 +85,18 @@ def test_contact_overflow_affects_only_its_environment(monkeypatch, memory, word
 
     monkeypatch.setattr(mujoco_model, "_robot_spec", cramped)
     sim = MujocoSimulation([push_scene(), push_scene()], threads=2)
-    home = sim.q.clone(), sim.block_pose.clone()
+    q, inside = homes(sim)
     held(sim, 3)
-    inside = home[1].clone()
     inside[1, :3] = torch.tensor([0.5, 0.2, 0.02])  # in an obstacle and the ground
-    put_back(sim, [0, 1], (home[0], inside))
-    assert sim.step(home[0]).tolist() == [False, True]
+    reset_envs(sim, [0, 1], q, inside)
+    assert sim.step(q).tolist() == [False, True]
     (fault,) = sim.faults().values()
     assert re.match(rf"environment 1 \(robot 'prims'.*{words}", fault)
     assert "\n" not in fault
-    put_back(sim, [0, 1], home)
+    put_home(sim)
     held(sim, 3)
     alone = held(MujocoSimulation([push_scene()]), 3)
-    assert same_bits(outputs(sim, 1), outputs(alone))
+    assert torch.equal(state(sim)[1], state(alone)[0])
 
 
 @pytest.mark.parametrize(("value", "words"), [(0.0, "not a pose of a block"), (math.nan, "reset")])

@@ -16,7 +16,6 @@ from morphgen.errors import CompositionError, FormatError, PartError, TaskError
 from morphgen.formats.fits import has_meshes
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import default_library
-from morphgen.model.geometry import Mesh
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.scenes.make import make_batch, make_split_batch, with_geometry
@@ -118,12 +117,9 @@ def test_names_are_compose_arguments(given, words):
 
 
 def test_collision_shapes_are_primitives_by_default():
-    def has_meshes(robot):
-        shapes = (shape for link in robot.links for shape in link.collisions)
-        return any(isinstance(shape.geometry, Mesh) for shape in shapes)
-
-    assert not has_meshes(load_robot("ur5-plane"))
-    assert has_meshes(load_robot("ur5-plane", geometry="mesh"))
+    for given, expected in (({}, False), ({"geometry": "mesh"}, True)):
+        links = load_robot("ur5-plane", **given).links
+        assert any(has_meshes(link.collisions) for link in links) is expected
 
 
 def test_robot_files_are_read(tmp_path, monkeypatch):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.joint_targets import SECOND, held, smooth_walk
-from helpers.resets import reset_envs
+from helpers.joint_targets import SECOND, drive, held, smooth_walk
+from helpers.resets import homes, put_home, reset_envs, state
 from helpers.robots import finger
 from helpers.scenes import (
     PAPER_ROBOTS,
@@ -74,35 +74,6 @@ def scenes(sim):
     if SIMULATORS[sim].simulates_contacts:
         return mixed_scenes()
     return [replace(scene, block=None, obstacles=()) for scene in mixed_scenes()]
-
-
-def homes(sim):
-    """Return the joint positions at home, and the poses of the blocks in their scenes."""
-    q, poses = torch.zeros_like(sim.q), torch.zeros(len(sim.scenes), 7)
-    for env, scene in enumerate(sim.scenes):
-        q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
-        if scene.block is not None:
-            poses[env] = torch.tensor((*scene.block.pose.position, *scene.block.pose.quaternion))
-    return q, poses
-
-
-def put_home(sim, envs=None):
-    """Reset all environments, or some of them, to their homes."""
-    envs = list(range(len(sim.scenes)) if envs is None else envs)
-    q, poses = homes(sim)
-    reset_envs(sim, envs, q[envs], poses[envs])
-
-
-def state(sim):
-    return torch.cat([sim.q, sim.qd, sim.block_pose, sim.block_velocity], dim=1).clone()
-
-
-def drive(sim, steps=25, seed=0):
-    """Step with random targets that do not depend on an environment's index."""
-    start = homes(sim)[0]
-    for k in range(steps):
-        change = np.random.default_rng([seed, k]).uniform(-0.3, 0.3, 32)
-        sim.step(start + torch.from_numpy(change).float()[: start.shape[1]])
 
 
 def break_physics(sim, env):
@@ -458,3 +429,52 @@ def test_links_on_a_turntable_collide_with_obstacles(load):
             turned[0, 0] = min(float(turned[0, 0]) + 0.05, 3.1)
             sim.step(turned)
         assert (sim.q[0, 0] > 3.0) == (not obstacles)
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_a_simulated_robot_meets_obstacles_where_they_were_moved(load):
+    """A cube with edges of 0.11 m on slides moves towards a wall."""
+    wall = Block((0.1, 1.0, 1.0), Pose((5.0, 0.0, 0.5)))
+    scene = Scene(robot("cubes"), obstacles=(wall,))
+    simulation = load(scene, scene)
+    zeros, q = torch.zeros(2, 7), torch.zeros(2, 2)
+    near, far = (torch.tensor([[[x, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]]]) for x in (0.4, 5.0))
+
+    def positions():
+        for _ in range(60):
+            simulation.step(torch.tensor([[0.9, 0.0]] * 2))
+        return simulation.q[:, 0].tolist()
+
+    both = [0, 1]
+    reset_envs(simulation, both, q, zeros, torch.cat([near, far]))
+    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
+    reset_envs(simulation, both, q, zeros)  # obstacles stay
+    assert positions() == pytest.approx([0.295, 0.9], abs=0.01)
+    reset_envs(simulation, [1], q[1:], zeros[1:], near)
+    reset_envs(simulation, [0], q[:1], zeros[:1], far)
+    assert positions() == pytest.approx([0.9, 0.295], abs=0.01)
+    with pytest.raises(ValueError, match="obstacles"):
+        simulation.reset(torch.ones(2, dtype=torch.bool), q, zeros, near)
+    with pytest.raises(ValueError, match="obstacles"):
+        reset_envs(simulation, both, q, zeros, torch.full((2, 1, 7), np.nan))
+
+
+@pytest.mark.parametrize("sim", WITH_CONTACTS)
+def test_a_moved_obstacle_gives_the_bits_of_a_loaded_one(load):
+    """A cube on slides pushes a block against a turned wall."""
+    pose = Pose.from_xyz_rpy((0.5, 0.25, 0.125), (0.0, 0.0, 0.5))
+    here, there = (Block((0.125, 0.5, 0.25), p) for p in (pose, Pose((0.5, 4.0, 0.125))))
+    block = Block((0.125, 0.125, 0.125), Pose((0.25, 0.25, 0.0625)), mass=0.1)
+    scenes = [Scene(robot("cubes"), block=block, obstacles=(box,)) for box in (here, there)]
+    loaded, moved = (load(scene) for scene in scenes)
+    row = np.array([*pose.position, *pose.quaternion], np.float32)
+    poses, start = torch.from_numpy(row)[None, None], torch.tensor([[0.0, 0.25]])
+    block_pose = torch.tensor([[0.25, 0.25, 0.0625, 1.0, 0.0, 0.0, 0.0]])
+    for simulation in (loaded, moved):
+        reset_envs(simulation, [0], start, block_pose, poses)
+    for step in range(50):
+        for simulation in (loaded, moved):
+            simulation.step(torch.tensor([[0.02 * step, 0.25]]))
+    assert torch.equal(loaded.q, moved.q)
+    assert torch.equal(loaded.block_pose, moved.block_pose)
+    assert loaded.block_pose[0, 0] > 0.3

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from helpers.joint_targets import SECOND, smooth_walk
+from helpers.resets import homes, put_home
 from helpers.scenes import ball, push_scene, robot
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.geometry import Box, Pose, Shape
@@ -22,7 +23,6 @@ import warp as wp
 
 from morphgen.tasks.batch import StepGraph
 from morphgen.tasks.sim import warp_sim
-from morphgen.tasks.sim import warp_sim as warp_group
 from morphgen.tasks.sim.warp_sim import WarpSimulation, structures
 
 if not torch.cuda.is_available():  # kernels of a GPU are tested as users run them
@@ -42,12 +42,6 @@ def walks(scenes, joints, seed=0):
     for i, scene in enumerate(scenes):
         targets[:, i, : scene.robot.dof] = smooth_walk(scene.robot, seed + i)
     return torch.from_numpy(targets)
-
-
-def block_poses(scenes):
-    """Return the poses of the blocks of scenes, shape (n, 7)."""
-    poses = [scene.block.pose if scene.block else Pose() for scene in scenes]
-    return torch.tensor([(*pose.position, *pose.quaternion) for pose in poses])
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +156,10 @@ def test_invalid_targets_are_reported_and_a_reset_repairs(sim):
 
 
 def test_contacts_that_do_not_fit_are_reported(monkeypatch):
-    monkeypatch.setattr(warp_group, "max_contacts", lambda num_shapes: 0)
+    monkeypatch.setattr(warp_sim, "max_contacts", lambda num_shapes: 0)
     scenes = [push_scene()]
     sim = simulation(scenes)
-    sim.reset(torch.tensor([True]), sim.q.clone(), block_poses(scenes))
+    put_home(sim)
     assert sim.step(sim.q).tolist() == [True]
     assert "do not fit" in sim.faults()[0]
     assert sim.counts[0, 1] == 1
@@ -177,11 +171,11 @@ def test_a_solver_that_stops_at_its_last_iteration_has_not_diverged(aside):
     sim = simulation(scenes)
     (group,) = sim._groups
     group.model.opt.iterations, group.model.opt.tolerance = 1, wp.zeros(1, dtype=float)
-    poses = block_poses(scenes)
+    q, poses = homes(sim)
     poses[0, 0] += aside
-    sim.reset(torch.tensor([True]), sim.q.clone(), poses)
+    sim.reset(torch.tensor([True]), q, poses)
     assert not sim.step(sim.q).any()
-    assert group.data.overflow.numpy()[0] & warp_group.OverflowType.ITERATIONS
+    assert group.data.overflow.numpy()[0] & warp_sim.OverflowType.ITERATIONS
     assert sim.faults() == {}
     assert sim.counts.tolist() == [[0, 0]]
 
@@ -230,7 +224,7 @@ def test_a_reset_moves_obstacles_and_blocks_without_mass():
     scene = push_scene()
     fixed = replace(scene, block=replace(scene.block, mass=0.0))
     sim = simulation([scene, fixed])
-    assert torch.allclose(sim.block_pose, block_poses([scene, fixed]))
+    assert torch.allclose(sim.block_pose, homes(sim)[1])
     poses = torch.tensor([[[-2.0, 0.0, 0.3, 1, 0, 0, 0], [2.0, 0.2, 0.1, 1, 0, 0, 0]]] * 2)
     block = torch.tensor([[2.0, 0.2, 0.4, 1.0, 0, 0, 0], [0.1, 0.2, 0.3, 0.0, 0, 0, -1.0]])
     sim.reset(torch.tensor([True, True]), sim.q.clone(), block, poses)
