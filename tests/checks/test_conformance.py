@@ -326,67 +326,58 @@ def file_rows(path):
 
 NO_BASE = ("joins the base to the world, without its mass",)
 KILOGRAM = ("gives links without inertia 1 kg and 1 kg m^2",)
+COUNTS = ("counts the inertia of links without mass",)
+TURNED = "reads a range in the wrong order as none"
+ZERO_RANGE = ("reads a range that is missing as 0 to 0",)
 IMPOSSIBLE = '<inertia ixx="0.01" iyy="0.02" izz="0.05" ixy="0" ixz="0" iyz="0"/>'
 MASSLESS = f'<inertial><mass value="0"/>{INERTIA}</inertial>'
 TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
+NO_RANGE = '<limit effort="5" velocity="1"/>'
 
 
+# changes of the pendulum; causes of PyBullet, of MuJoCo, and of both others
 @pytest.mark.parametrize(
-    ("changes", "causes"),
+    ("changes", "pybullet", "mujoco", "others"),
     [
-        ({}, {"pybullet": KILOGRAM, "mujoco (urdf)": NO_BASE}),
-        ({"tip": TIP, "base": ""}, {"pybullet": KILOGRAM}),
+        ({}, KILOGRAM, NO_BASE, {}),
+        ({"tip": TIP, "base": ""}, KILOGRAM, (), {}),
         (
             {"tip": TIP, "bar": ""},
-            {
-                "pybullet": KILOGRAM,
-                "mujoco (urdf)": (
-                    "gives links without inertia that of their shapes, of 1000 kg/m^3",
-                    *NO_BASE,
-                ),
-            },
+            KILOGRAM,
+            ("gives links without inertia that of their shapes, of 1000 kg/m^3", *NO_BASE),
+            {},
         ),
         (
             {"tip": TIP, "bar": IMPOSSIBLE},
-            {
-                "pybullet": ("sets inertia that no body has to zero",),
-                "mujoco (urdf)": ("refuses inertia that no body has",),
-            },
+            ("sets inertia that no body has to zero",),
+            ("refuses inertia that no body has",),
+            {},
         ),
-        (
-            {"tip": MASSLESS},
-            {
-                "pybullet": ("counts the inertia of links without mass",),
-                "pinocchio": ("counts the inertia of links without mass",),
-                "mujoco (urdf)": NO_BASE,
-            },
-        ),
+        ({"tip": MASSLESS}, COUNTS, NO_BASE, {"pinocchio": COUNTS}),
         (
             {"tip": TIP, "kind": "continuous"},
-            {
-                "pybullet": ("limits continuous joints that name a range",),
-                "mujoco (urdf)": NO_BASE,
-            },
+            ("limits continuous joints that name a range",),
+            NO_BASE,
+            {},
         ),
         (
-            {"tip": TIP, "limit": '<limit effort="5" velocity="1"/>'},
-            {
-                "pinocchio": ("reads a range that is missing as 0 to 0",),
-                "usd": ("reads a range that is missing as 0 to 0",),
-                "mujoco (urdf)": NO_BASE,
-            },
+            {"tip": TIP, "limit": NO_RANGE},
+            (),
+            NO_BASE,
+            {"pinocchio": ZERO_RANGE, "usd": ZERO_RANGE},
         ),
         (
             {"tip": TIP, "limit": LIMIT.replace("1", "0", 2)},
-            {"mujoco (urdf)": (*NO_BASE, "reads a range of 0 to 0 as none")},
+            (),
+            (*NO_BASE, "reads a range of 0 to 0 as none"),
+            {},
         ),
         *(
             (
                 {"tip": TIP, "kind": kind, "limit": LIMIT.replace('"-1" upper="1"', turned)},
-                {
-                    "pybullet": ("reads a range in the wrong order as none",),
-                    "mujoco (urdf)": (*NO_BASE, "reads a range in the wrong order as none"),
-                },
+                (TURNED,),
+                (*NO_BASE, TURNED),
+                {},
             )
             for kind, turned in (
                 ("revolute", '"1" upper="-1"'),
@@ -396,11 +387,12 @@ TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
         ),
     ],
 )
-def test_what_a_loader_does_with_a_file_is_named(changes, causes, tmp_path):
-    rows = file_rows(pendulum(tmp_path, **changes))
-    for loader, row in rows.items():
-        assert (row.passed, row.causes) == (loader not in causes, causes.get(loader, ())), row
-        assert bool(row.message) is (loader in causes)
+def test_what_a_loader_does_with_a_file_is_named(changes, pybullet, mujoco, others, tmp_path):
+    causes = {"pybullet": pybullet, "mujoco (urdf)": mujoco, **others}
+    for loader, row in file_rows(pendulum(tmp_path, **changes)).items():
+        expected = causes.get(loader, ())
+        assert (row.passed, row.causes) == (not expected, expected), row
+        assert bool(row.message) is bool(expected)
         assert not row.is_unexplained
 
 

@@ -1,5 +1,6 @@
 """Loading meshes: formats, units, colours, caching, convex hulls and errors."""
 
+import importlib.metadata
 import os
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.mesh import MeshPart, convex_hull, load_mesh, mesh_parts
 from morphgen.model.robot import Link, Robot
 
+DATA = Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
 
 
@@ -28,13 +30,6 @@ def box(tmp_path):
     path = tmp_path / "box.stl"
     trimesh.creation.box((0.2, 0.4, 0.6)).export(path)
     return path
-
-
-@pytest.fixture
-def data():
-    import importlib.metadata
-
-    return Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
 
 
 @pytest.mark.parametrize("suffix", ["stl", "ascii.stl", "STL", "obj", "ply", "glb", "dae"])
@@ -91,20 +86,19 @@ def test_relative_paths_follow_the_working_directory(tmp_path, monkeypatch):
         assert load_mesh(Mesh(Path("m.stl"))).extents[0] == pytest.approx(size)
 
 
-def test_collada_units_are_applied_once(tmp_path):
-    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.001")))
-    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [0.001, 0.002, 0.003]], atol=1e-12)
-
-
-@pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
-def test_the_up_axis_of_collada_is_ignored(up, tmp_path):
-    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", up=up)))
-    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [1, 2, 3]])
-
-
-def test_the_scene_graph_is_applied_in_the_files_units(tmp_path):
-    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.1", shift="10 0 0")))
-    np.testing.assert_allclose(mesh.bounds, [[1, 0, 0], [1.1, 0.2, 0.3]], atol=1e-12)
+@pytest.mark.parametrize(
+    ("asset", "bounds"),
+    [
+        ({"unit": "0.001"}, [[0, 0, 0], [0.001, 0.002, 0.003]]),
+        ({"unit": "0.1", "shift": "10 0 0"}, [[1, 0, 0], [1.1, 0.2, 0.3]]),
+        *(({"up": up}, [[0, 0, 0], [1, 2, 3]]) for up in ("X_UP", "Y_UP", "Z_UP")),
+    ],
+)
+def test_units_of_collada_are_applied_once_also_to_its_scene_and_its_up_axis_is_not(
+    asset, bounds, tmp_path
+):
+    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", **asset)))
+    np.testing.assert_allclose(mesh.bounds, bounds, atol=1e-12)
 
 
 def test_a_file_has_one_part_per_colour(tmp_path):
@@ -136,38 +130,11 @@ def test_triangles_without_area_are_dropped(tmp_path):
     path = tmp_path / "m.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\nf 1 1 2\n")
     assert load_mesh(Mesh(path)).faces.shape == (1, 3)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "reason"),
-    [
-        ("junk.stl", b"\x00\xff" * 300, "truncated or not STL"),
-        ("junk.dae", b"<COLLADA", "not a readable dae"),
-        ("junk.glb", b"glTF\x02\x00", "not a readable glb"),
-        (
-            "flat.obj",
-            b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n",
-            "none of its 1 triangles has an area",
-        ),
-        ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "not finite"),
-        ("inf.obj", b"v 1e999 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "not finite"),
-        ("a.step", b"x", "valid: .dae"),
-    ],
-)
-def test_an_unreadable_file_is_an_error_that_names_it(name, content, reason, tmp_path):
-    path = tmp_path / name
-    path.write_bytes(content)
-    for read in (lambda: load_mesh(Mesh(path)), lambda: mesh_parts(path)):
-        with pytest.raises(MeshError) as caught:
+    flat = tmp_path / "flat.obj"
+    flat.write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    for read in (lambda: load_mesh(Mesh(flat)), lambda: mesh_parts(flat)):
+        with pytest.raises(MeshError, match=rf"{flat}: none of its 1 triangles has an area"):
             read()
-        assert str(path) in str(caught.value)
-        assert reason in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(MeshError, match=r"lost\.stl: no such file"):
-        load_mesh(Mesh(tmp_path / "lost.stl"))
 
 
 @pytest.mark.parametrize("scale", [(0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0)])
@@ -195,18 +162,15 @@ def test_a_flat_mesh_has_no_hull(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])
-def test_y_up_visuals_of_the_kinova_match_its_stls(part, data):
-    meshes = data / "kinova_description" / "meshes"
-    assert "Y_UP" in (meshes / f"{part}.dae").read_text()
-    np.testing.assert_allclose(
-        load_mesh(Mesh(meshes / f"{part}.dae")).bounds,
-        load_mesh(Mesh(meshes / f"{part}.STL")).bounds,
-        atol=1e-3,
-    )
+def test_y_up_visuals_of_the_kinova_match_its_stls(part):
+    path = DATA / "kinova_description" / "meshes" / f"{part}.dae"
+    assert "Y_UP" in path.read_text()
+    visual, collision = load_mesh(Mesh(path)), load_mesh(Mesh(path.with_suffix(".STL")))
+    np.testing.assert_allclose(visual.bounds, collision.bounds, atol=1e-3)
 
 
-def test_the_kr210_visual_in_inches_has_the_size_of_its_collision(data):
-    meshes = data / "kuka_description" / "kuka_kr210" / "meshes" / "kr210l150"
+def test_the_kr210_visual_in_inches_has_the_size_of_its_collision():
+    meshes = DATA / "kuka_description" / "kuka_kr210" / "meshes" / "kr210l150"
     visual = load_mesh(Mesh(meshes / "visual" / "link_2.dae"))
     collision = load_mesh(Mesh(meshes / "collision" / "link_2.stl"))
     np.testing.assert_allclose(sorted(visual.extents), sorted(collision.extents), atol=1e-3)

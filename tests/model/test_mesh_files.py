@@ -387,9 +387,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
         gltf(extensionsRequired=["KHR_draco_mesh_compression"]),
         "requires the extension KHR_draco_mesh_compression, which is not read",
     ),
-    "meshopt.gltf": (
-        gltf(extensionsRequired=["EXT_meshopt_compression"]), "extension EXT_meshopt_compression"
-    ),
     "normalised.gltf": (accessor(0, normalized=True), "normalised integers"),
     "sixteen.dae": (dae().encode("utf-16"), "expected UTF-8"),
     "seven.dae": ('<?xml version="1.0" encoding="UTF-7"?>' + dae()[38:], "encoding 'utf-7'"),
@@ -443,12 +440,13 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     # the true reason
     "empty.stl": (b"", "the file is empty"),
-    "empty.glb": (b"", "the file is empty"),
+    "junk.glb": (b"glTF\x02\x00", "does not begin as a binary glTF file"),
+    "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
+    "inf.obj": (b"v 1e999 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
+    "a.step": (b"x", "cannot read '.step' meshes; valid: .dae"),
     "pointer.stl": (LFS, "the file is a Git LFS pointer; run 'git lfs pull'"),
-    "pointer.dae": (LFS, "the file is a Git LFS pointer"),
     "page.obj": (b"<!DOCTYPE html>\n<html></html>", "the file is a web page"),
     "other.stl": (b"glTF" + bytes(100), "the file has the content of a .glb file; rename it"),
-    "other.obj": (ascii_stl([0]).encode(), "the file has the content of a .stl file"),
     "other.ply": (dae().encode(), "the file has the content of a .dae file"),
     "cut.stl": (binary_stl()[:200], "4 triangles, which take 284 bytes, and the file has 200"),
     "short.stl": (binary_stl()[:60], "60 bytes; a binary STL file has at least 84"),

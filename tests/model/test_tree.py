@@ -78,41 +78,6 @@ def test_an_unknown_link_is_an_error():
             scale_links(arm(), *arguments)
 
 
-FACES = {"upper": (0.02, 0.0, -0.1), "slider": (0.0, 0.01, 0.05)}
-
-
-def face_positions(robot, factors, q):
-    """Return the faces of links in the root frame, as points of the links and of their parents."""
-    T = forward_kinematics(robot, q)
-    before = forward_kinematics(arm(), np.zeros(4))
-    for name, face in FACES.items():
-        i = robot.link_index[name]
-        j = robot.parents[i]
-        T_parent_link = np.linalg.inv(before[j]) @ before[i]
-        on_parent = (T_parent_link @ (*face, 1.0))[:3]
-        parent = robot.links[j].name
-        yield (
-            (T[i] @ (*(factors.get(name, 1.0) * np.array(face)), 1.0))[:3],
-            (T[j] @ (*(factors.get(parent, 1.0) * on_parent), 1.0))[:3],
-        )
-
-
-def test_faces_stay_in_contact_with_the_parent():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        names = [link.name for link in arm().links if rng.random() < 0.8]
-        factors = {name: rng.uniform(0.5, 1.5) for name in names}
-        robot = scale_links(arm(), factors, FACES)
-        for on_link, on_parent in face_positions(robot, factors, STRAIGHT):
-            assert on_link == pytest.approx(on_parent, abs=1e-12)
-
-
-def test_equal_factors_need_no_faces():
-    factors = dict.fromkeys((link.name for link in arm().links), 1.3)
-    assert scale_links(arm(), factors, FACES).joints == scale_links(arm(), factors).joints
-    assert scale_links(arm(), {}, FACES).joints == arm().joints
-
-
 AB, FIXED = (Link("a"), Link("b")), Joint("j", "fixed", "a", "b")
 
 
