@@ -202,12 +202,16 @@ def test_accepting_one_finding_accepts_no_other():
     assert not report.passed()
 
 
-def test_accepting_an_absent_finding_is_a_warning():
+def test_accepting_an_absent_finding_is_a_warning_also_in_plain_data():
     report = audit(combined(accepted={"body-naer": "a typo"}), LIBRARY)
     (finding,) = report.findings
     assert (finding.code, finding.severity) == ("accepted-unused", "warning")
     assert finding.where == "accepted body-naer"
     assert report.passed()
+    data = report.as_dict()
+    assert data["split"] == "mine/some"
+    assert [each["code"] for each in data["findings"]] == ["accepted-unused"]
+    assert set(data["nearest"]["planar-plane"]) == set(MEASURES)
 
 
 @pytest.mark.slow
@@ -220,13 +224,6 @@ def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
         one = audit(example_split, LIBRARY)
     assert seen == [(i, 25) for i in range(1, 26)]  # 13 robots and 12 rows of comparisons
     assert audit(example_split, LIBRARY, jobs=2) == one
-
-
-def test_an_audit_converts_to_plain_data():
-    data = audit(combined(accepted={"x": "y"}), LIBRARY).as_dict()
-    assert data["split"] == "mine/some"
-    assert [each["code"] for each in data["findings"]] == ["accepted-unused"]
-    assert set(data["nearest"]["planar-plane"]) == set(MEASURES)
 
 
 def test_link_and_joint_counts_are_means_over_train_or_test():

@@ -179,16 +179,7 @@ def test_each_combination_is_held_out_once_before_any_is_repeated():
     assert train
 
 
-def test_an_impossible_hold_out_is_an_error_with_the_reason():
-    with pytest.raises(BenchmarkError) as caught:
-        chosen([cell("a", "x"), cell("a", "y")])
-    assert "0 of 1 test robots can be held out of 2 combinations" in str(caught.value)
-    assert "in one combination only: x, y" in str(caught.value)
-    square = [cell(arm, ee) for arm in "ab" for ee in "xy"]
-    with pytest.raises(
-        BenchmarkError, match=r"0 of 1 .* and at least 4 are left to train on; give"
-    ):
-        chosen(square, 1, 4)
+def test_a_task_that_only_one_robot_has_cannot_be_held_out():
     both = [cell("a", "x", task) for task in ("reach", "push")]
     with pytest.raises(BenchmarkError, match="the outermost at another task only"):
         chosen(both)

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.generate import RobotFactory, SplitRequest
+from morphgen.benchmark.generate import RobotFactory
 from morphgen.benchmark.hold_out import (
     held_out_parts,
     hold_out,
@@ -23,25 +24,19 @@ from morphgen.benchmark.split import Member, compose_member, split_id
 from morphgen.benchmark.split_file import parse_split, split_text
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 
-LIBRARY = default_library()
 ARMS = ("arm3", "arm5", "arm_ed", "lwr")
 EES = ("cube", "cylinder", "plane", "sphere", "stick")
 PRIMITIVE = f"arm={{{','.join(ARMS)}}} ee={{{','.join(EES)}}}"
 """Twenty robots without meshes, which are fast to compose."""
 
 
-def request(*train, test=1, **changes):
-    return SplitRequest("mine", train, test, **changes)
-
-
 def made(rules, *train, patterns=(PRIMITIVE,), grammars=(), **changes):
     """Return the largest split of a request."""
-    return hold_out(
-        request(*train, **changes), rules, LIBRARY, patterns=patterns, grammars=grammars
-    )[-1]
+    return hold_out(order(*train, **changes), rules, LIBRARY, patterns=patterns, grammars=grammars)[
+        -1
+    ]
 
 
 def part_counts(members, kind):
@@ -173,7 +168,7 @@ def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):
 @pytest.mark.slow
 def test_the_seed_gives_the_same_robots_in_any_number_of_processes():
     def splits(seed, jobs):
-        wanted = request(8, test=2, seed=seed)
+        wanted = order(8, test=2, seed=seed)
         return hold_out(wanted, ["ee=plane"], LIBRARY, patterns=[PRIMITIVE], jobs=jobs)
 
     assert splits(3, 1) == splits(3, 2)
@@ -181,7 +176,7 @@ def test_the_seed_gives_the_same_robots_in_any_number_of_processes():
 
 
 def test_nested_sizes_share_the_test_robots_and_train_all_their_parts():
-    small, large = hold_out(request(3, 6, test=2), ["ee=plane"], LIBRARY, patterns=[PRIMITIVE])
+    small, large = hold_out(order(3, 6, test=2), ["ee=plane"], LIBRARY, patterns=[PRIMITIVE])
     assert small.train == large.train[:3]
     assert small.test == large.test
     for each in (small, large):

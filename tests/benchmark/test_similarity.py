@@ -295,20 +295,6 @@ def test_the_samples_of_an_arm_do_not_depend_on_its_gripper():
     assert density_overlap(workspace(robot), workspace(other)) == pytest.approx(1, abs=1e-5)
 
 
-def test_overlaps_depend_less_on_the_number_of_samples_than_shared_cells():
-    requests = (LWR, "arm3", "arm5", "chain beads=3", "prims", "planar_arm")
-    robots = [morphgen.compose(request) for request in requests]
-    few, many = ([workspace(robot, n).density for robot in robots] for n in (32_768, 131_072))
-
-    def change(measure):
-        pairs = list(itertools.combinations(range(len(robots)), 2))
-        return np.mean([abs(measure(few[i], few[j]) - measure(many[i], many[j])) for i, j in pairs])
-
-    overlap = change(lambda a, b: np.minimum(a, b).sum())
-    assert overlap < 0.005
-    assert overlap < 0.3 * change(lambda a, b: ((a > 0) & (b > 0)).sum() / (a + b > 0).sum())
-
-
 def test_an_immobile_tool_is_an_error():
     with pytest.raises(BenchmarkError, match="no joint moves its tool, which is on link 'base'"):
         workspace(replace(arm(), frames=(Frame("tool", "base"),)))

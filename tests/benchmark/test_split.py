@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.faulty_robots import with_joint, with_link
 from helpers.robots import arm
 from helpers.splits import member
 from morphgen.benchmark.robot_hash import robot_hash
@@ -22,21 +23,12 @@ from morphgen.model.tree import rename
 LIBRARY = default_library()
 
 
-def with_link(robot, name, **changes):
-    return robot.with_links([replace(robot.link(name), **changes)])
-
-
 def visual(robot):
     return robot.link("upper").visuals[0]
 
 
 def with_inertial(robot, **changes):
     return with_link(robot, "upper", inertial=replace(robot.link("upper").inertial, **changes))
-
-
-def with_joint(robot, name, **changes):
-    joints = [replace(j, **changes) if j.name == name else j for j in robot.joints]
-    return replace(robot, joints=tuple(joints))
 
 
 def jittered(value, size, rng):

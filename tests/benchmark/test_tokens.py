@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import morphgen
 from helpers.robots import arm
 from helpers.tokens import arm_tokens, field_of, shapes_of
 from morphgen.benchmark.tokens import (
@@ -28,8 +27,6 @@ from morphgen.benchmark.tokens import (
     tokens_npz,
 )
 from morphgen.errors import BenchmarkError, RobotError
-from morphgen.fitting.token_shapes import token_shapes
-from morphgen.grammar.library import default_library
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
@@ -219,15 +216,6 @@ def test_the_page_documents_every_field():
         assert f"| {field.name} | {columns} | {field.content} |" in PAGE
 
 
-COMPOSED = (
-    "arm=ur5 ee=plane",
-    "arm=kinova_gen3 ee=robotiq_2f85",
-    "base=planar arm=lwr ee=stick",
-    "base=pedestal left.arm=ur5 left.ee=stick right.arm=lwr right.ee=cube",
-    "chain beads=3",
-    "arm3",
-)
-
 NUMBERS = st.floats(-2, 2)
 SIZES = st.floats(1e-4, 3)
 UNIT3 = st.tuples(NUMBERS, NUMBERS, NUMBERS).filter(lambda v: math.hypot(*v) > 0.1)
@@ -296,20 +284,6 @@ def test_decoded_robots_have_the_same_tokens(body):
         assert {name[4:] for name in shapes_of(back)} == {name[1:] for name in shapes}
         for name in ("geometry pose", "joint origin"):
             assert (field_of(token_array, name)[:, 3] >= 0).all()
-
-
-@pytest.mark.parametrize("request_", COMPOSED)
-def test_composed_robots_are_decoded(request_):
-    robot = morphgen.compose(request_)
-    shapes = token_shapes(robot, default_library().folders)
-    q = random_configurations(robot, 5, np.random.default_rng(0))
-    for token_array in tokens(robot, shapes, [*q, robot.home], max_links=40):
-        back = assert_read_back(token_array, max_links=40)
-        assert back.dof == len(robot.movable_joints)
-        assert len(back.frames) == 1
-    assert [tuple(value) for value in field_of(token_array, "joint axis")[1:]] == [
-        pytest.approx(joint.unit_axis if joint.is_movable else (0, 0, 0)) for joint in robot.joints
-    ]
 
 
 def test_decoded_robots_move_in_normalized_positions():

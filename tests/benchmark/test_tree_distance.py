@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,7 +20,7 @@ from morphgen.benchmark.similarity import (
 )
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import Joint, Link, Robot
-from morphgen.model.tree import scale_links
+from morphgen.model.tree import rename, scale_links
 
 BLOCK = Shape(Box((0.1, 0.2, 0.3)))
 AXES = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, 0.6, 0.8))
@@ -108,16 +107,6 @@ def test_the_distance_is_symmetric_and_zero_on_the_diagonal(a, b):
 def test_the_triangle_inequality(a, b, c):
     for measured in (edit_distance, normalised_distance):
         assert measured(a, c) <= measured(a, b) + measured(b, c) + 1e-12
-
-
-@given(trees(), trees(), trees())
-@settings(deadline=None)
-def test_the_costs_of_changes_insertions_and_deletions_are_a_metric(a, b, c):
-    costs, onwards, straight = change_costs(a, b), change_costs(b, c), change_costs(a, c)
-    np.testing.assert_allclose(change_costs(b, a), costs.T, atol=0)
-    assert (costs >= np.abs(a.weights[:, None] - b.weights) - 1e-12).all()
-    assert (costs <= np.minimum(a.weights[:, None] + b.weights, 1.0) + 1e-12).all()
-    assert (straight[:, None, :] <= costs[:, :, None] + onwards[None] + 1e-12).all()
 
 
 def test_the_distance_is_one_without_common_parts_and_zero_between_empty_trees():
@@ -232,14 +221,7 @@ def test_size_does_not_matter(factor):
 
 def test_names_do_not_matter():
     robot = arm()
-    links = {link.name: f"new_{link.name}" for link in robot.links}
-    other = replace(
-        robot,
-        links=tuple(replace(link, name=links[link.name]) for link in robot.links),
-        joints=tuple(
-            replace(joint, parent=links[joint.parent], child=links[joint.child])
-            for joint in robot.joints
-        ),
-        frames=(),
+    links, joints = (
+        {each.name: f"new_{each.name}" for each in kind} for kind in (robot.links, robot.joints)
     )
-    assert distance(robot, other) == 0.0
+    assert distance(robot, rename(robot, links, joints)) == 0.0

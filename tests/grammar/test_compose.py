@@ -216,30 +216,6 @@ def test_each_limb_has_one_tool_frame():
     assert robot.frame("tool").link == robot.frame("right_tool").link == "right_ee_plate"
 
 
-def test_both_hands_of_yumi_hold_a_gripper_and_the_right_one_is_the_tool():
-    robot = composed("arm=yumi left.ee=yumi_gripper right.ee=yumi_gripper")
-    assert robot.dof == 14 + 2
-    tools = {
-        name: frame_pose(robot, robot.home, name) for name in ("tool", "left_tool", "right_tool")
-    }
-    np.testing.assert_array_equal(tools["tool"], tools["right_tool"])
-    assert tools["left_tool"][1, 3] > 0.05 > -0.05 > tools["right_tool"][1, 3]
-    mirrored = tools["right_tool"][:3, 3] * [1, -1, 1]
-    assert tools["left_tool"][:3, 3] == pytest.approx(mirrored, abs=0.03)
-
-
-def test_a_plate_on_the_gantry_is_the_primitive_of_the_paper_and_points_down():
-    robot = composed("base=gantry ee=plane")
-    assert len(robot.links) == 7
-    assert len(robot.movable_joints) == robot.dof == 5
-    assert [robot.joints[k].kind for k in robot.movable_joints] == ["prismatic"] * 3 + [
-        "revolute"
-    ] * 2
-    tool = frame_pose(robot, robot.home)
-    assert tool[:3, 2] == pytest.approx([0, 0, -1], abs=1e-12)
-    assert tool[:3, 3] == pytest.approx([0, 0, 0.8 - 0.1], abs=1e-12)
-
-
 def test_an_empty_root_link_of_a_part_adds_no_link():
     robot = joined("arm=ur5 ee=none")
     assert [link.name for link in robot.links if link.name.startswith("ee")] in ([], ["ee_link"])

@@ -64,22 +64,12 @@ def test_a_rejected_draw_does_not_change_other_robots():
     assert all(str(kept[i].derivation) == free[i] for i in same)
 
 
-@pytest.mark.parametrize(
-    ("condition", "message"),
-    [
-        ("mass > 900", "500 failed at: where (mass > 900)"),
-        ("dof == 2 and mass > 900 and reach > 0", "500 failed at: where (mass > 900)"),
-    ],
-)
-def test_an_unsatisfiable_condition_is_named(condition, message):
-    with pytest.raises(SamplingError) as caught:
-        next(sample_robots(shipped("cubes"), LIBRARY, 1, where=[parse_condition(condition)]))
-    assert str(caught.value) == f"robot 0 of 'cubes': 0 of 500 draws were accepted; {message}"
-
-
 def test_the_most_frequent_reason_of_rejection_is_named(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 40)
-    robot_grammar = grammar("robot -> @weight(3) cubes | cartpole", "where mass > 900 or links > 3")
+    robot_grammar = grammar(
+        "robot -> @weight(3) cubes | cartpole",
+        "where dof > 0 and (mass > 900 or links > 3) and reach > 0",
+    )
     with pytest.raises(SamplingError, match=r"40 failed at: where \(\(mass > 900\) or \(links > 3"):
         sample_robot(robot_grammar, LIBRARY, 0)
 
@@ -234,16 +224,6 @@ def test_a_choice_without_effect_is_an_error(monkeypatch):
         neighbours(robot_grammar, sample_robot(robot_grammar, LIBRARY, 0), 1)
 
 
-RANGES = {
-    "nlink": ({4, 5, 6, 7}, {2, 3, 4, 5}),
-    "chain": ({10, 13, 16, 19, 22, 25}, {7, 9, 11, 13, 15, 17}),
-    "planar_arm": (set(range(6, 11)), set(range(4, 10))),
-    "multi_finger": (set(range(8, 20)), set(range(5, 19))),
-    "tongs": ({10, 12}, {7, 9}),
-}
-"""Links and movable joints that the benchmark's table names for categories of several sizes."""
-
-
 def robot_faults(drawn: Sample, category):
     """Return the faults of a robot of a category."""
     robot = drawn.robot
@@ -251,12 +231,6 @@ def robot_faults(drawn: Sample, category):
     faults = unphysical(robot)
     if counts != benchmark_counts(category, drawn.derivation):
         faults.append(f"{counts} links and movable joints: {drawn.derivation}")
-    if category in RANGES:
-        faults += [
-            f"{n} not in {ok}"
-            for n, ok in zip(counts, RANGES[category], strict=True)
-            if n not in ok
-        ]
     faults += [f"{f.code} {f.where}" for f in check(robot) if f.severity != "info"]
     if [frame.name for frame in robot.frames] != ["tool"]:
         faults.append(f"frames {robot.frames}")
