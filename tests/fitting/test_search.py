@@ -1,6 +1,5 @@
 """Searching for primitives that fit a solid: what is found, its score, and the sampled points."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -132,35 +131,6 @@ def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads(threads)
         found.append((one.shapes, one.iou, two.shapes, two.iou))
         assert torch.get_num_threads() == n
     assert found[0] == found[1]
-
-
-def test_sample_points_cover_the_solid_and_its_surroundings():
-    shape = Shape(Box((0.1, 0.2, 0.4)), Pose((1.0, 2.0, 3.0)))
-    target = target_of(shape)
-    size = math.hypot(0.1, 0.2, 0.4)
-    np.testing.assert_allclose(target.centre, (1.0, 2.0, 3.0), atol=1e-9)
-    placed = target.points * size + target.centre
-    np.testing.assert_array_equal(target.inside, target.solid.contains(placed))
-    assert (target.points.max(axis=0) > np.array((0.05, 0.1, 0.2)) / size + 0.1).all()
-    assert (target.weights > 0).all()
-    assert target.weights.mean() == pytest.approx(1.0)
-    again = target_of(shape)
-    np.testing.assert_array_equal(target.points, again.points)
-    np.testing.assert_array_equal(target.weights, again.weights)
-    assert not np.array_equal(target.points, target_of(shape, seed=1).points)
-
-
-@pytest.mark.parametrize("count", [None, 4096])
-def test_sample_weights_are_volumes(count):
-    target = target_of(Shape(Box((0.1, 0.2, 0.4))))
-    points, inside, weights = (
-        array[:count] for array in (target.points, target.inside, target.weights)
-    )
-    for factor in (0.5, 1.0, 1.2, 1.5):
-        half = np.array((0.05, 0.1, 0.2)) * factor / target.solid.size
-        within = (np.abs(points) <= half).all(axis=1)
-        ratio = weights[within].sum() / weights[inside].sum()
-        assert ratio == pytest.approx(factor**3, rel=0.1 if count else 0.03)
 
 
 def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from morphgen.errors import FitError, MeshError
-from morphgen.fitting.solid import DECIMATED_FACES, MAX_FACES, openness, solid_of, solid_of_mesh
+from morphgen.fitting.solid import DECIMATED_FACES, MAX_FACES, solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)
@@ -326,21 +325,6 @@ def tube(wall=0.01, radius=0.1, length=0.6, closed=False):
 def solid_from(mesh, tmp_path):
     mesh.export(tmp_path / "mesh.stl")
     return solid_of([Shape(Mesh(tmp_path / "mesh.stl"))])
-
-
-def test_openness_is_zero_inside_a_box_one_far_away_and_half_on_a_wall():
-    rays = RayMeshIntersector(trimesh.creation.box((1, 1, 1)))
-    points = np.array([(0.1, 0.2, -0.3), (50.0, 0, 0), (0.5 + 1e-4, 0, 0)])
-    assert openness(rays, points) == pytest.approx([0, 1, 0.5], abs=0.02)
-    assert openness(rays, np.zeros((0, 3))).shape == (0,)
-
-
-def test_openness_in_a_cup_is_the_solid_angle_of_its_opening():
-    walls, lid = trimesh.creation.annulus(0.49, 0.5, 1.0), trimesh.creation.box((1, 1, 0.01))
-    cup = trimesh.util.concatenate([walls, lid])
-    # The opening of the upper half as seen from the bottom: radius 0.49 at distance 0.49.
-    (share,) = openness(RayMeshIntersector(cup), np.array([(0.0, 0.0, 0.01)]))
-    assert share == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)
 
 
 @pytest.mark.parametrize("closed", [False, True])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import morphgen
 from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
 from helpers.scenes import robot
@@ -264,23 +263,40 @@ def test_evaluations_read_tensors_only_now_and_then(specs):
 
 MANY_REACH = ReachConfig(num_goals=20, train_layouts=4, eval_layouts=2)
 MANY_PUSH = PushConfig(num_goals=20, train_layouts=4, eval_layouts=2)
-
-
-@pytest.fixture(scope="module")
-def layout_specs(cache):
-    arm, gantry = robot("arm3"), robot("prims")
-    return {
-        "reach": draw_spec(arm, MANY_REACH, obstacles=True, cache=cache),
-        "push": draw_spec(gantry, MANY_PUSH, obstacles=True, cache=cache),
-        "free": draw_spec(arm, MANY_REACH, cache=cache),
-    }
+LAYOUTS = {
+    "reach": ("arm3", MANY_REACH, True),
+    "push": ("prims", MANY_PUSH, True),
+    "free": ("arm3", MANY_REACH, False),
+}
+"""Robot and config of environments, and whether they have obstacles."""
+LONG_REACH = ReachConfig(num_goals=20)
+WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
 
 
 @pytest.fixture
-def build_layouts(layout_specs, opened):
-    def make(*names, **options):
-        chosen = [layout_specs[name] for name in names]
-        return opened(batch_from_specs(chosen, len(names), **{"sim": "mujoco", **options}))
+def build(cache, opened):
+    """Create batches in MuJoCo of tuples as in ``LAYOUTS``."""
+
+    def make(settings, num_envs=None, **options):
+        chosen = [
+            draw_spec(robot(words), config, obstacles=obstacles, cache=cache)
+            for words, config, obstacles in settings
+        ]
+        given = {"sim": "mujoco", **options}
+        return opened(batch_from_specs(chosen, num_envs or len(chosen), **given))
+
+    return make
+
+
+@pytest.fixture
+def build_layouts(build):
+    return lambda *names, **options: build([LAYOUTS[name] for name in names], **options)
+
+
+@pytest.fixture
+def build_batch(build):
+    def make(num_envs=3, words=WORDS, obstacles=False, config=LONG_REACH, **options):
+        return build([(each, config, obstacles) for each in words], num_envs, **options)
 
     return make
 
@@ -303,18 +319,16 @@ def test_unknown_layouts_are_rejected(build_layouts):
         build_layouts("reach", layouts="test")
 
 
-def test_starts_and_goals_are_free_in_their_layout(build_layouts, layout_specs):
+def test_starts_and_goals_are_free_in_their_layout(build_layouts):
     batch = build_layouts("reach", "push")
     for _ in range(10):
         batch.reset()
         reach, push = (FreeSpace(batch.layouts.scene(env)) for env in (0, 1))
-        goal = batch.groups["reach"].goal_configuration[0, : layout_specs["reach"].robot.dof]
-        start = batch.q[0, : layout_specs["reach"].robot.dof]
+        goal = batch.groups["reach"].goal_configuration[0, : batch.specs[0].robot.dof]
+        start = batch.q[0, : batch.specs[0].robot.dof]
         assert reach.free(torch.stack([goal, start]).double().numpy()).all()
         block = batch.simulation.block_pose[1:].double().numpy()
-        assert push.free(
-            batch.q[1:, : layout_specs["push"].robot.dof].double().numpy(), block
-        ).all()
+        assert push.free(batch.q[1:, : batch.specs[1].robot.dof].double().numpy(), block).all()
         assert push.block_is_clear(block).all()
 
 
@@ -371,36 +385,6 @@ def test_baselines_plan_around_the_current_obstacles(build_layouts, monkeypatch)
     assert len(scenes) == 4  # two robots of the batch, two layouts each
 
 
-LONG_REACH = replace(ReachConfig(), num_goals=20)
-WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
-
-
-@pytest.fixture(scope="module")
-def three_robots():
-    return [morphgen.compose(words, geometry="primitive") for words in WORDS]
-
-
-@pytest.fixture(scope="module")
-def settings(three_robots, cache):
-    return {
-        obstacles: [
-            draw_spec(robot, LONG_REACH, obstacles=obstacles, seed=0, cache=cache)
-            for robot in three_robots
-        ]
-        for obstacles in (False, True)
-    }
-
-
-@pytest.fixture
-def build_batch(settings, opened):
-    def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=LONG_REACH, **options):
-        chosen = [replace(settings[obstacles][i], config=config) for i in robots]
-        options = {"sim": "mujoco", **options}
-        return opened(batch_from_specs(chosen, num_envs, **options))
-
-    return make
-
-
 def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
     batch = build_batch(config=replace(LONG_REACH, max_episode_steps=5))
     batch.reset()
@@ -421,7 +405,7 @@ def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
 
 
 def test_start_is_never_the_goal_configuration(build_batch):
-    batch = build_batch(40, robots=(0,))
+    batch = build_batch(40, WORDS[:1])
     for _ in range(3):
         batch.reset()
         goal_q = batch.groups["reach"].goal_configuration
@@ -481,7 +465,7 @@ def test_returned_tensors_are_copies(build_batch):
 
 
 def test_spread_reset_staggers_the_first_episodes(build_batch):
-    batch = build_batch(60, robots=(0,), seed=1)
+    batch = build_batch(60, WORDS[:1], seed=1)
     batch.reset(spread=True)
     passed = batch.episode_step.clone()
     assert passed.unique().numel() > 40
