@@ -2,11 +2,10 @@
 
 import os
 import struct
-import subprocess
-import sys
 
 import pytest
 
+from helpers.fuzzing import MEMORY_MIB, Runner
 from morphgen.cli import main
 
 BOX = '<robot name="r"><link name="a"><collision><geometry>{}</geometry></collision></link></robot>'
@@ -31,11 +30,8 @@ def entities(depth):
 
 SOUND = '<robot name="r"><link name="a"/></robot>'
 URDFS = {
-    "empty": b"",
     "nul": b"<robot name='r'>\0</robot>",
-    "truncated": SOUND[:25].encode(),
     "truncated after a prefix": b'<robot name="r"><drake:x><link name="a',
-    "latin-1 called utf-8": '<robot name="é"/>'.encode("latin-1"),
     "utf-16 without a mark": SOUND.encode("utf-16-le"),
     "utf-16 with the wrong mark": b"\xff\xfe" + SOUND.encode("utf-16-be"),
     "binary": bytes(range(256)) * 100,
@@ -44,10 +40,7 @@ URDFS = {
     "many prefixes": b"<r>" + b"".join(b"<p%d:x/>" % i for i in range(5000)) + b"</r>",
     "many attributes": b"<robot " + b" ".join(b'a%d="1"' % i for i in range(200_000)) + b">",
     "huge": b'<robot name="r">' + b" " * 9_000_000 + b"</robot>",
-    "long name": f'<robot name="{"n" * 100_000}"><link name="a"/></robot>'.encode(),
-    "name with a line break": b'<robot name="r&#10;oops"><link name="a"/></robot>',
     "name that moves the cursor": b'<robot name="r&#x9b;2J"><link name="a"/></robot>',
-    "link with a line break": b'<robot name="r"><link name="a&#10;b"/></robot>',
     "chain without end": chain(10_000).encode(),
     "shapes without end": (
         '<robot name="r"><link name="a">' + "<collision/>" * 20_000 + "</link></robot>"
@@ -153,18 +146,9 @@ def test_a_card_that_is_a_pipe_is_not_opened(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["many attributes", "shapes without end", "entity bomb"])
-def test_hostile_urdfs_use_bounded_memory_and_time(name, tmp_path):
-    path = tmp_path / "x.urdf"
-    path.write_bytes(URDFS[name])
-    code = (
-        "import sys, re; from morphgen.cli import main; main(sys.argv[1:]);"
-        "print(re.search(r'VmHWM:\\s+(\\d+) kB', open('/proc/self/status').read())[1])"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code, "show", str(path)], capture_output=True, text=True, timeout=30
-    )
-
-    assert result.returncode == 0, result.stderr
-    # Not ru_maxrss: it starts at the value of the parent process.
-    assert int(result.stdout.split()[-1]) < 2**20  # KiB
+def test_hostile_urdfs_use_bounded_memory_and_time(tmp_path):
+    path, runner = tmp_path / "x.urdf", Runner(tmp_path)
+    for name in ("many attributes", "shapes without end", "entity bomb"):
+        path.write_bytes(URDFS[name])
+        assert runner.run("show", path)["mib"] < MEMORY_MIB, name
+    runner.close()

@@ -25,45 +25,37 @@ def positions(robot, q):
     return dict(zip(names, movable_positions(robot, q).tolist(), strict=True))
 
 
-def assert_poses_agree(robot, path, seed=0):
-    """Compare centres of mass and sites with MuJoCo at random configurations."""
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    for q in random_configurations(robot, 10, np.random.default_rng(seed)):
+def assert_poses_agree(robot, path):
+    """Compare links and sites with MuJoCo at random configurations."""
+    data = mujoco_data(path)
+    for q in random_configurations(robot, 10, np.random.default_rng(0)):
         for name, value in positions(robot, q).items():
             data.joint(name).qpos[0] = value
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        T_root_link = forward_kinematics(robot, q)
-        for T, link in zip(T_root_link, robot.links, strict=True):
-            if link.inertial is None:
-                continue
-            com = T @ [*link.inertial.com, 1]
-            np.testing.assert_allclose(com[:3], data.body(link.name).xipos, atol=1e-9)
-            R = T[:3, :3]
-            R_com = data.body(link.name).ximat.reshape(3, 3)
-            np.testing.assert_allclose(
-                R @ link.inertial.matrix @ R.T,
-                R_com @ np.diag(model.body(link.name).inertia) @ R_com.T,
-                atol=1e-9,
-            )
-        for frame in robot.frames:
+        assert_pose_agrees(robot, q, data)
+
+
+def mujoco_data(path):
+    return mujoco.MjData(mujoco.MjModel.from_xml_path(str(path)))
+
+
+def assert_pose_agrees(robot, q, data):
+    """Compare mass properties of links, and sites, with those of MuJoCo in its state."""
+    mujoco.mj_kinematics(data.model, data)
+    T_root_link = forward_kinematics(robot, q)
+    for T, link in zip(T_root_link, robot.links, strict=True):
+        if link.inertial is None:
+            continue
+        com = T @ [*link.inertial.com, 1]
+        np.testing.assert_allclose(com[:3], data.body(link.name).xipos, atol=1e-9)
+        R, R_com = T[:3, :3], data.body(link.name).ximat.reshape(3, 3)
+        principal = np.diag(data.model.body(link.name).inertia)
+        inertia = R @ link.inertial.matrix @ R.T
+        np.testing.assert_allclose(inertia, R_com @ principal @ R_com.T, atol=1e-9)
+    for frame in robot.frames:
+        if frame.name != "tool":
             T = T_root_link[robot.link_index[frame.link]] @ frame.T_link_frame.matrix
-            if frame.name == "tool":
-                continue
             np.testing.assert_allclose(T[:3, 3], data.site(frame.name).xpos, atol=1e-9)
             np.testing.assert_allclose(T[:3, :3].ravel(), data.site(frame.name).xmat, atol=1e-9)
-
-
-def assert_held_as_in_mujoco(robot, path, qpos):
-    """Compare the centres of mass at home with those of MuJoCo at a configuration."""
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
-    for T, link in zip(forward_kinematics(robot, robot.home), robot.links, strict=True):
-        com = T @ [*link.inertial.com, 1]
-        np.testing.assert_allclose(com[:3], data.body(link.name).xipos, atol=1e-12)
 
 
 def assert_same(robot, other):
@@ -263,7 +255,9 @@ def test_joint_equalities_become_mimic_and_fixed_joints(tmp_path):
     assert robot.ignore_pairs == (("left", "right"),)
     assert robot.joints[0].effort == 6.0
     follower = 0.1 + 0.5 - 2 * (0.5 - 0.2)  # from its reference, as the leader
-    assert_held_as_in_mujoco(robot, path, (0.5, follower, 0.3 + 0.4))
+    data = mujoco_data(path)
+    data.qpos[:] = (0.5, follower, 0.3 + 0.4)
+    assert_pose_agrees(robot, robot.home, data)
 
 
 def test_fixed_tendon_of_two_joints_held_by_an_equality_is_a_mimic(tmp_path):
@@ -288,7 +282,9 @@ def test_joint_that_follows_a_held_joint_is_held(tmp_path):
     )
     robot = read_mjcf(path)
     assert robot.dof == 0
-    assert_held_as_in_mujoco(robot, path, (0.3, 0.7))
+    data = mujoco_data(path)
+    data.qpos[:] = (0.3, 0.7)
+    assert_pose_agrees(robot, robot.home, data)
 
 
 def test_free_base_becomes_the_root(tmp_path):

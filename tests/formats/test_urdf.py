@@ -31,25 +31,16 @@ def text_file(folder, text):
     return path
 
 
-def test_links_are_sorted_from_the_root(tmp_path):
+def test_links_are_sorted_from_the_root_and_missing_limits_are_not_zero(tmp_path):
     path = text_file(
         tmp_path,
         '<robot name="r"><link name="c"/><link name="a"/><link name="b"/>'
         '<joint name="j2" type="fixed"><parent link="b"/><child link="c"/></joint>'
-        '<joint name="j1" type="fixed"><parent link="a"/><child link="b"/></joint></robot>',
+        '<joint name="j1" type="revolute"><parent link="a"/><child link="b"/></joint></robot>',
     )
-    assert [link.name for link in read_urdf(path).links] == ["a", "b", "c"]
-
-
-def test_missing_limits_are_not_read_as_zero(tmp_path):
-    path = text_file(
-        tmp_path,
-        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
-        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>',
-    )
-    joint = read_urdf(path).joints[0]
-    assert joint.limits is None
-    assert joint.effort is None
+    robot = read_urdf(path)
+    assert [link.name for link in robot.links] == ["a", "b", "c"]
+    assert (robot.joints[0].limits, robot.joints[0].effort) == (None, None)
 
 
 def test_home_is_in_the_middle_of_a_range_without_zero(tmp_path):

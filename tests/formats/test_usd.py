@@ -15,6 +15,7 @@ pytest.importorskip("urdf_usd_converter")
 from pxr import Usd, UsdGeom, UsdPhysics
 
 WORDS = ("arm=ur5", "ee=robotiq_2f85")
+ROBOT = morphgen.compose(" ".join(WORDS))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def stage(folder):
 
 def test_links_have_their_masses_and_centres_of_mass(stage):
     prims = {prim.GetName(): prim for prim in stage.Traverse()}
-    for link in morphgen.compose(" ".join(WORDS)).links:
+    for link in ROBOT.links:
         if not prims[link.name].HasAPI(UsdPhysics.RigidBodyAPI):
             assert link.inertial is None
             continue
@@ -46,7 +47,7 @@ def test_links_have_their_masses_and_centres_of_mass(stage):
 
 def test_joints_have_their_couplings(stage):
     prims = {prim.GetName(): prim for prim in stage.Traverse()}
-    followers = [joint for joint in morphgen.compose(" ".join(WORDS)).joints if joint.mimic]
+    followers = [joint for joint in ROBOT.joints if joint.mimic]
     assert len(followers) == 5
     for joint in followers:
         (leader,) = prims[joint.name].GetRelationship("newton:mimicJoint").GetTargets()
@@ -67,9 +68,7 @@ def test_the_folder_stands_alone(folder, stage):
 
 def test_every_collision_mesh_is_a_hull(stage):
     meshes = sum(
-        isinstance(shape.geometry, Mesh)
-        for link in morphgen.compose(" ".join(WORDS)).links
-        for shape in link.collisions
+        isinstance(shape.geometry, Mesh) for link in ROBOT.links for shape in link.collisions
     )
     approximations = [
         prim.GetAttribute("physics:approximation").Get()

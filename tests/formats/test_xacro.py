@@ -126,9 +126,12 @@ def test_find_searches_around_the_file_and_in_roots(tmp_path, origin):
         ('<xacro:include filename="lost.xacro"/>', "lost.xacro"),
         ('<xacro:include filename="broken.xacro"/>', "broken.xacro:3:"),
         ('<xacro:include filename="bomb.xacro"/>', "DOCTYPE"),
+        ('<xacro:include filename="part.xacro"/>', "endless"),
+        ('<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>', "endless"),
     ],
 )
 def test_errors_are_one_line_that_names_the_file(body, reason, origin, tmp_path):
+    origin.write_text(robot(body))
     (tmp_path / "broken.xacro").write_text("<robot>\n\n<link></robot>")
     (tmp_path / "bomb.xacro").write_text('<!DOCTYPE r [<!ENTITY a "b">]><r>&a;</r>')
     assert reason in failure(body, origin)

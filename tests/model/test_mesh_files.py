@@ -416,7 +416,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
         ply([], "element vertex 1", *(f"property float p{i}" for i in range(200_000))),
         "no PLY header of at most 65536 bytes",
     ),
-    "comments.ply": (ply([], *(["comment"] * 30_000), PLY_VERTICES), "no PLY header of at most"),
     "vertices.ply": (
         ply([], PLY_VERTICES.replace("4", "2000000000"), style="binary_little_endian"),
         "counts 2000000000 of element 'vertex', more than the file has bytes for",

@@ -9,20 +9,11 @@ import pytest
 from helpers.robots import arm
 from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.inertia import inertial_from_density
 from morphgen.model.kinematics import forward_kinematics, frame_pose
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.tree import rename, scale_links, subtree
 
 STRAIGHT = np.zeros(4)
-
-
-def test_scaled_mass_properties_are_those_of_the_scaled_shapes():
-    link = scale_links(arm(), {"upper": 1.7}).link("upper")
-    solid = inertial_from_density(link.collisions, 1000.0)
-    assert link.inertial.mass == pytest.approx(solid.mass)
-    assert link.inertial.inertia == pytest.approx(solid.inertia, abs=1e-9)
-    assert link.inertial.com == pytest.approx(solid.com)
 
 
 def test_joints_and_frames_on_a_scaled_link_move_and_its_own_joint_does_not():
