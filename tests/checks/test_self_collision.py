@@ -78,12 +78,6 @@ def test_touching_faces_do_not_collide():
     assert set(deep) == {("ball0", "ball1")}
 
 
-def test_ignored_pairs_are_not_reported():
-    robot = replace(slides(0.0, 0.01, 0.02), ignore_pairs=(("ball0", "ball1"),))
-    (found,) = penetrations(robot, [robot.home])
-    assert set(found) == {("ball0", "ball2"), ("ball1", "ball2")}
-
-
 def test_links_of_the_root_are_tested():
     """MuJoCo by default does not test bodies welded to the world against their children."""
     robot = chain(ball("a"), replace(ball("b"), collisions=(Shape(Sphere(0.3)),)))

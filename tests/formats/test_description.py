@@ -10,8 +10,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle, read_robot, write_bundle
 from morphgen.formats.description import is_mjcf, read_description
 from morphgen.formats.urdf.write import urdf_text
-from morphgen.grammar.library import Library
-from morphgen.grammar.robot_source import find_robot, import_robot, read_source
+from morphgen.grammar.robot_source import import_robot
 
 SITE = TWO_JOINTS.replace(
     '<joint name="b"', '<site name="attachment_site" pos="0 0 1"/><joint name="b"'
@@ -42,10 +41,8 @@ def test_xacro_arguments_of_other_files_are_refused(tmp_path):
         read_description(write(tmp_path, TWO_JOINTS), {"size": "1"})
 
 
-def test_sources_and_imports_accept_mjcf(tmp_path):
+def test_imports_accept_mjcf(tmp_path):
     path = write(tmp_path, SITE)
-    robot = read_source(find_robot(path), Library([]))
-    assert robot.frame("tool").link == "right"
     assert import_robot(path).frame("tool").link == "right"
     right = import_robot(path, root_link="right", tool="right", name="half")
     assert (right.name, right.dof, right.frame("tool").link) == ("half", 0, "right")
@@ -64,12 +61,8 @@ def test_part_from_an_mjcf(tmp_path):
         tmp_path / "library",
         file="robot.xml",
         root="base",
-        ports=None,
-        parameters=None,
-        mount=None,
         tool={"link": "right"},
-        home=None,
-        accepted=None,
+        **dict.fromkeys(("parameters", "mount", "home", "accepted")),
     )
     robot = morphgen.compose("arm=ur5 ee=pincer", library=[tmp_path / "library"])
     assert {"ee_left", "ee_right"} <= set(robot.link_index)

@@ -10,6 +10,8 @@ from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf.read import UnsoundError
 
+WORLD = '<worldbody><body name="a">{}</body></worldbody>'
+INERTIAL = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
 BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
 
 
@@ -18,8 +20,7 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
     [
         ("<worldbody/>", "it has no bodies; expected at least one in <worldbody>"),
         (
-            '<worldbody><body name="a"><geom size="0.1"/><body name="b"><joint name="j" '
-            'type="ball"/><geom size="0.1"/></body></body></worldbody>',
+            WORLD.format('<body><joint name="j" type="ball"/><geom size="1"/></body>'),
             "joint 'j': type ball; expected hinge or slide, such as three hinges at one place",
         ),
         (
@@ -50,8 +51,7 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
             "equality 'e': another one couples joint 'a', too; expected one",
         ),
         (
-            '<worldbody><body name="a"><geom name="table" type="plane" size="1 2 3"/><geom '
-            'size="1"/></body></worldbody>',
+            WORLD.format('<geom name="table" type="plane" size="1 2 3"/><geom size="1"/>'),
             "geom 'table': type plane; expected box, sphere, cylinder, capsule, ellipsoid or mesh",
         ),
         (
@@ -59,9 +59,8 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
             "<extension> is refused: plugins are code",
         ),
         (
-            '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1e10"/></asset><worldbody>'
-            '<body name="a"><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
-            '<geom type="mesh" mesh="m"/></body></worldbody>',
+            '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1e10"/></asset>'
+            + WORLD.format(f'{INERTIAL}<geom type="mesh" mesh="m"/>'),
             "mesh 'm': a vertex is beyond 1e+09 m",
         ),
         (
@@ -82,7 +81,7 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
             "body_pos of the compiled model has the value nan; expected numbers up to 1e+20",
         ),
         (
-            '<worldbody><body name="a"><geom size="0.1" colour="red"/></body></worldbody>',
+            WORLD.format('<geom size="0.1" colour="red"/>'),
             "not MJCF that MuJoCo reads: XML Error: Schema violation: unrecognized attribute: "
             "'colour' Element 'geom'",
         ),

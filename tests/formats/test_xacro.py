@@ -9,7 +9,7 @@ import pytest
 
 from morphgen.errors import FormatError
 from morphgen.formats import resolve
-from morphgen.formats.resolve import PackageFinder, default_finder, distribution_file
+from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro import expand as xacro_process
 from morphgen.formats.xacro.expand import Expansion, evaluate, expand
 from morphgen.formats.xml import parse_xml
@@ -174,24 +174,6 @@ def test_expansion_is_thread_safe(tmp_path):
     for thread in threads:
         thread.join()
     assert results == {k: [[{"name": f"{k}0.0"}]] * 30 for k in range(4)}
-
-
-@pytest.mark.parametrize(
-    ("file", "links"),
-    [
-        ("ur_description/urdf/ur5_robot.urdf.xacro", 11),
-        ("franka_description/robots/panda_arm_hand.urdf.xacro", 12),
-        ("kinova_description/urdf/j2s7s300_standalone.xacro", 17),
-        ("kortex_description/robots/gen3_robotiq_2f_85.xacro", 24),
-        ("interbotix_descriptions/urdf/wx250s.urdf.xacro", 14),
-        ("kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.xacro", 10),
-    ],
-)
-def test_robots_of_the_data_packages_expand(file, links):
-    path = distribution_file("rtb-data", f"rtbdata/xacro/{file}")
-    data = expand(path, {}, default_finder())
-    assert len(parse_xml(data, file).findall("link")) == links
-    assert data == expand(path, {}, default_finder())
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from morphgen.model.kinematics import (
     joint_limits,
     random_configurations,
     solve_pose_ik,
+    solve_position_ik,
 )
-from morphgen.model.kinematics import solve_position_ik as solve_one
 from morphgen.model.kinematics_torch import (
     angle_between,
     matrix_from_quaternion,
@@ -85,9 +85,8 @@ def test_position_ik_reports_the_error_of_unreachable_goals(kinematics):
 def test_position_ik_leaves_rows_that_have_arrived():
     q = random_configurations(PANDA, 20, np.random.default_rng(0))
     goals = frame_pose(PANDA, q)[:, :3, 3] + np.linspace(0, 0.1, 20)[:, None]
-    solve = solve_one
-    loose, error = solve(PANDA, q, goals, tolerance=0.01)
-    tight, _ = solve(PANDA, q, goals)
+    loose, error = solve_position_ik(PANDA, q, goals, tolerance=0.01)
+    tight, _ = solve_position_ik(PANDA, q, goals)
     near = np.linalg.norm(goals - frame_pose(PANDA, q)[:, :3, 3], axis=1) <= 0.01
     np.testing.assert_array_equal(loose[near], q[near])
     assert 0 < near.sum() < len(q)

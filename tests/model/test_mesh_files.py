@@ -369,7 +369,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "many.gltf": (accessor(0, count=19_000_000), "accessor 0 counts 19000000 entries of 12 bytes"),
     "negative.gltf": (accessor(1, count=-(2**40)), "-1099511627776 is not a count"),
-    "huge.gltf": (accessor(1, count=2**62), "accessor 1 counts 4611686018427387904 entries"),
     "offset.gltf": (accessor(0, byteOffset=40), "accessor 0 counts 4 entries of 12 bytes"),
     "sparse.gltf": (accessor(0, sparse={"count": 1}), "accessor 0 is sparse"),
     "stride.gltf": (
@@ -403,7 +402,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
         b"glTF" + struct.pack("<IIII", 2, 100_020, 100_000, 0x4E4F534A) + b"[" * 100_000,
         "not a readable glb mesh",
     ),
-    "length.glb": (b"glTF" + struct.pack("<IIII", 2, 2**32 - 1, 2**32 - 1, 0) + b"{}", "truncated"),
     "triangles.dae": (
         dae_with(f'<polylist count="1">{INPUT}<vcount>3000000</vcount><p>0 1 2</p></polylist>'),
         "2999998 triangles; at most 1000000",
@@ -456,7 +454,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
         "counts 9 of element 'face', more than the file has bytes for: it is truncated",
     ),
     "none.stl": (b"solid x\nendsolid x\n", "holds no triangle"),
-    "zeros.stl": (bytes(2**20), "holds no triangle"),
     "solid.stl": (b"solid" + bytes(2**20), "holds no triangle"),
     "none.obj": (b"v 0 0 0\nl 1 1\n", "holds 1 vertices and no triangle"),
     "none.ply": (ply(PLY_POINTS, PLY_VERTICES), "holds 4 vertices and no triangle"),
