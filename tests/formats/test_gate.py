@@ -423,7 +423,7 @@ HUGE = {
     "height field": (1, "asset", '<hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/>'),
     "texture": (1, "asset", '<texture type="2d" builtin="flat" width="99999" height="99999"/>'),
     "built-in mesh": (1, "asset", '<mesh name="m" builtin="supersphere" params="9999 1 1"/>'),
-    "hull": (1, "asset", '<mesh name="m" maxhullvert="2000000000" vertex="0 0 0 1 0 0 0 1 0"/>'),
+    "hull": (1, "asset", '<mesh name="m" maxhullvert="9999999" vertex="0 0 0 1 0 0 0 1 0 0 1 1"/>'),
     "memory": (1, "", '<size memory="900G"/>'),
     "user values": (1, "", '<size nuser_geom="99999999" nuserdata="999999999"/>'),
     "numbers": (1, "custom", '<numeric name="n" size="999999999"/>'),

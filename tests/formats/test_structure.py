@@ -83,7 +83,6 @@ FAULTS = [
 XACRO = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>'
 SUSPICIOUS = [
     ("number-commas", ('size="1 1 1"', 'size="1, 1, 1"')),
-    ("number-commas", ('scale="-1 1 1"', 'scale="1,1,1"')),
     ("element-repeated", ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><axis xyz="1 0 0"/>')),
     ("element-repeated", ('<box size="1 1 1"/>', '<box size="1 1 1"/><sphere radius="1"/>')),
     ("xacro-unexpanded", ('<robot name="r">', XACRO)),

@@ -444,6 +444,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "pointer.stl": (LFS, "the file is a Git LFS pointer; run 'git lfs pull'"),
     "page.obj": (b"<!DOCTYPE html>\n<html></html>", "the file is a web page"),
     "other.stl": (b"glTF" + bytes(100), "the file has the content of a .glb file; rename it"),
+    "other.obj": (ascii_stl([0]).encode(), "the file has the content of a .stl file"),
     "other.ply": (dae().encode(), "the file has the content of a .dae file"),
     "cut.stl": (binary_stl()[:200], "4 triangles, which take 284 bytes, and the file has 200"),
     "short.stl": (binary_stl()[:60], "60 bytes; a binary STL file has at least 84"),
