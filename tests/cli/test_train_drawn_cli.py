@@ -65,7 +65,13 @@ def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, ok, tm
     assert f"{folder} has no robots.json: it is unknown whether" in err
 
 
-@pytest.mark.parametrize("drawn", ["cubes:2", "stick:1", "cubes:1,stick:2"])
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        "cubes:1,stick:2",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("cubes:2", "stick:1")),
+    ],
+)
 def test_without_a_split_fresh_robots_are_evaluated(run, drawn):
     run(*RUN, drawn, "--steps", "96", "--out", "run")
     trained = {each.robot_hash for each in read_drawn(Path("run"))}

@@ -69,7 +69,13 @@ STUCK = {
 """Work that never ends, which a viewer has begun."""
 
 
-@pytest.mark.parametrize("stuck", STUCK.values(), ids=STUCK)
+@pytest.mark.parametrize(
+    "stuck",
+    [
+        pytest.param(work, id=name, marks=[pytest.mark.slow] if "PIPE" in work else [])
+        for name, work in STUCK.items()
+    ],
+)
 def test_work_that_hangs_does_not_keep_the_viewer_running(tmp_path, monkeypatch, stuck):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     os.mkfifo(tmp_path / "pipe")

@@ -60,6 +60,7 @@ def test_spheres_cover_the_share_of_a_box_that_they_must(share):
     assert inside == pytest.approx(fit.quality.coverage, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_more_spheres_overlap_more_and_a_cover_costs_overlap():
     shape = Shape(Cylinder(0.04, 0.4), Pose.from_xyz_rpy((0.1, 0.2, 0.3), (0.5, 0.2, 0.1)))
     target = sample_solid(solid_of([shape]), 0)

@@ -95,7 +95,7 @@ def test_progress_reaches_the_number_of_robots(tmp_path):
     assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (3, 5), (4, 5), (5, 5)]
 
 
-@pytest.mark.parametrize("light", [True, False])
+@pytest.mark.parametrize("light", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
     one = plan(tmp_path / "one", "chain", light=light)
     two = replace(one, folder=tmp_path / "two")

@@ -88,7 +88,12 @@ def test_joints_are_within_a_milliradian_of_mujoco_after_a_second_without_contac
 
 
 @pytest.mark.parametrize(
-    ("order", "rows"), [((0, 1, 2, 0, 1, 2, 0), 3), ((0, 0, 2, 1, 2), 5), ((1,), 1)]
+    ("order", "rows"),
+    [
+        ((0, 1, 2, 0, 1, 2, 0), 3),
+        pytest.param((0, 0, 2, 1, 2), 5, marks=pytest.mark.slow),
+        pytest.param((1,), 1, marks=pytest.mark.slow),
+    ],
 )
 def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(
     arms, sim, order, rows
