@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, TypeVar
 
 import numpy as np
@@ -152,6 +153,9 @@ def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
             )
         device = f"cuda:{local}"
         torch.cuda.set_device(local)
+    # Optimisers import this module. If a group exists by then, the module keeps it for ever, and
+    # the group's threads abort the process now and then when it ends (torch 2.13).
+    import_module("torch._dynamo")
     distributed.init_process_group("nccl" if kind == "cuda" else "gloo")
     try:
         yield ProcessGroup(rank, size), device

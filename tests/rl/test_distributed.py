@@ -30,7 +30,10 @@ def train_by_two(folder, updates, *options):
         "    inner(learner, *rest)\n"
         "    torch.save(learner.actor.state_dict(), f\"{sys.argv[1]}.{os.environ['RANK']}\")\n"
         "training._learn = learn\n"
-        "sys.exit(main(sys.argv[2:]))\n"
+        "code = main(sys.argv[2:])\n"
+        "tasks = [f'/proc/self/task/{each}/comm' for each in os.listdir('/proc/self/task')]\n"
+        "assert not [name for name in map(open, tasks) if 'gloo' in name.read()]\n"
+        "sys.exit(code)\n"
     )
     words = (*TRAIN, str(updates * UPDATE), "--out", folder, "--no-tensorboard", *options)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2")
