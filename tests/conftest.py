@@ -1,6 +1,7 @@
-"""Settings of hypothesis, and the end of a test session."""
+"""Settings of hypothesis, fixtures of several rooms, and the end of a test session."""
 
 import gc
+from dataclasses import replace
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -8,6 +9,27 @@ from hypothesis import HealthCheck, settings
 # Tests do not fail because other work makes the machine slow.
 settings.register_profile("any load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any load")
+
+
+@pytest.fixture(scope="module")
+def module_cache(tmp_path_factory):
+    """Keep goal sets and other files in a cache of the module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture
+def robot_urdf(tmp_path):
+    """Write a robot as ``some_robot.urdf``."""
+    from morphgen.formats.urdf.write import urdf_text  # few tests need it
+
+    def write(robot):
+        path = tmp_path / "some_robot.urdf"
+        path.write_text(urdf_text(replace(robot, frames=()), str))
+        return path
+
+    return write
 
 
 @pytest.hookimpl(trylast=True)

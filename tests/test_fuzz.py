@@ -228,7 +228,6 @@ def require_good_manners(answer, context):
 def manners(max_examples):
     return settings(
         max_examples=max_examples,
-        deadline=None,
         derandomize=True,
         database=None,
         suppress_health_check=list(HealthCheck),

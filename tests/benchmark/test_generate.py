@@ -348,7 +348,7 @@ def test_constant_parameters_are_ignored_unless_they_differ():
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 4), st.integers(6, 40), st.floats(0.4, 1.4))
 def test_points_inside_the_hull_agree_with_a_delaunay_triangulation(seed, d, n, spread):
     rng = np.random.default_rng(seed)

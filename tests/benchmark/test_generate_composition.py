@@ -144,7 +144,7 @@ CELLS = st.lists(
 ).map(lambda triples: [cell(*triple) for triple in triples])
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(CELLS, st.integers(1, 3), st.integers(1, 4), st.integers(0, 99))
 def test_hold_out_finds_a_valid_test_set_if_one_exists(cells, n, left, seed):
     exists = any(is_fair(cells, test, left) for test in itertools.combinations(cells, n))

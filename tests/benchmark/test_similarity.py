@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -139,7 +139,6 @@ def apart(points):
 
 
 @given(PLANES)
-@settings(deadline=None)
 def test_points_of_a_plane_keep_their_distances(points):
     embedding = classical_mds(apart(points))
     np.testing.assert_allclose(apart(embedding.points), apart(points), atol=1e-5)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.robots import arm
@@ -272,7 +272,6 @@ def assert_read_back(token_array, **options):
     return back
 
 
-@settings(deadline=None)
 @given(bodies())
 def test_decoded_robots_have_the_same_tokens(body):
     robot, shapes, q = body

@@ -88,13 +88,12 @@ def is_below(tree, lower, upper):
 
 
 @given(trees(4), trees(4))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_the_distance_is_the_minimum_over_all_mappings(a, b):
     assert edit_distance(a, b) == pytest.approx(brute_force(a, b), abs=1e-12)
 
 
 @given(trees(), trees())
-@settings(deadline=None)
 def test_the_distance_is_symmetric_and_zero_on_the_diagonal(a, b):
     assert normalised_distance(a, b) == normalised_distance(b, a)
     assert normalised_distance(a, a) == 0.0
@@ -103,7 +102,7 @@ def test_the_distance_is_symmetric_and_zero_on_the_diagonal(a, b):
 
 @pytest.mark.slow
 @given(trees(), trees(), trees())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_the_triangle_inequality(a, b, c):
     for measured in (edit_distance, normalised_distance):
         assert measured(a, c) <= measured(a, b) + measured(b, c) + 1e-12

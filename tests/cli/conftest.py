@@ -1,6 +1,5 @@
 """Each command-line test runs in its own temporary folder."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
-from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import LIBRARY_VARIABLE
 
 
@@ -61,18 +59,6 @@ def refused(run, tmp_path):
 
 
 @pytest.fixture
-def robot_urdf(tmp_path):
-    """Write a robot as ``some_robot.urdf``."""
-
-    def write(robot):
-        path = tmp_path / "some_robot.urdf"
-        path.write_text(urdf_text(replace(robot, frames=()), str))
-        return path
-
-    return write
-
-
-@pytest.fixture
 def urdf(tmp_path):
     """Write XML to ``urdf/broken.urdf``, the only file of its folder."""
 
@@ -94,6 +80,15 @@ def cache(tmp_path_factory):
 def own_cache(cache, monkeypatch):
     """Keep goal sets in a cache of the module."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+@pytest.fixture
+def goal_cache(tmp_path, monkeypatch):
+    """A temporary goal cache; fits use the user's cache."""
+    from morphgen.tasks.goals import goal_sets  # loads torch, which few of the tests need
+
+    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    return tmp_path / "cache" / "morphgen"
 
 
 @pytest.fixture

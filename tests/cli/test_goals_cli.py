@@ -8,15 +8,9 @@ from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_folder import BuildSettings, build_split
 from morphgen.tasks import free_space
-from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.registry import TASKS
 
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    """A temporary goal cache; fits use the user's cache."""
-    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
-    return tmp_path / "cache" / "morphgen"
+pytestmark = pytest.mark.usefixtures("goal_cache")
 
 
 def some():
@@ -34,7 +28,7 @@ def cells(line):
     return [cell for cell in line.split("  ") if cell]
 
 
-def test_table_has_one_row_per_goal_set(ok, path, cache):
+def test_table_has_one_row_per_goal_set(ok, path, goal_cache):
     out = ok("goals", path)
     head, _, *rows, last = out.splitlines()
     assert head.split() == [
@@ -53,7 +47,7 @@ def test_table_has_one_row_per_goal_set(ok, path, cache):
     ]
     assert [row.split()[5] for row in rows] == ["0", "0", "3"]
     assert last == "3 of 3 goal sets are complete, seed 0"
-    assert len(list((cache / "goals-5").iterdir())) == 3
+    assert len(list((goal_cache / "goals-5").iterdir())) == 3
 
 
 def test_certify_option_adds_certificates(ok, path):

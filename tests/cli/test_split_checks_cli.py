@@ -12,7 +12,6 @@ from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import PAPER
-from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.goals.split_goals import read_goals
 
 
@@ -177,12 +176,6 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
         assert run("split", "audit", name, "--strict")[0] == 0, name
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    """A temporary goal cache; fits use the user's cache."""
-    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
-
-
 def reaching(**more):
     """A valid split of reach robots."""
     train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
@@ -195,7 +188,7 @@ def known(**more):
     return replace(reaching(**more), test=(*reaching().test, twin))
 
 
-@pytest.mark.usefixtures("own_cache")
+@pytest.mark.usefixtures("goal_cache")
 def test_goal_seed_is_printed_stored_and_audited(run, ok, write):
     out = ok("split", "build", write(reaching()), "--light", "--goals", "--goal-seed", "7")
     assert out.splitlines()[1] == "4 goal sets, seed 7"
@@ -207,7 +200,7 @@ def test_goal_seed_is_printed_stored_and_audited(run, ok, write):
     assert out.splitlines()[i + 1].endswith("its set was made with seed 7, the split's with 0")
 
 
-@pytest.mark.usefixtures("own_cache")
+@pytest.mark.usefixtures("goal_cache")
 def test_goals_are_audited_only_if_stored_or_requested(run, write):
     accepted = {"body-shared": "new goals", "combination-seen": "it is known"}
     path = write(known(accepted=accepted))
@@ -224,7 +217,7 @@ def test_goals_are_audited_only_if_stored_or_requested(run, write):
         assert "5 goal sets were audited, seed 0" in out
 
 
-@pytest.mark.usefixtures("own_cache")
+@pytest.mark.usefixtures("goal_cache")
 def test_accepted_findings_do_not_fail(ok, write):
     accepted = {"body-shared": "one", "combination-seen": "two", "goals-shared": "three"}
     out = ok("split", "audit", write(known(accepted=accepted)), "--goals", "--strict")

@@ -84,3 +84,11 @@ def test_links_to_fits_outside_the_bundle_are_not_followed(folder, tmp_path):
     (folder / FITS).symlink_to(tmp_path / "elsewhere.json")
     with pytest.raises(FormatError, match="leaves its folder"):
         read_bundle(folder)
+
+
+def test_invalid_fits_are_an_error_that_names_the_file(folder):
+    data = json.loads((folder / FITS).read_text())
+    data["links"][0]["token_iou"] = 7
+    (folder / FITS).write_text(json.dumps(data))
+    with pytest.raises(FormatError, match=rf"{FITS}.*invalid value 7"):
+        read_bundle(folder)

@@ -63,6 +63,7 @@ URDF_ELEMENTS = {
         "",
     ),
 }
+"""Elements of a URDF that name a file: the text in its link, and that after it."""
 MJCF_ELEMENTS = {
     "include": ("", '<include file="{uri}"/>'),
     "include with a namespace": ("", '<include xmlns="x" file="{uri}"/>'),
@@ -85,7 +86,7 @@ MJCF_ELEMENTS = {
     "flexible body": ("", '<flexcomp name="f" type="mesh" file="{uri}"/>'),
     "mesh attribute of a geom": ("", '<geom size="0.1" file="{uri}"/>'),
 }
-"""What of an MJCF names a file: before the bodies, and in one."""
+"""Elements of an MJCF that name a file: the text before its body, and that in it."""
 MESH_FILES = {
     "material library": ("obj", "mtllib {uri}\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "buffer": (

@@ -1,5 +1,6 @@
 """Resolving mesh and include references to files, without leaving the permitted folders."""
 
+import os
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from morphgen.formats.resolve import (
     PackageFinder,
     default_finder,
     distribution_file,
+    is_installed,
     require_allowed_text,
     resolve_uri,
 )
@@ -127,6 +129,16 @@ def test_ros_environment_is_searched_after_given_roots(tmp_path, urdf, monkeypat
         default_finder(packages={"one": tmp_path / "mine" / "one"}),
     ):
         assert resolve_uri("package://one/a.stl", urdf, finder) == mine
+
+
+def test_only_files_that_lie_in_an_installed_package_are_installed(tmp_path):
+    file = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
+    (tmp_path / "link.xacro").symlink_to(file)
+    mine = touch(tmp_path / "mine.xacro")
+    through = file.parent / os.path.relpath(mine.resolve(), file.parent.resolve())
+    assert through.is_file()
+    found = [is_installed(each) for each in (file, tmp_path / "link.xacro", mine, through)]
+    assert found == [True, True, False, False]
 
 
 def test_distribution_files_are_found_and_missing_ones_are_errors(monkeypatch):

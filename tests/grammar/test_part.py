@@ -246,7 +246,7 @@ def variation(*factors):
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=12, derandomize=True)
 @given(st.tuples(*[FACTOR] * 7))
 def test_neighbouring_links_stay_in_contact_for_all_scale_factors(factors):
     with pytest.MonkeyPatch.context() as patch:

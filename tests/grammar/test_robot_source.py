@@ -1,7 +1,5 @@
 """Importing a URDF or xacro as a robot: tool, home, repairs and ignored pairs."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError
-from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import import_robot, resolve_robot
 from morphgen.model.geometry import IDENTITY, Box
@@ -19,54 +16,42 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.model.tree import rename
 
 
-@pytest.fixture
-def urdf(tmp_path):
-    """Write a robot as a URDF."""
-
-    def write(robot):
-        path = tmp_path / "some_robot.urdf"
-        path.write_text(urdf_text(replace(robot, frames=()), str))
-        return path
-
-    return write
-
-
-def test_the_tool_frame_is_at_the_given_link_if_there_is_one(urdf):
-    robot = import_robot(urdf(arm()), tool="left")
+def test_the_tool_frame_is_at_the_given_link_if_there_is_one(robot_urdf):
+    robot = import_robot(robot_urdf(arm()), tool="left")
     frame = robot.frame("tool")
     assert (frame.link, frame.T_link_frame) == ("left", IDENTITY)
     assert robot.provenance["source"] == "some_robot.urdf"
-    robot = import_robot(urdf(arm()))
+    robot = import_robot(robot_urdf(arm()))
     assert robot.frames == ()
     assert "tool-missing" in {finding.code for finding in check(robot)}
 
 
-def test_the_given_root_link_becomes_the_root(urdf):
-    robot = import_robot(urdf(arm()), root_link="lower", tool="slider")
+def test_the_given_root_link_becomes_the_root(robot_urdf):
+    robot = import_robot(robot_urdf(arm()), root_link="lower", tool="slider")
     assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
     assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
 
 
-def test_the_robot_has_the_name_of_the_file_unless_a_name_is_given(urdf):
-    assert import_robot(urdf(arm())).name == "arm"
-    assert import_robot(urdf(arm()), name="limb").name == "limb"
+def test_the_robot_has_the_name_of_the_file_unless_a_name_is_given(robot_urdf):
+    assert import_robot(robot_urdf(arm())).name == "arm"
+    assert import_robot(robot_urdf(arm()), name="limb").name == "limb"
 
 
-def test_home_has_no_self_collision(urdf):
-    robot = import_robot(urdf(arm()))
+def test_home_has_no_self_collision(robot_urdf):
+    robot = import_robot(robot_urdf(arm()))
     assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
     assert ("left", "slider") in robot.ignore_pairs
 
 
-def test_home_is_zero_or_the_middle_of_a_range_without_zero(urdf):
-    path = urdf(with_joint(arm(), "elbow", limits=(0.5, 1.5)))
+def test_home_is_zero_or_the_middle_of_a_range_without_zero(robot_urdf):
+    path = robot_urdf(with_joint(arm(), "elbow", limits=(0.5, 1.5)))
     assert import_robot(path).home == pytest.approx(arm().home)  # morphgen's own, which says it
     path.write_text(path.read_text().replace("morphgen>", "others>"))
     assert import_robot(path).home == pytest.approx((0.0, 1.0, 0.0, 0.0))
 
 
-def test_safe_repairs_are_applied_and_reported(urdf):
-    path = urdf(arm())
+def test_safe_repairs_are_applied_and_reported(robot_urdf):
+    path = robot_urdf(arm())
     path.write_text(path.read_text().replace('<axis xyz="1 0 0"', '<axis xyz="2 0 0"'))
     robot = import_robot(path)
     assert robot.joints[1].axis == pytest.approx((1, 0, 0))
@@ -75,11 +60,11 @@ def test_safe_repairs_are_applied_and_reported(urdf):
     assert as_is.joints[1].axis == (2.0, 0.0, 0.0)
     assert as_is.provenance["repairs"] == []
     valid = with_joint(arm(), "right", mimic=None)
-    assert import_robot(urdf(valid)).provenance["repairs"] == []
+    assert import_robot(robot_urdf(valid)).provenance["repairs"] == []
 
 
-def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(urdf):
-    path = urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
+def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(robot_urdf):
+    path = robot_urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
     robot = import_robot(path, tool="tool")
     assert robot.frame("tool").link == "tool_link"
     assert import_robot(path).frames == robot.frames
@@ -88,7 +73,7 @@ def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(urdf):
     assert "frame-name-taken" not in {finding.code for finding in check(robot)}
     np.testing.assert_allclose(
         frame_pose(robot, robot.home),
-        frame_pose(import_robot(urdf(arm()), tool="slider"), robot.home),
+        frame_pose(import_robot(robot_urdf(arm()), tool="slider"), robot.home),
         atol=1e-12,
     )
 
@@ -110,8 +95,8 @@ def test_xacro_arguments_are_passed(tmp_path):
         ({"args": {"length": "1"}}, "xacro arguments length for a file that is not a xacro"),
     ],
 )
-def test_unknown_links_are_errors(urdf, options, message):
-    path = urdf(arm())
+def test_unknown_links_are_errors(robot_urdf, options, message):
+    path = robot_urdf(arm())
     with pytest.raises(FormatError) as caught:
         import_robot(path, **options)
     assert str(caught.value).startswith(f"{path}: {message}")

@@ -116,9 +116,7 @@ TEXTS = st.builds(
 )
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(TEXTS)
 def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 2)
@@ -136,7 +134,7 @@ def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text)
 
 
 # Few random grammars are sound, and how few is chance: that is no fault of the test.
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
 @given(TEXTS, st.integers(0, 3))
 def test_grammars_without_faults_can_be_derived(text, seed):
     grammar = grammar_from_text(text, "g")

@@ -1,4 +1,4 @@
-"""What tests do with the viewer's pages in a browser."""
+"""Use the controls of a page of the viewer in a browser, and inspect the viewer behind it."""
 
 import gc
 import time

@@ -184,9 +184,15 @@ def test_compressed_content_is_not_unpacked(run, tmp_path):
 def test_a_tensor_cannot_reach_beyond_its_storage(run, tmp_path):
     numbers = b"M" + struct.pack("<H", 832)
     more = b"J" + struct.pack("<i", 2**31 - 1)
+
+    def claimed(name, data):
+        if not name.endswith("data.pkl"):
+            return data
+        assert numbers in data
+        return data.replace(numbers, more, 1)
+
     with zipfile.ZipFile(tmp_path / CHECKPOINT, "w") as claim:
-        copied(run / CHECKPOINT, claim, lambda name, data: data.replace(numbers, more, 1))
-    assert (tmp_path / CHECKPOINT).read_bytes() != (run / CHECKPOINT).read_bytes()
+        copied(run / CHECKPOINT, claim, claimed)
     assert equal(weights(tmp_path), weights(run))
 
 

@@ -422,3 +422,9 @@ def test_one_process_compiles_many_learners(monkeypatch):
             )
             Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
     torch.compiler.reset()
+
+
+def test_the_first_episodes_are_spread():
+    batch = OnALine(8)
+    learner(batch)
+    assert batch.spread

@@ -43,11 +43,7 @@ from morphgen.tasks.scenes.robot_tables import build_robot_tables
 CONFIGS = (ReachConfig(num_goals=3), PushConfig())
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("module_cache")
 
 
 def drawn_config(request="cubes:4,stick:2", *, updates=24, slice_updates=4, **more):

@@ -68,7 +68,7 @@ def stub_batch(specs, names, num_envs, *, first=0, **options):
     return TaskBatch(tables, chosen, index, simulation, first=first, **options)
 
 
-def drive(batch, steps, seed=0, diverging=True):
+def recorded_steps(batch, steps, seed=0, diverging=True):
     """Return the numbers of all steps under random actions, by name; some environments diverge."""
     generator = torch.Generator().manual_seed(seed)
     numbers = {}
@@ -163,7 +163,7 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
     one, other = (stub_batch(specs, MIXED, 6, seed=seed, observe=CHANNELS) for seed in (3, 4))
     one.reset()
     one.advance(0.2)
-    drive(one, 25)
+    recorded_steps(one, 25)
     assert one.state_dict()["next_episode"].unique().numel() > 1
     other.load_state_dict(one.state_dict())
     observation = other.reset()
@@ -180,10 +180,10 @@ def test_skipping_what_changes_nothing_changes_no_bit(specs, names, monkeypatch)
     skipping, complete = batches
     for batch in batches:
         batch.reset(spread=True)
-    numbers = drive(skipping, 60)
+    numbers = recorded_steps(skipping, 60)
     with monkeypatch.context() as patch:
         patch.setattr(base, "HOST_DEVICES", ())
-        require_equal(numbers, drive(complete, 60))
+        require_equal(numbers, recorded_steps(complete, 60))
     assert (numbers["truncated"] | numbers["terminated"]).any(dim=0).all()
     assert numbers["diverged"].any(dim=0).any()
     assert numbers["terminated"].any() == ("push" in names)

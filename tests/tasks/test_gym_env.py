@@ -53,11 +53,7 @@ POSE = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
 FRAME = (64, 48)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def goals_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("module_cache")
 
 
 def make(name=REACH, **options):

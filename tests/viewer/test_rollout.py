@@ -43,13 +43,6 @@ def files(root):
     return FileAccess(default_library().folders, (root,), root / "none")
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture
 def beginning(episode):
     """The first 20 steps of the episode."""
@@ -58,7 +51,7 @@ def beginning(episode):
 
 
 @pytest.fixture(scope="module")
-def episode(files, cache):
+def episode(files, module_cache):
     """An episode of two reach robots: one composed, one from a bundle."""
     rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), files)
     while rollout.advance():
@@ -126,7 +119,7 @@ def test_a_damaged_episode_is_an_error_that_names_it(episode, files, root):
     assert len(refused) > 40
 
 
-def test_an_episode_at_its_start_can_be_saved(files, root, cache):
+def test_an_episode_at_its_start_can_be_saved(files, root, module_cache):
     rollout = Rollout(RolloutConfig("reach", ("robots/one",), "zero"), files)
     (root / "start.npz").write_bytes(episode_bytes(rollout.episode))
     rollout.close()
@@ -169,7 +162,7 @@ def test_an_invalid_episode_is_rejected(episode, files, root, arrays, why):
         read_episode(path, files)
 
 
-def test_an_episode_of_a_changed_robot_is_rejected(files, root, cache):
+def test_an_episode_of_a_changed_robot_is_rejected(files, root, module_cache):
     write_bundle(arm(), root / "robots" / "two", picture=False)
     rollout = Rollout(RolloutConfig("reach", ("robots/two",), "zero"), files)
     rollout.close()
@@ -180,7 +173,7 @@ def test_an_episode_of_a_changed_robot_is_rejected(files, root, cache):
         read_episode(root / "two.npz", files)
 
 
-def test_failed_robot_does_not_stop_the_others(files, cache):
+def test_failed_robot_does_not_stop_the_others(files, module_cache):
     rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), files)
     assert list(rollout.faults) == ["robots/none"]
     assert "no such file" in rollout.faults["robots/none"]
@@ -188,7 +181,7 @@ def test_failed_robot_does_not_stop_the_others(files, cache):
     rollout.close()
 
 
-def test_a_policy_gets_the_observations_it_was_trained_with(root, files, cache):
+def test_a_policy_gets_the_observations_it_was_trained_with(root, files, module_cache):
     config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
     train(root / "run", config, execution=QUIET)
@@ -211,7 +204,7 @@ def test_a_policy_gets_the_observations_it_was_trained_with(root, files, cache):
         (RolloutConfig("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
     ],
 )
-def test_an_invalid_rollout_is_rejected(files, cache, config, why):
+def test_an_invalid_rollout_is_rejected(files, module_cache, config, why):
     with pytest.raises(MorphgenError, match=why):
         Rollout(config, files)
 
