@@ -42,7 +42,7 @@ class UpdateMetrics:
     terms: dict[str, float]  # mean of each reward term
     policy_loss: float  # clipped policy loss
     value_loss: float  # half the squared error, or `matching_loss` if the critic predicts symlogs
-    entropy: float  # of a robot's actions, or of a joint's with `joint_entropy` [nats]
+    entropy: float  # entropy of a robot's actions, or mean of its joints' [nats]
     kl: float  # divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)
     clip_fraction: float  # share of the probability ratios outside of the clip range
     actor_gradient: float  # norm of the actor's gradient before clipping

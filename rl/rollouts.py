@@ -104,11 +104,10 @@ class _Results:
     def episodes(self, batch: TaskBatch) -> list[Episode]:
         """Return the episodes, ordered by environment and then by time."""
         episodes = []
+        numbers = self._numbers.tolist()  # at once: each read of a GPU waits for it
         for env, robot in enumerate(batch.env_robot_index.tolist()):
             task = TASKS[batch.specs[robot].task]
-            for success, distance, total, last, steps, diverged, angle in self._numbers[
-                env
-            ].tolist():
+            for success, distance, total, last, steps, diverged, angle in numbers[env]:
                 score = task.episode_score(total, last, int(steps))
                 facts = bool(success), distance, score, int(steps), bool(diverged), angle
                 episodes.append(Episode(env, robot, *facts))

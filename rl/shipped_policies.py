@@ -37,8 +37,7 @@ _ZERO_SHOT = {
     ("reach", "pose", True): _shipped("zero-shot-pose-obstacles", "pose-obstacles"),
     ("push", "position", False): _shipped("zero-shot-push", "push", "push"),
 }
-"""Policies of ``morphgen zeroshot`` for any robot, by task, goal and whether there are obstacles.
-"""
+"""Policies of ``morphgen zeroshot`` for any robot, by task, goal and presence of obstacles."""
 POLICIES: Registry[ShippedPolicy] = Registry(
     "policy", "morphgen.policies", {each.name: each for each in _ZERO_SHOT.values()}
 )

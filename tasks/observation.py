@@ -308,7 +308,6 @@ class PointClouds:
     def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
         """Prepare; ``begin`` draws the points."""
         n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
-        self._num_points = num_points
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
         # Box 0 is the block, and the others are the obstacles; missing ones have no size.
@@ -359,7 +358,7 @@ class PointClouds:
 def _normal(uniform: torch.Tensor) -> torch.Tensor:
     """Return normal numbers from uniform ones in [0, 1) (Box and Muller 1958), shape (..., 2 m)."""
     first, second = uniform.chunk(2, dim=-1)
-    radius = torch.sqrt(-2 * torch.log1p(-first))  # of 1 - first, which is never zero
+    radius = torch.sqrt(-2 * torch.log1p(-first))  # 1 - first is never zero
     angle = 2 * math.pi * second
     return torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
 

@@ -85,10 +85,6 @@ class RoleSliders:
             set_value(slider, moved.get(role, self._home[role]))
         self._move()
 
-    def set_all(self, position: float) -> None:
-        """Move all roles to the same position."""
-        self.set(dict.fromkeys(self._sliders, position))
-
     def _read(self) -> None:
         for role, slider in self._sliders.items():
             if role in self.moved or slider.value != self._home[role]:

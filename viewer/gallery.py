@@ -24,7 +24,7 @@ from morphgen.viewer.robot_files import (
 )
 from morphgen.viewer.robot_rows import FILTERS, UNITS, Row, passes
 
-SCALES = ("common", "own")  # of pictures: the same for all robots, or each fills its picture
+SCALES = ("common", "own")  # of pictures: one for all, or each robot fills its own
 
 
 @dataclass(eq=False)
@@ -35,7 +35,7 @@ class Gallery:
     title: str
     rows: list[robot_rows.Row]  # all robots, shown or not
     columns: tuple[str, ...] = ()  # roles in a column each; without any, there is one grid
-    scale: str = SCALES[1]  # of the pictures at first, one of `SCALES`
+    scale: str = SCALES[1]  # scale of pictures at first, one of `SCALES`
     noun: str = "robot"  # what a row shows: a robot, or a part of the library
     thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
     faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
@@ -205,7 +205,7 @@ def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str])
     if value and value not in keys:
         valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
         gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
-    labels = [f"{name[1:]}, largest first" if name[0] == "-" else name for name in keys]
+    labels = [f"{k[1:]}, largest first" if key == "sort" and k[0] == "-" else k for k in keys]
     if len(keys) > 1:
         dropdown = gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
         session.keep_choice(key, dropdown, tuple(keys))

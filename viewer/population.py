@@ -397,7 +397,7 @@ def _measured(row: Row, robot: Robot) -> Row:
 class Layout:
     """Positions of n robots on the ground, with labels."""
 
-    positions: Array  # of the roots, (n, 2) [m]: x right, y away from the reader
+    positions: Array  # roots, (n, 2) [m]: x right, y away from the reader
     labels: tuple[tuple[str, tuple[float, float]], ...] = ()
     """Texts on the ground and their positions [m]."""
 

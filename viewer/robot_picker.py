@@ -35,7 +35,7 @@ class RobotPicker:
     lists: RobotLists
     current: Callable[[], str]  # returns the URI of the robot that the dropdown shows first
     source: viser.GuiDropdownHandle[str]
-    robot: viser.GuiDropdownHandle[str]  # of the source; typing into it searches them
+    robot: viser.GuiDropdownHandle[str]  # robots of the source; typing searches them
     words: viser.GuiTextHandle
     labels: dict[str, str]  # URIs of the robots in the dropdown, by label
 

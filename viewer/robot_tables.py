@@ -16,7 +16,7 @@ from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.viewer import markup
 
-_UNITS = {"prismatic": ("m", "N", "m/s")}  # of position, effort and velocity
+_UNITS = {"prismatic": ("m", "N", "m/s")}  # units of position, effort, velocity
 _ROTATION_UNITS = ("rad", "N m", "rad/s")
 
 
@@ -25,7 +25,7 @@ class JointGroup:
     """Independent joints that came with the same part."""
 
     label: str  # label of the part, which begins the names of its joints; empty for unknown parts
-    title: str  # label and name of the part, such as `left_arm (ur5)`, or what both are
+    title: str  # label and name of the part, such as `left_arm (ur5)`, or the one that both are
     rows: tuple[int, ...]  # indices of the joints in q
 
 
@@ -52,7 +52,7 @@ def joint_groups(robot: Robot) -> list[JointGroup]:
 
 
 def part_title(label: str, part: str) -> str:
-    """Return the label of a part with its name, or once what both are."""
+    """Return the label of a part with its name, or one of them if both are the same."""
     return label if label == part else f"{label} ({part})"
 
 

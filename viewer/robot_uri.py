@@ -250,7 +250,7 @@ def with_library_meshes(robot: Robot, library: Library) -> Robot:
 
 def content_hash(uri: str, files: FileAccess) -> str:
     """Return a hash that changes with the robot's description, its parts and morphgen's version."""
-    # Not with meshes and included xacro files, which takes long: who edits one starts again.
+    # Meshes and included xacro files would take long: who edits one restarts the viewer.
     lines = [_VERSION]
     if derivation := resolve_derivation(uri, files):
         lines.append(str(derivation))

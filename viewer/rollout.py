@@ -271,7 +271,7 @@ def _to_numpy(values: torch.Tensor) -> Array:
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)  # speeds of playback [simulated seconds per second]
 FRAME_TIME = 0.04  # time between two frames in a browser: 25 per second [s]
-MAX_SIMULATION_TIME = 0.12  # until commands are handled, however far behind it is [s]
+MAX_SIMULATION_TIME = 0.12  # longest time until commands are handled [s]
 
 
 class Display(Protocol):

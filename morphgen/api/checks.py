@@ -153,11 +153,11 @@ def conform_source(
     """Compare loaders and simulators on a file, and on its bundle; see ``conform``."""
     if source.path is not None and (source.path / CARD).is_file():
         return _conform_bundle(source.path, samples, seed)
-    # The bundle that morphgen makes of it.
+    # First the bundle that morphgen makes of the file, then the file as it is.
     report = _conform_robot(read_source(source, library, root), samples, seed)
     if source.path is None or source.path.is_dir():
         return report
-    rows = compare_file(source.path, default_finder(root=root), samples, seed)  # the file as it is
+    rows = compare_file(source.path, default_finder(root=root), samples, seed)
     passed = report.passed and not any(row.is_unexplained for row in rows)
     return replace(report, passed=passed, rows=(*rows, *report.rows))
 

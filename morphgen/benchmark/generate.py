@@ -309,7 +309,7 @@ def _find_test_robots(
     name_by_hash = {robot.hash: robot.name for robot in train}
     found: list[Candidate] = []
     rejected: Counter[str] = Counter()
-    num_composed = 0  # of the rejected ones
+    num_composed = 0  # robots that were composed and rejected
     for number, stream in ((n, each) for n in itertools.count() for each in streams):
         if len(found) == request.test:
             return found
@@ -575,7 +575,7 @@ def hold_out(
     excluded, too. The first few train candidates cover every part and task of the test candidates.
     """
     rng = np.random.default_rng(seed)
-    max_held = 0  # of the best attempt, for the message
+    max_held = 0  # most test candidates of an attempt, for the message
     for _ in range(NUM_ATTEMPTS):
         pool = _TrainPool(candidates)
         order = [int(i) for i in rng.permutation(len(candidates))]

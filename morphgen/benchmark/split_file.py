@@ -19,7 +19,7 @@ from morphgen.benchmark.robot_hash import HASH_LENGTH
 from morphgen.benchmark.split import FORMAT, SIDES, Member, Regime, Split, split_id
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.formats.data_files import parse_yaml, read_text
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import write_atomic, writing
 from morphgen.formats.records import Record, read_record
 
 MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
@@ -157,11 +157,9 @@ def read_split_file(path: Path) -> SplitFile:
 
 def write_split(split: Split, path: Path) -> None:
     """Write a split file through a temporary file; the folder is created if needed."""
-    try:
+    with writing(path, BenchmarkError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, split_text(split))
-    except OSError as error:
-        raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
 
 
 def split_text(split: Split) -> str:

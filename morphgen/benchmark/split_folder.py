@@ -431,7 +431,7 @@ def build_split(
     """
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
-    with _writing(split_folder), _removed_if_empty(split_folder):
+    with writing_split(split_folder), _removed_if_empty(split_folder):
         _prepare(split_folder, split, settings)
         with locked_folder(split_folder):
             (split_folder / SUMS_FILE).unlink(missing_ok=True)  # marks the folder as unfinished
@@ -533,8 +533,8 @@ def _removed_if_empty(split_folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _writing(split_folder: Path) -> Iterator[None]:
-    """Convert an ``OSError`` to an error of one line."""
+def writing_split(split_folder: Path) -> Iterator[None]:
+    """Turn an ``OSError`` into an error that names the file in the folder, if it is known."""
     try:
         yield
     except OSError as error:

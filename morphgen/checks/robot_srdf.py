@@ -196,7 +196,7 @@ class _Limb(NamedTuple):
     arm: str
     tool: str
     hand: str
-    links: list[str]  # of the end-effector; none without one
+    links: list[str]  # links of the end-effector, if there is one
 
 
 def _limbs(robot: Robot) -> Iterator[_Limb]:

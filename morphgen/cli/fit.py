@@ -195,7 +195,7 @@ def _folder(args: argparse.Namespace, target: Target, *, several: bool) -> Path:
     folder = bundle_folder(parent, name)
     if target.path is not None:
         source = target.path.resolve()
-        # The bundle itself, or the one that a named file is in.
+        # A robot may be named by its bundle, or by a file in it.
         if folder.resolve() in (source, source.parent):
             raise FormatError(f"--out {args.out} is the robot itself; name another folder")
     require_replaceable(folder)

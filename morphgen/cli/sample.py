@@ -174,7 +174,7 @@ def sample(args: argparse.Namespace) -> None:
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]
-        # The most frequent first.
+        # The most frequent reason comes first.
         rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
         lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
         lines += [f"  {name} has the same body as {same}" for name, same in report.duplicates]

@@ -180,7 +180,7 @@ def _csv(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     rows.writerow(("robot", "other", *matrices))
     for i, robot in enumerate(names):
         for j in range(i + 1, len(names)):
-            # The digits from which the same number is read.
+            # repr has the digits from which the same number is read.
             rows.writerow((robot, names[j], *(repr(float(m[i, j])) for m in matrices.values())))
     return text.getvalue().encode()
 

@@ -611,7 +611,7 @@ def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
 
     groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
     for split in splits:
-        # In order: a hash per robot.
+        # The robots are compared in their order.
         hashes = tuple(tuple(m.robot_hash for m in split.side(side)) for side in SIDES)
         groups.setdefault(hashes, []).append(split)
     return {_common_prefix([split.name for split in group]): group for group in groups.values()}

@@ -345,7 +345,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
     for subrun in subruns:
         if (subrun.folder / CHECKPOINT).is_file():
             print(subrun.folder / CHECKPOINT)
-    if subruns:  # of the processes of torchrun, the first one says it
+    if subruns:  # the first process of torchrun alone says it
         left = sum(not is_done(subrun) for subrun in subruns)
         if left:
             what = f" with {left} of {len(subruns)} robots left" * (len(subruns) > 1)

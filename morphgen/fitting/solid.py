@@ -70,7 +70,7 @@ class Solid:
             inside[near] = winding > 0.5
         if self.method == "filled":
             unsure = near & ~inside
-            inside[unsure] = openness(self._rays, points[unsure]) < MAX_OPENNESS
+            inside[unsure] = _openness(self._rays, points[unsure]) < MAX_OPENNESS
         return inside
 
     def distance(self, points: Array) -> Array:
@@ -226,7 +226,7 @@ def _probes(solid: Solid) -> Array:
     return np.random.default_rng(0).uniform(low, high, (_NUM_PROBES, 3))
 
 
-def openness(rays: RayMeshIntersector, points: Array) -> Array:
+def _openness(rays: RayMeshIntersector, points: Array) -> Array:
     """Return the shares of directions in which rays from points (n, 3) hit no triangle, shape (n,).
 
     It is at least one half for a point outside of the convex hull.

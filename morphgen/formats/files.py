@@ -14,7 +14,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 
@@ -121,12 +121,12 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def writing(what: object) -> Iterator[None]:
+def writing(what: object, error_type: type[MorphgenError] = FormatError) -> Iterator[None]:
     """Turn an ``OSError`` into the error that something cannot be written."""
     try:
         yield
     except OSError as error:
-        raise FormatError(f"cannot write {what}: {error.strerror}") from error
+        raise error_type(f"cannot write {what}: {error.strerror}") from error
 
 
 def write_file(path: Path, content: str | bytes) -> None:

@@ -183,3 +183,12 @@ def _line(text: str | bytes, path: KeyPath) -> int:
         if node is not None:
             line = node.start_mark.line + 1
     return line
+
+
+def dotted_values(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values in nested dictionaries by their dotted names."""
+    values: dict[str, Any] = {}
+    for name, value in data.items():
+        is_nested = isinstance(value, dict) and value
+        values |= dotted_values(value, f"{prefix}{name}.") if is_nested else {prefix + name: value}
+    return values

@@ -33,6 +33,7 @@ from morphgen.formats.files import (
     partial_path,
     replacing_folder,
     write_atomic,
+    writing,
 )
 from morphgen.formats.records import FiniteNumber
 from morphgen.formats.resolve import portable_uri
@@ -235,12 +236,10 @@ def _prepare(config: SetConfig) -> None:
             raise FormatError(
                 f"{config.folder} exists and is not a set (no {SETTINGS}); name another"
             )
-        try:
+        with writing(f"to {config.folder}"):
             config.folder.mkdir(parents=True, exist_ok=True)
             write_atomic(config.folder / GRAMMAR, config.grammar_text)
             write_atomic(path, json.dumps(settings, indent=2) + "\n")
-        except OSError as error:
-            raise FormatError(f"cannot write to {config.folder}: {error.strerror}") from error
         return
     existing = read_settings(config.folder)
     for key, value in settings.items():

@@ -196,7 +196,7 @@ def compile_tree(
     links = max_links or most
     levels_of = [_levels(robot) for robot in robots]
     levels, column, start = [], np.zeros((len(robots), links), dtype=np.int64), 1
-    level_column = np.zeros_like(column)  # of each link within its level
+    level_column = np.zeros_like(column)  # column of each link within its level
     for depth in range(1, max(map(len, levels_of))):
         members = [rows[depth] if depth < len(rows) else [] for rows in levels_of]
         width = max(map(len, members))

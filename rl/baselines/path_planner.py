@@ -112,9 +112,9 @@ def rrt_connect(
     """Grow a tree from the start (dof,) and one from the goals (n, dof) until they meet.
 
     RRT-Connect (Kuffner and LaValle 2000) between joint limits (dof, 2). Without goals, the tree of
-    the start grows alone. Its lengths count the largest steps of the joints, (dof,). Returns
-    waypoints from the start to a goal, None if the trees did not meet; and the tree of the start,
-    whose nodes can all be reached.
+    the start grows alone. ``step`` is the largest change of every joint in a control step, (dof,),
+    and lengths are in control steps. Returns waypoints from the start to a goal, None if the trees
+    did not meet; and the tree of the start, whose nodes can all be reached.
     """
     start_tree = Tree(start[None], step, free_fraction)
     growing, other = start_tree, Tree(goals, step, free_fraction)
@@ -175,7 +175,7 @@ class PathPlanner:
         block: Array | None = None,
         tree: Tree | None = None,
     ) -> Path | None:
-        """Return the cheapest free path straight to a goal, or by way of its via; None if none is.
+        """Return the cheapest free path, straight to a goal or by way of its via; None without one.
 
         Start (dof,), goals (n, dof) and vias (n, dof) are configurations; the block has a pose (7,)
         if the scene has one.

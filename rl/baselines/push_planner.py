@@ -196,7 +196,7 @@ class PushPlanner:
         steps_left: float,
         tree: Tree | None = None,
     ) -> tuple[float, Path, _Candidates] | None:
-        """Return cost, path and candidates of the cheapest path to a candidate; None if none is."""
+        """Return cost, path and candidates of the cheapest free path; None without one."""
         cost = PathCost(candidates.cost, steps_left - candidates.steps)
         if tree is None:
             order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")

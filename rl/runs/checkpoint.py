@@ -22,13 +22,12 @@ from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic, writing
-from morphgen.formats.records import Record, read_record
+from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
 from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
-from morphgen.rl.scores.scores import dotted_values
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
@@ -84,7 +83,7 @@ def require_learner(learner: object, where: str) -> None:
         if not 0 <= number < len(parameters):
             raise TaskError(f"{where}: optimiser: state of an unknown parameter {number}")
         wanted = dict.fromkeys(("exp_avg", "exp_avg_sq"), parameters[number])
-        own = {name: moments[name] for name in moments if name != "step"}  # has no shape
+        own = {name: moments[name] for name in moments if name != "step"}  # a count, no moment
         _require_tensors(own, wanted, f"{where}: optimiser: parameter {number}")
 
 

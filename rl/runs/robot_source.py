@@ -36,7 +36,7 @@ from morphgen.formats.files import write_file
 from morphgen.formats.records import read_record
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
-from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.processes import parallel_map
 from morphgen.progress import own_progress, show_progress
@@ -409,7 +409,8 @@ def _draw_all(
     held_out = tuple(sorted({member.robot_hash for split in splits for member in split.test}))
     total = num_drawn(source)
     goals = replace(config, seed=source.goal_seed)
-    draw_one = partial(_draw_one, source, goals, library.folders, others | frozenset(held_out))
+    factory = RobotFactory(library, max_links=LARGEST_MAX_LINKS)
+    draw_one = partial(_draw_one, source, goals, factory, others | frozenset(held_out))
     kept: dict[str, tuple[Member, EnvSpec]] = {}
     skipped: Counter[str] = Counter()
     fault = ""
@@ -447,12 +448,11 @@ def _draw_all(
 def _draw_one(
     source: RobotSource,
     config: GoalConfig,
-    folders: tuple[Path, ...],
+    factory: RobotFactory,
     held_out: frozenset[str],
     recipe: SampledRecipe,
 ) -> tuple[Member, EnvSpec | None, str, str]:
     """Return a robot with its environments, or the reason for skipping it and its error."""
-    factory = _factory(folders)
     (member,) = factory_members((factory(recipe),), (str(source.task),), source.obstacles)
     if member.robot_hash in held_out:
         return member, None, HELD_OUT, ""
@@ -460,9 +460,3 @@ def _draw_one(
         return member, member_spec(member, factory.library, config), "", ""
     except MorphgenError as error:
         return member, None, UNFIT, str(error)
-
-
-@lru_cache(maxsize=2)
-def _factory(folders: tuple[Path, ...]) -> RobotFactory:
-    """Return the factory of a process, which keeps the parts that it has read."""
-    return RobotFactory(Library(folders), max_links=LARGEST_MAX_LINKS)

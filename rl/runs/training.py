@@ -539,21 +539,19 @@ def _learn(
     """Make the remaining updates of a part, and record them; return whether it stopped early."""
     is_stopped = False
     interval = updates_between(part.config)
-    with ExitStack() as stack:
-        record: Recorder | None = None
-        if execution is not None:
-            tensorboard, wandb = execution.tensorboard, execution.wandb
-            recorders = recording(
-                part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
-            )
-            record = stack.enter_context(recorders)
+    recorders: AbstractContextManager[Recorder] = nullcontext(lambda metrics: None)
+    if execution is not None:
+        tensorboard, wandb = execution.tensorboard, execution.wandb
+        recorders = recording(
+            part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
+        )
+    with recorders as record:
         stop.start_clock()
         while not learner.done and not is_stopped:
             metrics = learner.iterate()
             scores = batches.recorded_scores(metrics.scores, learner.update)
             metrics = replace(metrics, scores=scores)
-            if record is not None:
-                record(metrics)
+            record(metrics)
             if batches.changes_at(learner.update):
                 use_batch(learner, batches.make(learner.update))
             # A checkpoint has the state of the batch that the run continues with.

@@ -127,9 +127,11 @@ def _robot(named: Mapping[str, str], rows: Iterable[Mapping[str, str]]) -> dict[
     values: dict[str, list[Any]] = {name: [] for name in (*LISTS, *RANDOM)}
     for row in rows:  # one at a time: as a mapping, a row takes ten times its text
         for name, own in values.items():
-            if name in _FLAGS and (row[name] or name in LISTS):
+            if name in RANDOM and not row[name]:
+                continue  # the random policy had fewer episodes
+            if name in _FLAGS:
                 own.extend(_flags(row[name], int(row["episodes"])))
-            elif row[name] or name in LISTS:
+            else:
                 own.append(int(row[name]) if name == "steps" else float(row[name]))
     return {**named, **values}
 

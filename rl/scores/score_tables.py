@@ -110,8 +110,8 @@ def curves(cells: Sequence[Cell]) -> bytes:
 def _curve(cell: Cell) -> tuple[list[int], list[float], bool] | None:
     """Return the mean training curve of a run's parts; None if there are no metrics yet.
 
-    It has the transitions and the mean score of a control step up to and of each update, and
-    whether all updates have been made.
+    It has, per update, the transitions so far and the mean score of a control step; and whether all
+    updates have been made.
     """
     assert cell.config is not None
     runs = subruns_of(cell.folder, cell.config)

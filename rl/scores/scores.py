@@ -197,7 +197,7 @@ def relative_scores(outcomes: RobotOutcomes, random: RandomScores | None = None)
             "policy; leave the robots of this side out"
         )
     own = np.array(random[outcomes.side, outcomes.robot])
-    if len(scores) % len(own):  # of another run: some episodes would count more often than others
+    if len(scores) % len(own):  # another run's: some episodes would count more often
         own = np.array([own.mean()])
     relative: Array = scores - np.resize(own, len(scores))
     return relative
@@ -256,15 +256,6 @@ def finite_or_none(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, (tuple, list)):
         return [finite_or_none(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def dotted_values(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values in nested dictionaries by their dotted names."""
-    values: dict[str, Any] = {}
-    for name, value in data.items():
-        is_nested = isinstance(value, dict) and value
-        values |= dotted_values(value, f"{prefix}{name}.") if is_nested else {prefix + name: value}
-    return values
 
 
 def score_decimals(scores: Iterable[float]) -> int:

@@ -216,11 +216,12 @@ def do_cell(
         scores: list[Score] = []
         for side in sides:
             source = other_side(cell.source, side)
+            if mode is None and not BASELINES[cell.agent].suits(tasks_of(source)):
+                continue  # no robot of this side has a task of the baseline
             with stage(f"{cell.agent}{f' {name}' if mode else ''} on {side}"):
                 if mode is not None:
                     scores += evaluate_run(folder, side, eval_config, mode)
-                # A baseline is not evaluated on a side without a robot for it.
-                elif BASELINES[cell.agent].suits(tasks_of(source)):
+                else:
                     scores += evaluate_baseline(cell.agent, source, eval_config)
         append_submission(cell.study / EPISODES, _submission(cell, name, scores))
 

@@ -22,8 +22,8 @@ from morphgen.benchmark.split import Split, split_id
 from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
-from morphgen.formats.records import Record, read_record
-from morphgen.rl.scores.scores import Count, Name, RobotOutcomes, Score, dotted_values
+from morphgen.formats.records import Record, dotted_values, read_record
+from morphgen.rl.scores.scores import Count, Name, RobotOutcomes, Score
 from morphgen.tasks.goals.eval_protocol import EvalProtocol, ExpectedRobot
 from morphgen.tasks.registry import TASKS
 

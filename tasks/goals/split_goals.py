@@ -21,7 +21,13 @@ from typing import Any
 
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.split import Member, Side, Split, require_side, sided_members
-from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
+from morphgen.benchmark.split_folder import (
+    README_FILE,
+    SUMS_FILE,
+    read_sums,
+    sums_text,
+    writing_split,
+)
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
@@ -180,22 +186,18 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
     folder = home / GOALS
     files = dict(_files(results, config))
     read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
-    try:
-        with locked_folder(home):
-            sums = read_sums(home / SUMS_FILE)
-            (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
-            for leftover in home.glob(f".{GOALS}.*"):
-                shutil.rmtree(leftover, ignore_errors=True)
-            with replacing_folder(folder) as partial:
-                for name, content in files.items():
-                    (partial / name).parent.mkdir(exist_ok=True)
-                    (partial / name).write_bytes(content)
-            sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
-            sums |= {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
-            write_atomic(home / SUMS_FILE, sums_text(sums))
-    except OSError as error:
-        path = error.filename or home
-        raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
+    with writing_split(home), locked_folder(home):
+        sums = read_sums(home / SUMS_FILE)
+        (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
+        for leftover in home.glob(f".{GOALS}.*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        with replacing_folder(folder) as partial:
+            for name, content in files.items():
+                (partial / name).parent.mkdir(exist_ok=True)
+                (partial / name).write_bytes(content)
+        sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
+        sums |= {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
+        write_atomic(home / SUMS_FILE, sums_text(sums))
     return folder
 
 

@@ -49,8 +49,8 @@ from morphgen.benchmark.survey import (
     survey_difficulty,
     survey_split,
 )
-from morphgen.errors import BenchmarkError, FormatError
-from morphgen.formats.files import file_sha256, write_atomic
+from morphgen.errors import BenchmarkError
+from morphgen.formats.files import file_sha256, write_atomic, writing
 from morphgen.formats.records import read_record
 from morphgen.formats.zip_files import write_zip
 from morphgen.grammar.library import Library
@@ -225,9 +225,7 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
             f"{archive} exists with another content; a release does not change: name another "
             "--version or --out"
         )
-    try:
+    with writing(archive):
         made.replace(archive)
-    except OSError as error:
-        raise FormatError(f"cannot write {archive}: {error.strerror}") from error
     content = file_sha256(folder / SUMS_FILE)
     return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size, release)

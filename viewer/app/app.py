@@ -54,7 +54,7 @@ class Viewer:
     uploads: TemporaryDirectory[str]  # deleted with the viewer, at the latest when its process ends
     sessions: dict[str, Session] = field(default_factory=dict)
     """Current sessions of the connected browsers, by the secret token that their scripts send."""
-    cache: SharedResults = field(default_factory=SharedResults)  # of slow work, for all sessions
+    cache: SharedResults = field(default_factory=SharedResults)  # results for all sessions
 
     @property
     def port(self) -> int:

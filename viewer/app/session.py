@@ -103,7 +103,7 @@ class Session:
     width: int = DEFAULT_WIDTH  # width of the browser's window when the page was opened [pixels]
     chosen: tuple[str, ...] = ()  # URIs of the robots in the tray
     visit: int = 0  # number of the page since the browser has loaded the client
-    cache: SharedResults = field(default_factory=SharedResults)  # of slow work, for all browsers
+    cache: SharedResults = field(default_factory=SharedResults)  # results for all browsers
     events: ThreadPoolExecutor = field(
         default_factory=partial(ThreadPoolExecutor, 1, "morphgen-events")
     )

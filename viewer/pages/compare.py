@@ -29,7 +29,7 @@ EMPTY = (
 ONE_ROBOT = "Add a second robot to see how similar they are."
 PRIMITIVES = "primitives"  # value of `show` in the address when primitives are drawn
 GAP = 0.35  # distance between the bounding boxes of two robots [m]
-_CAMERA_DIRECTION = (0.74, 0.09, 0.28)  # to the camera: robots along y are from left to right
+_CAMERA_DIRECTION = (0.74, 0.09, 0.28)  # robots along y are seen from left to right
 
 
 @dataclass(eq=False)
@@ -151,15 +151,13 @@ def _add_move_tab(page: ComparePage) -> None:
     session = page.session
     buttons = session.client.gui.add_button_group("Go to", ("home", "middle"))
     sliders = page.sliders = RoleSliders(session, -1.0, lambda: _move(page))
+    roles = comparison.all_roles(page.robots)
 
     def go_to_target() -> None:
-        if buttons.value == "home":
-            sliders.set({})
-        else:
-            sliders.set_all(0.0)
+        sliders.set({} if buttons.value == "home" else dict.fromkeys(roles, 0.0))
 
     session.on_change(buttons, go_to_target)
-    for role in comparison.all_roles(page.robots):
+    for role in roles:
         names = ", ".join(
             robot.name for robot in page.robots if role in comparison.joint_roles(robot)
         )

@@ -225,7 +225,7 @@ Mode = Literal["typical", "drawn", "chosen"]
 """The typical robot, one that is drawn by seed and number, or the one that choices give."""
 _PLACE = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
 """Beginning of an error that names a place in a grammar."""
-ShowRobot = Callable[[Robot, Derivation, str, str], None]  # also gets command and URI
+ShowRobot = Callable[[Robot, Derivation, str, str], None]  # gets command and URI, too
 
 
 @dataclass(eq=False)
@@ -240,12 +240,12 @@ class GrammarTab:
     start: viser.GuiDropdownHandle[str]  # grammars to start from
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
-    too_long: viser.GuiHtmlHandle  # that the text does not fit into the address, or empty
+    too_long: viser.GuiHtmlHandle  # says that an address cannot hold the text, or empty
     seed: viser.GuiNumberHandle[int]
     number: viser.GuiNumberHandle[int]
     num_parts: viser.GuiSliderHandle[int] = field(init=False)
     tree: viser.GuiHtmlHandle = field(init=False)
-    derivation: Derivation | None = None  # of the whole robot; fewer parts may be shown
+    derivation: Derivation | None = None  # the whole robot's; fewer parts may be shown
     choices: Choices = field(default_factory=dict)  # choices that gave the robot
     mode: Mode = "typical"  # which robot of the grammar is shown
     on_shown: Callable[[Individual], object] | None = None  # called with a whole robot

@@ -32,7 +32,7 @@ class PartChoice:
     """Parts by slot, and the parameters that differ from their defaults."""
 
     parts: Mapping[str, str]  # names of parts by slot, such as `left.arm`
-    values: Mapping[str, float] = field(default_factory=dict)  # by `slot.parameter` [SI]
+    values: Mapping[str, float] = field(default_factory=dict)  # value of each `slot.parameter` [SI]
 
     @property
     def words(self) -> str:

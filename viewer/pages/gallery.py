@@ -113,7 +113,8 @@ def show_chosen(session: Session) -> None:
     header = "The first robots that you chose are to train on, the others to test on."
     open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
     gui, n = session.client.gui, len(rows)
-    initial = min(parse_count(session.address.state.get("train", ""), max(n - 1, 1)), n)
+    default = max(n - 1, 1)
+    initial = min(parse_count(session.address.state.get("train", ""), default), n)
     num_train = gui.add_slider("to train on", 0, n, 1, initial)
 
     def divide() -> None:
@@ -127,7 +128,7 @@ def show_chosen(session: Session) -> None:
         address = replace(session.address, subjects=session.chosen or ("",))
         session.open_address(address, instead=True)
 
-    session.keep("train", lambda: str(num_train.value))
+    session.keep("train", lambda: "" if num_train.value == default else str(num_train.value))
     _set_sides(gallery.rows, initial)
     add_controls(gallery)
     add_split_form(session, lambda: sides, expanded=True)

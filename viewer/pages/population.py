@@ -55,7 +55,7 @@ ARRANGEMENTS = {
 }
 """Labels of the arrangements by their key in the address."""
 MIDDLE = 0.5  # position of a slider whose joints are at home
-CAMERA_DIRECTION = (0.08, -0.8, 0.6)  # to the camera: rows are read from left to right
+CAMERA_DIRECTION = (0.08, -0.8, 0.6)  # to the camera, which sees rows from left to right
 _NUM_NAMED = 5  # selected robots that are listed
 
 
@@ -308,11 +308,12 @@ def _add_actions(page: PopulationPage) -> None:
         session.choose((*session.chosen, *(row.uri for row in _require_selection(page))))
 
     def export_robots() -> None:
-        send_bundles(session, [row.uri for row in _require_selection(page)])
+        uris = [row.uri for row in _require_selection(page)]  # of now, whatever work is waiting
+        session.run_in_background(lambda: send_bundles(session, uris))
 
     session.on_change(select, change_selection)
     session.on_change(choose, choose_robots)
-    session.on_press(export, export_robots)
+    session.on_change(export, export_robots)
 
 
 def _require_selection(page: PopulationPage) -> list[Row]:

@@ -112,7 +112,7 @@ class RobotPage:
     range_row: int | None = None  # index in q of the joint whose axis and range are drawn
     findings: tuple[Finding, ...] = ()  # findings of the checks, once they are there
     link_choice: viser.GuiDropdownHandle[str] | None = None
-    primitives: Sequence[Sequence[Shape]] | None = None  # by link, once they were shown
+    primitives: Sequence[Sequence[Shape]] | None = None  # primitives by link, once they were shown
     workspace: Workspace | None = None  # controls of the workspace; None for robots without a tool
     toggles: dict[str, viser.GuiCheckboxHandle] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
@@ -550,7 +550,7 @@ extents of the robot: surfaces at the same place would flicker."""
 
 
 def _add_toggles(page: RobotPage) -> None:
-    """Add a checkbox for everything that can be shown, and the slider of the opacity."""
+    """Add a checkbox for everything that can be shown, and the slider of the workspace's slice."""
     gui, session = page.session.client.gui, page.session
     for name in TOGGLES:
         if name in TOOL_TOGGLES and not has_tool(page.robot):
@@ -595,8 +595,10 @@ def _show_visual(page: RobotPage) -> None:
     """Show the visual shapes as the toggles say, and the layers beside them exact or grown."""
     page.view.set_opacity(_XRAY_OPACITY if _is_on(page, "x-ray") else 1.0)
     page.view.set_visible("visual", _has_visual(page))
-    _show_layer(page, "collision")
-    _show_layer(page, "primitives")
+    if "collision" in page.view.layers:  # else its own toggle draws it
+        _show_layer(page, "collision")
+    if "primitives" in page.view.layers:
+        _show_layer(page, "primitives")
 
 
 def _show_layer(page: RobotPage, layer: Literal["collision", "primitives"]) -> None:

@@ -80,7 +80,7 @@ _AMBER: Rgb = (232, 89, 12)  # colour of the inertia of links with findings abou
 _SHELL: Rgb = (76, 110, 245)
 SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
 """Colours of a slice of the workspace where few and where most configurations lead."""
-_INERTIA_CODES = ("inertia", "mass", "com-", "density")  # of findings about inertia begin so
+_INERTIA_CODES = ("inertia", "mass", "com-", "density")  # beginnings of codes about inertia
 _NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
 

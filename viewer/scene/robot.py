@@ -35,7 +35,7 @@ from morphgen.viewer.scene.stage import (
 Layer = Literal["visual", "collision", "primitives", "inertia"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
-RED: Rgb = (224, 49, 49)  # colour of colliding or selected links
+RED: Rgb = (224, 49, 49)  # colour of colliding links
 _COLOURS: Mapping[Layer, Rgb] = {
     "collision": (64, 192, 87),
     "primitives": (253, 126, 20),

@@ -156,7 +156,7 @@ def background_colour(*, dark: bool) -> Rgb:
 
 
 def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
-    """Draw an endless grid at a height [m]; its cells have 10 cm or, below a large size, 1 m."""
+    """Draw an endless grid at a height [m]; its cells have 10 cm, or 1 m under large things."""
     cell = 0.1 if size < 8 else 1.0
     scene.add_grid(
         "/ground",

@@ -344,6 +344,7 @@ class _Reader:
         An ellipsoid becomes a convex mesh of its volume, or a sphere if its radii are equal.
         """
         model, T_link_body = self._model, self.T_link_body[body]
+        is_moved = not T_link_body.is_identity
         visuals: list[Shape] = []
         collisions: list[Shape] = []
         drawn: list[Shape] = []
@@ -364,7 +365,6 @@ class _Reader:
             if geometry is None:
                 refused.setdefault(kind.name.removeprefix("mjGEOM_").lower(), []).append(name)
                 continue
-            is_moved = not T_link_body.is_identity
             shape = Shape(geometry, T_link_body @ T_body_shape if is_moved else T_body_shape)
             if touches:
                 collisions.append(shape)

@@ -260,19 +260,27 @@ def _place_findings(
         if place == "installed":
             source = package_source(files[0])
             packages.append({"package": package, **source})
-            code, come = "mesh-from-package", f"come from {source['source']}"
+            code, origin_of = "mesh-from-package", source["source"]
             why = (
                 f"package {package!r} is not around the file; {count} meshes come from the one in "
+                f"{origin_of}, {example}"
             )
-            why += f"{source['source']}, {example}"
             fix = "put the meshes beside the file, if these are not the ones"
-            repair = f"{count} meshes of package {package!r} {come}, licence {source['licence']}"
+            repair = (
+                f"{count} meshes of package {package!r} come from {origin_of}, "
+                f"licence {source['licence']}"
+            )
         else:
-            code, where = "mesh-beside", f"were found beside the file, {example}"
-            why = f"package {package!r} is not known; {count} of its meshes {where}"
+            code = "mesh-beside"
+            why = (
+                f"package {package!r} is not known; {count} of its meshes were found beside the "
+                f"file, {example}"
+            )
             fix = f"name the folder of the file {package!r}, or name the package by --root"
-            read = "were read from the file's own folders"
-            repair = f"{count} meshes of the unknown package {package!r} {read}"
+            repair = (
+                f"{count} meshes of the unknown package {package!r} were read from the file's own "
+                "folders"
+            )
         findings.append(Finding(code, "warning", origin, why, fix, repair))
     return packages, findings
 

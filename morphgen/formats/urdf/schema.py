@@ -75,11 +75,11 @@ class _Attribute:
 
 def _parsed(
     schema: str,
-) -> tuple[dict[str, list[_Attribute]], dict[str, list[str]], dict[str, str]]:
-    """Return the attributes and the children of every element by tag, and the marks of children."""
+) -> tuple[dict[str, list[_Attribute]], dict[str, list[str]], dict[tuple[str, str], str]]:
+    """Return attributes and children by tag, and marks by the tags of parent and child."""
     attributes: dict[str, list[_Attribute]] = {}
     children: dict[str, list[str]] = {}
-    marks: dict[str, str] = {}
+    marks: dict[tuple[str, str], str] = {}
     for line in schema.strip().splitlines():
         own, _, inside = line.partition(">")
         tag, *words = own.split()
@@ -89,13 +89,15 @@ def _parsed(
             attributes.setdefault(tag, []).append(attribute)
         for name, mark in re.findall(r"(\w+)([*?]?)", inside):
             children.setdefault(tag, []).append(name)
-            marks[name] = mark
+            marks[tag, name] = mark
     return attributes, children, marks
 
 
 _ATTRIBUTES, CHILDREN, _MARKS = _parsed(_SCHEMA)
 _READ_ATTRIBUTES = {tag: [each.name for each in rules] for tag, rules in _ATTRIBUTES.items()}
-_READ_CHILDREN = {tag: [n for n in names if _MARKS[n] != "?"] for tag, names in CHILDREN.items()}
+_READ_CHILDREN = {
+    tag: [name for name in names if _MARKS[tag, name] != "?"] for tag, names in CHILDREN.items()
+}
 _EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
     "joint": {"parent": "", "child": ""},
     "inertial": {
@@ -193,11 +195,10 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
         yield _finding(element, *fault)
     if tag == "geometry":
         yield from _geometry_findings(element)
-    for name in (
-        CHILDREN.get(tag, ()) if tag != "robot" else ()
-    ):  # its parts have checks of their own
+    # `_robot_findings` checks the children of <robot>.
+    for name in () if tag == "robot" else CHILDREN.get(tag, ()):
         children = element.findall(name)
-        if len(children) > 1 and _MARKS[name] != "*":
+        if len(children) > 1 and _MARKS[tag, name] != "*":
             why = f"<{tag}> has {len(children)} <{name}>; the first one counts"
             repair = f"of {len(children)} <{name}> the first one was taken"
             yield _finding(children[1], "element-repeated", why, "keep one", repair)
@@ -270,7 +271,7 @@ def _number_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_
         yield "number-malformed", why, fix
         return
     if len(words) not in counts:
-        surplus = name == "scale" and len(words) > max(counts)  # as of some exporters
+        surplus = name == "scale" and len(words) > max(counts)  # some exporters write them
         repair = f"of {shown} the first {max(counts)} numbers were taken" if surplus else ""
         fix = f"write {' or '.join(map(str, counts))}"
         yield "number-count", f"{shown} holds {len(words)} numbers", fix, repair
@@ -344,10 +345,8 @@ def _document_findings(root: etree._Element) -> list[Finding]:
     # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
     name = f"<xacro:{etree.QName(unexpanded).localname}>"
-    why, fix = (
-        f"{name} is left in the document",
-        "give the file the suffix .xacro, or expand it first",
-    )
+    why = f"{name} is left in the document"
+    fix = "give the file the suffix .xacro, or expand it first"
     repair = "" if broken else f"{name} was left out"
     owner = f"robot {shortened(root.get('name', ''))!r}" if root.get("name") else ""
     xacro_finding = _finding(unexpanded, "xacro-unexpanded", why, fix, repair, owner)
@@ -442,10 +441,8 @@ def _tree(links: Sequence[etree._Element], joints: Sequence[etree._Element]) -> 
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
-                why, fix = (
-                    f"its {role} {name!r} is not a link",
-                    f"name a link{nearest(name, by_name)}",
-                )
+                why = f"its {role} {name!r} is not a link"
+                fix = f"name a link{nearest(name, by_name)}"
                 yield _finding(joint, "joint-link-unknown", why, fix)
         if not child or child not in by_name:
             continue

@@ -22,7 +22,7 @@ from morphgen.formats.resolve import PackageFinder, is_installed
 from morphgen.formats.xacro.evaluator import Expression, Function, RefusedError
 from morphgen.formats.xacro.expand import Expansion, run_in_child
 
-_OPEN, _CLOSE = "\ue000", "\ue001"  # of the private use area, which documents hardly have
+_OPEN, _CLOSE = "\ue000", "\ue001"  # private-use characters: documents hardly have them
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
 _FUNCTIONS: Mapping[str, Callable[..., object]] = {
     name: getattr(math, name)
