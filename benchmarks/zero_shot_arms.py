@@ -73,7 +73,7 @@ class Measuring:
         except TaskError as error:
             return label, one_line(str(error))
         if self.task == "reach":
-            (score,) = evaluate([FollowPath], source, self.config, Interface(channels=PATH))
+            (score,) = evaluate([FollowPath], source, self.config, Interface(observe=PATH))
             (policy, own), *others = results.items()
             results = {policy: own, "path": score, **dict(others)}
         return label, results

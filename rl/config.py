@@ -102,6 +102,21 @@ def _record_of(kind: type, given: frozenset[str]) -> type[msgspec.Struct]:
     return msgspec.defstruct(kind.__name__, declared, bases=(Record,), frozen=True, kw_only=True)
 
 
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], between: str) -> str:
+    """Return which of our values others have not, as ``seed 3, not 4``; empty if they are equal."""
+    pairs = {name: (theirs.get(name), value) for name, value in ours.items()}
+    return "; ".join(
+        f"{name} {_short(their)}{between}{_short(our)}"
+        for name, (their, our) in pairs.items()
+        if their != our
+    )
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) < 60 and "\n" not in text else f"of {len(text)} letters"
+
+
 def policy_from(stored: object, where: str = "policy") -> PolicyConfig:
     """Return the policy config that ``dataclasses.asdict`` made a dictionary of."""
     data = dict(stored) if isinstance(stored, Mapping) else stored

@@ -2,26 +2,22 @@
 
 ``torchrun`` starts the processes. Each collects rollouts in its own environments. Gradients are
 averaged before every step of the optimiser, so that all processes keep the same weights; process 0
-alone writes files. The metrics of an update, which they merge, stand here, too.
+alone writes files. The metrics of an update, which are those of all processes, stand here, too.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import distributed
 
 from morphgen.errors import TaskError
-
-Metrics = dict[str, Any]  # metrics of one process's rollout by name
 
 
 @dataclass(frozen=True)
@@ -55,12 +51,6 @@ class UpdateMetrics:
     steps_per_second: float  # transitions per second, collection and learning together
 
 
-def explained_variance(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
-    """Return 1 if values predict the returns, and 0 if no better than the returns' mean."""
-    spread = returns.var()
-    return torch.where(spread > 0, 1 - (returns - values).var() / spread.clamp(min=1e-12), 0.0)
-
-
 T = TypeVar("T")
 
 
@@ -83,24 +73,21 @@ class ProcessGroup:
         part = count // self.size
         return range(self.rank * part, (self.rank + 1) * part)
 
-    def mean(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the mean over the processes of a tensor that has one shape in all of them."""
-        if self.size == 1:
-            return values
-        values = values.clone()
-        distributed.all_reduce(values)
-        return values / self.size
+    def sum(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the sum over the processes of a tensor that has one shape in all of them."""
+        if self.size > 1:
+            values = values.clone()
+            distributed.all_reduce(values)
+        return values
 
     def average_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Set gradients to their means over the processes."""
         if self.size == 1:
             return
         gradients = [p.grad for p in parameters if p.grad is not None]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
-        distributed.all_reduce(flat)
-        flat /= self.size
-        sizes = [gradient.numel() for gradient in gradients]
-        for gradient, part in zip(gradients, torch.split(flat, sizes), strict=True):
+        flat = self.sum(torch.cat([gradient.flatten() for gradient in gradients])) / self.size
+        parts = torch.split(flat, [gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
             gradient.copy_(part.view_as(gradient))
 
     def collect(self, values: torch.Tensor) -> list[torch.Tensor]:
@@ -161,32 +148,3 @@ def process_group(device: str) -> Iterator[tuple[ProcessGroup, str]]:
         yield ProcessGroup(rank, size), device
     finally:
         distributed.destroy_process_group()
-
-
-def merged_metrics(metrics: Sequence[Metrics]) -> Metrics:
-    """Return the metrics of a rollout from those of the processes, which have equal sizes."""
-    sums = np.sum([each["robot_sums"] for each in metrics], axis=0)
-    envs = np.sum([each["robot_envs"] for each in metrics], axis=0)
-    with np.errstate(invalid="ignore"):
-        scores = {"scores": tuple((sums / envs).tolist())}
-    if len(metrics) == 1:
-        kept = {k: v for k, v in metrics[0].items() if k not in ("robot_sums", "robot_envs")}
-        return kept | scores
-    episodes = [each["episodes"] for each in metrics]
-    successes = sum(e["success"] * n for e, n in zip(metrics, episodes, strict=True) if n)
-
-    def mean(name: str) -> float:
-        return float(sum(each[name] for each in metrics)) / len(metrics)
-
-    return {
-        "reward": mean("reward"),
-        "score": mean("score"),
-        **scores,
-        "success": successes / sum(episodes) if sum(episodes) else math.nan,
-        "episodes": sum(episodes),
-        "unstable": sum(each["unstable"] for each in metrics),
-        "terms": {
-            name: sum(each["terms"][name] for each in metrics) / len(metrics)
-            for name in metrics[0]["terms"]
-        },
-    }

@@ -17,6 +17,7 @@ from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress
 from morphgen.rl.baselines import BASELINES, ZERO, baselines_for
 from morphgen.rl.baselines.simple import Random
+from morphgen.rl.config import differences
 from morphgen.rl.inference import Mode, Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
@@ -123,15 +124,12 @@ def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: 
 def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:
     """Require that all policies take the same observations and actions."""
     interfaces = [asdict(run.interface) for run in runs]
-    first, *others = [{**entries.pop("channels"), **entries} for entries in interfaces]
+    first, *others = [{**entries.pop("observe"), **entries} for entries in interfaces]
     for path, other in zip(paths[1:], others, strict=True):
-        differences = [
-            f"{key} {other[key]}, not {first[key]}" for key in first if other[key] != first[key]
-        ]
-        if differences:
+        if wrong := differences(other, first, ", not "):
             raise TaskError(
                 f"{path}: its policy is for other observations or actions than that of "
-                f"{paths[0]}: {'; '.join(differences)}; evaluate it on its own"
+                f"{paths[0]}: {wrong}; evaluate it on its own"
             )
 
 
@@ -224,13 +222,11 @@ def _run_all(
             first=first * len(specs),
             sim=config.sim,
             seed=seed,
-            kind=interface.kind,
-            observe=interface.channels,
             workers=config.workers,
-            max_links=interface.max_links,
             layouts="eval",
             device=simulator.devices[0],
             library=library,
+            **vars(interface),
         )
         try:
             controller = controller or make()

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from msgspec import structs
 
 from morphgen.errors import TaskError, nearest
+from morphgen.formats.records import read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import policy_from
 from morphgen.rl.observation_layout import (
-    layout_from,
+    Layout,
     layout_of,
     pad_links,
     require_layout,
@@ -25,18 +26,11 @@ from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import require_device
-from morphgen.tasks.scenes.make import BatchOptions
 from morphgen.tasks.task import TaskConfig
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
 """How a policy acts: by the mean of its actions, or by sampling."""
-
-
-class PolicyBatchOptions(BatchOptions):
-    """Keyword arguments of ``make_batch`` for the environments of a policy."""
-
-    configs: Sequence[TaskConfig]
 
 
 class Policy:
@@ -70,7 +64,7 @@ class Policy:
             TaskError: If the state is of an agent that is unknown here.
         """
         self._tasks = tuple(tasks)
-        self.layout = layout_from(learner["layout"])
+        self.layout = read_record(learner["layout"], Layout, "layout", TaskError)
         """Layout of the observations that the policy was trained with."""
         self.config = policy_from(learner["policy"])
         self._device = torch.device(device)
@@ -81,20 +75,15 @@ class Policy:
         self._generator = torch.Generator(self._device).manual_seed(seed)
 
     @property
-    def batch_options(self) -> PolicyBatchOptions:
+    def batch_options(self) -> dict[str, Any]:
         """Arguments of ``make_batch`` for environments with the policy's observations and actions.
 
         They are continuous or discrete actions, the observation channels, the number of links that
         an agent for robots of one size needs, and the configs of the tasks.
         """
         links, obstacles = self.layout.links, self.layout.obstacles
-        needed = policy_interface(self.config, max_links=links, obstacles=obstacles)
-        return {
-            "kind": needed.kind,
-            "observe": needed.channels,
-            "max_links": needed.max_links,
-            "configs": self._tasks,
-        }
+        interface = policy_interface(self.config, max_links=links, obstacles=obstacles)
+        return vars(interface) | {"configs": self._tasks}
 
     def require(self, observation: Observation) -> None:
         """Require that an observation has the layout that the policy was trained with.
@@ -104,7 +93,7 @@ class Policy:
         """
         layout = layout_of(observation)
         if AGENTS[self.config.agent].any_size:
-            layout = replace(layout, links=self.layout.links)
+            layout = structs.replace(layout, links=self.layout.links)
         require_layout(self.layout, layout, "the checkpoint")
 
     @torch.no_grad()

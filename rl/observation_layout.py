@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
+from msgspec.structs import asdict
 from torch.nn import functional
 
 from morphgen.errors import TaskError
+from morphgen.formats.records import Record
+from morphgen.rl.config import differences
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS
@@ -125,19 +128,22 @@ KNOWN = {
 """Entries of observations that networks encode in their own way."""
 
 
-@dataclass(frozen=True)
-class Layout:
+Rows = Annotated[int, Meta(ge=0, le=100_000)]
+"""Number of rows or columns; a layout in a file cannot ask for more memory than there is."""
+
+
+class Layout(Record, frozen=True):
     """Sizes and channels of the observations that a network is built for."""
 
-    links: int  # rows of link tokens, L
-    token: int  # numbers per link token
-    obstacles: int  # rows of obstacle tokens, O
-    points: int  # points of the cloud, P; 0 without a cloud
+    links: Rows  # rows of link tokens, L
+    token: Rows  # numbers per link token
+    obstacles: Rows  # rows of obstacle tokens, O
+    points: Rows  # points of the cloud, P; 0 without a cloud
     channels: tuple[str, ...]  # names of the entries of `CHANNELS` that the observations contain
     tool: bool = False  # whether the observations have the tool's position
-    fields: tuple[tuple[str, int, str], ...] = ()
+    fields: tuple[tuple[str, Rows, str], ...] = ()
     """Name, size and mask of the fields that tasks of other packages declare, by name."""
-    vectors: tuple[tuple[str, int], ...] = ()
+    vectors: tuple[tuple[str, Rows], ...] = ()
     """Name and size of the kinematic channels, which have a vector per link."""
     tree: bool = False  # whether the observations have the entries of `TREE`
 
@@ -189,25 +195,12 @@ def _declared_fields(observation: Observation) -> tuple[tuple[str, int, str], ..
     return tuple(fields)
 
 
-def layout_from(stored: Mapping[str, Any]) -> Layout:
-    """Return the layout that ``Layout.as_data`` made a dictionary of."""
-    lists = {
-        name: tuple(tuple(entry) for entry in stored.get(name, ()))
-        for name in ("fields", "vectors")
-    }
-    return Layout(**{**stored, "channels": tuple(stored["channels"]), **lists})
-
-
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:
     """Require that weights fit observations."""
-    theirs, ours = asdict(stored), asdict(observed)
-    wrong = [
-        f"{name} {theirs[name]}, here {ours[name]}" for name in ours if theirs[name] != ours[name]
-    ]
-    if wrong:
+    if wrong := differences(asdict(stored), asdict(observed), ", here "):
         raise TaskError(
-            f"{what} is for other observations: {'; '.join(wrong)}; these depend on the task, its "
-            "goals and obstacles, and the observation channels"
+            f"{what} is for other observations: {wrong}; these depend on the task, its goals and "
+            "obstacles, and the observation channels"
         )
 
 

@@ -71,23 +71,16 @@ def make_env_and_controller(
 
     Unless ``config`` is given, the task has the constants that the controller is evaluated with.
     """
-    interface, policy = spec.interface, None
-    if spec.learner is not None:
-        if kind not in (None, interface.kind):
-            raise TaskError(f"{spec.name}: its actions are {interface.kind}, not {kind}")
-        policy = Policy(spec.learner, "deterministic", seed)
-    options.setdefault("config", spec.task_config)
-    env = TaskEnv(
-        spec.task,
-        robot,
-        layouts="eval",
-        kind=kind or interface.kind,
-        observe=interface.channels,
-        max_links=interface.max_links,
-        **options,
-    )
-    if policy is None:
+    interface = vars(spec.interface)
+    if spec.learner is not None and kind not in (None, spec.interface.kind):
+        raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
+    if kind is not None:
+        interface = interface | {"kind": kind}
+    options = {"config": spec.task_config, "layouts": "eval", **interface, **options}
+    env = TaskEnv(spec.task, robot, **options)
+    if spec.learner is None:
         return env, BASELINES[spec.name].make(seed)
+    policy = Policy(spec.learner, "deterministic", seed)
     try:
         policy.require(env.batch.observe())
     except TaskError:

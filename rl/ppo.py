@@ -11,10 +11,10 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from itertools import chain
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -23,14 +23,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import (
-    ALONE,
-    Metrics,
-    ProcessGroup,
-    UpdateMetrics,
-    explained_variance,
-    merged_metrics,
-)
+from morphgen.rl.distributed import ALONE, ProcessGroup, UpdateMetrics
 from morphgen.rl.observation_layout import joint_entropy, layout_of, pad_links, truncate_links
 from morphgen.rl.policies import entries_unneeded, make_networks, rows_needed
 from morphgen.tasks.batch import StepGraph, TaskBatch, can_record
@@ -111,6 +104,12 @@ def _potential(x: torch.Tensor) -> torch.Tensor:
     return torch.expm1(torch.abs(x)) - torch.abs(x)
 
 
+def explained_variance(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
+    """Return 1 if values predict the returns, and 0 if no better than the returns' mean."""
+    spread = returns.var()
+    return torch.where(spread > 0, 1 - (returns - values).var() / spread.clamp(min=1e-12), 0.0)
+
+
 KL_FACTOR = 1.2
 """Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
 MIN_ACTOR_LR_SCALE = 0.01
@@ -125,39 +124,6 @@ def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
     if kl > config.desired_kl:
         return max(scale / KL_FACTOR, MIN_ACTOR_LR_SCALE)
     return min(scale * KL_FACTOR, 1.0)
-
-
-class FinalObservations:
-    """Collects observations step by step, and returns the rows of truncated episodes at the end.
-
-    On a GPU nothing is read before the end, so that a rollout never waits for it; until then the
-    observations of all environments stay in memory.
-    """
-
-    def __init__(self) -> None:
-        self._observations: list[Observation] = []
-        self._truncated: list[torch.Tensor] = []
-
-    def add(self, observation: Observation, truncated: torch.Tensor) -> None:
-        """Copy the observation after a step (n, ...), and whether it was truncated, (n,), bool."""
-        reads = is_host(truncated.device)
-        self._observations.append(
-            {n: value[truncated] if reads else value.clone() for n, value in observation.items()}
-        )
-        self._truncated.append(truncated.clone())
-
-    def gather(self) -> Observation:
-        """Return the rows of the k truncated episodes, tensors (k, ...) in the order of steps."""
-        steps = self._observations
-        if is_host(self._truncated[0].device):
-            return {name: torch.cat([step[name] for step in steps]) for name in steps[0]}
-        truncated = torch.stack(self._truncated)
-        counts = truncated.sum(dim=1).tolist()
-        rows = torch.split(torch.nonzero(truncated)[:, 1], counts)
-        return {
-            name: torch.cat([step[name][row] for step, row in zip(steps, rows, strict=True)])
-            for name in steps[0]
-        }
 
 
 MAX_COMPILED = 64  # functions and input shapes that a process may compile
@@ -211,8 +177,8 @@ def _compiled(function: Callable[P, T], graphs: bool) -> Callable[P, T]:
 
 
 LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
-LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
-"""Metrics of a gradient step; see ``UpdateMetrics``."""
+LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient", "explained_variance")
+"""Metrics of the gradient steps of an update; see ``UpdateMetrics``."""
 
 
 class Learner:
@@ -319,10 +285,7 @@ class Learner:
         """Continue in the environments of a batch, where all begin new episodes."""
         self.batch = batch
         self.env_robot_index = batch.env_robot_index.to(self.device)
-        # Of several processes, one may have no environment of a robot.
         self.num_robots = len(batch.specs)
-        counts = torch.bincount(batch.env_robot_index, minlength=self.num_robots)
-        self._envs_of_robots: list[int] = counts.tolist()
         self._step_graph = StepGraph(batch) if can_record(batch) else None
         self.restart_episodes()
 
@@ -351,10 +314,11 @@ class Learner:
         return {name: value.to(self.device) for name, value in self._needed(observation).items()}
 
     @torch.no_grad()
-    def _collect_rollout(self) -> Metrics:
+    def _collect_rollout(self) -> dict[str, Any]:
         """Act for ``num_steps`` control steps and fill the buffers; return rollout metrics."""
         obs = self._network_input(self._current_observation())
-        reward_terms, final_observations = [], FinalObservations()
+        reward_terms: list[dict[str, torch.Tensor]] = []
+        final_rows: list[Observation] = []
         for step in range(self.config.num_steps):
             for name, buffer in self.observations.items():
                 buffer[step].copy_(obs[name])
@@ -371,48 +335,54 @@ class Learner:
             self.successes[step], self.diverged[step] = result.success, result.diverged
             self.terminated[step], self.truncated[step] = result.terminated, result.truncated
             reward_terms.append({name: term.mean() for name, term in result.terms.items()})
-            final_observations.add(self._needed(result.final_observation), result.truncated)
+            final_rows.append(self._rows_to_keep(result.final_observation, result.truncated))
             self._observation = result.observation
             obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
         self.next_observation = {name: value.clone() for name, value in obs.items()}
-        self.final_observations = self._network_input(final_observations.gather())
+        self.final_observations = self._network_input(self._truncated_rows(final_rows))
         terms = {
             name: torch.stack([means[name] for means in reward_terms]).mean()
             for name in reward_terms[0]
         }
-        return merged_metrics(self.processes.gather(self._rollout_metrics(terms)))
+        return self._rollout_metrics(terms)
 
-    def _rollout_metrics(self, terms: Mapping[str, torch.Tensor]) -> Metrics:
-        """Return rewards and scores of the rollout, and counts of the episodes that ended in it.
+    def _rows_to_keep(self, observation: Observation, truncated: torch.Tensor) -> Observation:
+        """Return a copy of the rows of truncated episodes; on a GPU all rows, to read nothing."""
+        rows = truncated if is_host(truncated.device) else slice(None)
+        needed = self._needed(observation)
+        return {name: value[rows].clone() for name, value in needed.items()}
 
-        Of each robot they are the sum of its environments' mean scores, and their number: see
-        ``merged_metrics``. Terms are the means of the reward's terms, shape ().
-        """
+    def _truncated_rows(self, kept: Sequence[Observation]) -> Observation:
+        """Return the rows of the truncated episodes, (k, ...), of those that a rollout kept."""
+        if is_host(self.batch.device):
+            return {name: torch.cat([step[name] for step in kept]) for name in kept[0]}
+        return {n: torch.stack([step[n] for step in kept])[self.truncated] for n in kept[0]}
+
+    def _rollout_metrics(self, terms: Mapping[str, torch.Tensor]) -> dict[str, Any]:
+        """Return the metrics of the rollout of all processes; terms are means, shape ()."""
         ended = self.terminated | self.truncated
-        num_ended = ended.sum()
-        env_scores = self.scores.mean(dim=0)
+        env_scores, robots = self.scores.mean(dim=0), self.batch.env_robot_index
         robot_scores = torch.zeros(self.num_robots, device=env_scores.device)
-        robot_scores.index_add_(0, self.batch.env_robot_index, env_scores)
-        numbers = (
-            self.rewards.mean(),
-            env_scores.mean(),
-            (self.successes & ended).sum() / num_ended,
-            num_ended,
-            self.diverged.sum(),
-        )
+        robot_scores.index_add_(0, robots, env_scores)
+        # Of several processes, one may have no environment of a robot.
+        robot_envs = torch.bincount(robots, minlength=self.num_robots)
+        counts = (self.successes & ended).sum(), ended.sum(), self.diverged.sum()
+        means = torch.stack([*counts, self.rewards.mean(), env_scores.mean(), *terms.values()])
         # One copy from the device instead of one for each number.
-        values = torch.cat([torch.stack([*numbers, *terms.values()]), robot_scores]).tolist()
-        reward, score, success, episodes, unstable, *means = values
+        sums = torch.cat([means.double(), robot_scores.double(), robot_envs.double()])
+        sums = self.processes.sum(sums.to(self.device)).cpu()
+        of_rollout, scores, envs = sums.split([len(means), self.num_robots, self.num_robots])
+        successes, episodes, unstable = of_rollout[:3].tolist()
+        reward, score, *term_means = (of_rollout[3:] / self.processes.size).tolist()
         return {
             "reward": reward,
             "score": score,
-            "success": success,
+            "scores": tuple((scores / envs).tolist()),
+            "success": successes / episodes if episodes else math.nan,
             "episodes": int(episodes),
             "unstable": int(unstable),
-            "robot_sums": means[len(terms) :],
-            "robot_envs": self._envs_of_robots,
-            "terms": dict(zip(terms, means[: len(terms)], strict=True)),
+            "terms": dict(zip(terms, term_means, strict=True)),
         }
 
     @torch.no_grad()
@@ -445,7 +415,7 @@ class Learner:
         values = torch.cat(chunks)[:count]
         return symexp(values) if self.config.symlog else values
 
-    def _learn(self) -> Metrics:
+    def _learn(self) -> dict[str, float]:
         """Improve actor and critic on the rollout; return the means of ``LEARN_METRICS``."""
         config = self.config
         learning_rate = config.learning_rate * (1 - self.update / self.num_updates)
@@ -491,11 +461,12 @@ class Learner:
             for network in (self.critic, self.target_critic):
                 assert network.normalizer is not None
                 network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
-        mean_metrics = self.processes.mean(torch.stack(metrics).mean(dim=0))
+        explained = explained_variance(values, returns)
+        mean_metrics = torch.cat([torch.stack(metrics).mean(dim=0), explained[None]])
+        mean_metrics = self.processes.sum(mean_metrics) / self.processes.size
         means = dict(zip(LEARN_METRICS, mean_metrics.tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
-        explained = float(self.processes.mean(explained_variance(values, returns)))
-        return {**means, "explained_variance": explained, "learning_rate": actor_group["lr"]}
+        return {**means, "learning_rate": actor_group["lr"]}
 
     def _loss(
         self,

@@ -10,7 +10,8 @@ import pickle
 import pickletools
 import struct
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,24 +20,21 @@ from typing import Any
 import torch
 
 from morphgen.benchmark.tokens import MAX_LINKS
-from morphgen.errors import MorphgenError, TaskError, nearest, shortened
+from morphgen.errors import MALFORMED, MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic, writing
 from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
+from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
 from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
-from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs, task_configs
+from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs
 from morphgen.tasks.scenes.make import require_geometry
 from morphgen.tasks.task import TaskConfig
-
-MAX_ROWS = 100_000
-"""Largest number of links, obstacles or points of an observation, and of numbers of a token."""
 
 
 class _Optimiser(Record, frozen=True):
@@ -55,7 +53,7 @@ class _Learner(Record, frozen=True):
     optimiser: _Optimiser
     generators: dict[str, Any]
     batch: dict[str, Any]
-    layout: dict[str, Any]
+    layout: Layout
     policy: dict[str, Any]
     config: dict[str, Any]
     update: int
@@ -67,12 +65,11 @@ class _Learner(Record, frozen=True):
 def require_learner(learner: object, where: str) -> None:
     """Require that the state of a learner is complete, and its weights have the right shapes."""
     state = read_record(learner, _Learner, f"{where}: learner", TaskError)
-    layout = _layout(state.layout, f"{where}: layout")
     try:
         PPOConfig(**read_fields(state.config, PPOConfig, "config"))
         policy = policy_from(state.policy)
         with torch.device("meta"):  # shapes alone: nothing is allocated
-            actor, critic = make_networks(policy, layout, 0)
+            actor, critic = make_networks(policy, state.layout, 0)
     except TaskError as error:
         raise TaskError(f"{where}: {error}") from error
     _require_tensors(state.actor, actor.state_dict(), f"{where}: actor")
@@ -87,35 +84,22 @@ def require_learner(learner: object, where: str) -> None:
         _require_tensors(own, wanted, f"{where}: optimiser: parameter {number}")
 
 
-def _layout(stored: Mapping[str, Any], where: str) -> Layout:
-    """Return the stored layout, if it is valid."""
-    layout = Layout(**read_fields(stored, Layout, where))
-    sizes = {name: getattr(layout, name) for name in ("links", "token", "obstacles", "points")}
-    named = [*sizes.items(), *(field[:2] for field in layout.fields), *layout.vectors]
-    for name, size in named:
-        if not 0 <= size <= MAX_ROWS:
-            raise TaskError(f"{where}: {name} {size}: expected 0 to {MAX_ROWS:,}")
-    return layout
-
-
 def _require_tensors(
     stored: Mapping[str, Any], wanted: Mapping[str, torch.Tensor], where: str
 ) -> None:
     """Require tensors of the same names, shapes and types as others."""
-    for name in wanted:
+    for name in wanted | stored:
         if name not in stored:
             raise TaskError(f"{where} has no {name}")
-    for name, tensor in stored.items():
         if name not in wanted:
             raise TaskError(f"{where} has {shortened(repr(name))}, which its sizes do not ask for")
+        tensor, expected = stored[name], wanted[name]
         if not isinstance(tensor, torch.Tensor):
             raise TaskError(f"{where}: {name} is {shortened(repr(tensor))}; expected a tensor")
-        actual = (tuple(tensor.shape), tensor.dtype)
-        expected = (tuple(wanted[name].shape), wanted[name].dtype)
-        if actual != expected:
+        if (tensor.shape, tensor.dtype) != (expected.shape, expected.dtype):
             raise TaskError(
-                f"{where}: {name} has shape {actual[0]} of {actual[1]}; expected {expected[0]} of "
-                f"{expected[1]}"
+                f"{where}: {name} has shape {tuple(tensor.shape)} of {tensor.dtype}; expected "
+                f"{tuple(expected.shape)} of {expected.dtype}"
             )
 
 
@@ -137,11 +121,14 @@ _GLOBALS = frozenset(
 allocate as much as a file asks for, such as ``bytearray``."""
 
 
+_DAMAGED = (*MALFORMED, AssertionError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile)
+"""Exceptions that zipfile and torch 2 raise for damaged files; torch documents none of them."""
+
+
 def packed(content: Mapping[str, Any], where: str) -> bytes:
     """Return the bytes of a checkpoint's file, with its hash."""
-    _require_plain(content, where)
     file = io.BytesIO()
-    torch.save({**content, HASH: _digest(content)}, file)
+    torch.save({**content, HASH: _digest(content, where)}, file)
     return file.getvalue()
 
 
@@ -151,25 +138,11 @@ def unpacked(file: Path) -> dict[str, Any]:
         _require_container(file)
         # Mapped, a storage that claims more than its record has cannot reach beyond the file.
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except (  # what zipfile and torch 2 raise for damaged files; torch documents none of it
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        EOFError,
-        LookupError,
-        OSError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except _DAMAGED as error:
         raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
     if not isinstance(data, dict) or HASH not in data:
         raise TaskError(f"{file} is not a checkpoint of morphgen train")
-    digest = data.pop(HASH)
-    _require_plain(data, str(file))
-    if digest != _digest(data):
+    if data.pop(HASH) != _digest(data, str(file)):
         raise TaskError(
             f"{file} is damaged: its content does not have the hash that was stored with it; use "
             "another copy"
@@ -208,43 +181,63 @@ def _require_container(file: Path) -> None:
             )
 
 
-def _require_plain(content: object, where: str) -> None:
-    """Require that the content has plain containers, finite numbers and dense tensors only."""
-    total = 0
-    for count, (path, value) in enumerate(_walked(content, where)):
-        if count > MAX_VALUES:
+def _digest(content: object, where: str) -> str:
+    """Return the hexadecimal SHA-256 of a content; the order of keys does not matter.
+
+    It must have plain containers, finite numbers and dense tensors only.
+    """
+    digest, counts = hashlib.sha256(), Counter[str]()
+
+    def add(value: object, path: str, level: int) -> None:
+        counts["values"] += 1
+        if counts["values"] > MAX_VALUES:
             raise TaskError(f"{where}: more than {MAX_VALUES:,} values")
         if isinstance(value, torch.Tensor):
-            total += _require_tensor(value, where, path)
-            if total > MAX_BYTES:
+            counts["bytes"] += _require_tensor(value, where, path)
+            if counts["bytes"] > MAX_BYTES:
                 raise TaskError(f"{where}: tensors of more than {MAX_BYTES:,} bytes")
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise TaskError(f"{where}: {path} is {value}: not finite")
-        elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
-            raise TaskError(f"{where}: {path} is a number of {value.bit_length():,} bits")
-        elif not isinstance(value, str | int | float | dict | list | tuple | None):
-            raise TaskError(f"{where}: {path} is of an unexpected type: {type(value).__name__}")
-
-
-def _walked(content: object, where: str) -> Iterator[tuple[str, object]]:
-    """Yield every value of nested containers, with its path."""
-    left: list[tuple[str, object, int]] = [("", content, 0)]
-    while left:
-        path, value, level = left.pop()
-        yield path, value
-        entries: Iterator[tuple[object, object]] | None = None
-        if isinstance(value, dict):
-            entries = iter(value.items())
-        elif isinstance(value, list | tuple):
-            entries = iter(enumerate(value))
-        if entries is None:
-            continue
-        if level == MAX_LEVELS:
+        if not isinstance(value, dict | list | tuple):
+            digest.update(_leaf(value, f"{where}: {path} is"))
+            return
+        if level > MAX_LEVELS:
             raise TaskError(f"{where}: more than {MAX_LEVELS} levels of containers")
-        for key, below in entries:
-            if not isinstance(key, str | int):
-                raise TaskError(f"{where}: a key of an unexpected type: {type(key).__name__}")
-            left.append((f"{path}.{str(key)[:100]}".lstrip("."), below, level + 1))
+        digest.update(f"{'d' if isinstance(value, dict) else 'l'}{len(value)};".encode())
+        for key, each in _entries(value, where):
+            if isinstance(value, dict):
+                digest.update(_leaf(key, f"{where}: a key is"))
+            add(each, f"{path}.{str(key)[:100]}".lstrip("."), level + 1)
+
+    add(content, "", 0)
+    return digest.hexdigest()
+
+
+def _leaf(value: object, what: str) -> bytes:
+    """Return the bytes to hash of a tensor, text or number."""
+    if isinstance(value, torch.Tensor):
+        flat = value.detach().contiguous().reshape(-1).view(torch.uint8)
+        return f"t{value.dtype}{tuple(value.shape)}".encode() + flat.numpy().tobytes()
+    if isinstance(value, str):
+        text = value.encode("utf-8", "surrogatepass")
+        return f"s{len(text)};".encode() + text
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise TaskError(f"{what} {value}: not finite")
+        return b"f" + struct.pack(">d", value)
+    if not isinstance(value, int | None):
+        raise TaskError(f"{what} of an unexpected type: {type(value).__name__}")
+    if value is not None and value.bit_length() > MAX_INTEGER_BITS:
+        raise TaskError(f"{what} a number of {value.bit_length():,} bits")
+    return f"{type(value).__name__}{value};".encode()
+
+
+def _entries(value: Mapping[Any, Any] | Sequence[Any], where: str) -> Iterable[tuple[Any, Any]]:
+    """Return keys or indices and values of a container, sorted by key."""
+    if not isinstance(value, Mapping):
+        return enumerate(value)
+    for key in value:
+        if not isinstance(key, str | int):
+            raise TaskError(f"{where}: a key of an unexpected type: {type(key).__name__}")
+    return sorted(value.items(), key=lambda entry: (isinstance(entry[0], str), entry[0]))
 
 
 def _require_tensor(tensor: torch.Tensor, where: str, path: str) -> int:
@@ -259,36 +252,6 @@ def _require_tensor(tensor: torch.Tensor, where: str, path: str) -> int:
         lost = int((~torch.isfinite(tensor)).sum())
         raise TaskError(f"{where}: {path}: {lost} of {tensor.numel()} numbers are not finite")
     return size
-
-
-def _digest(content: object) -> str:
-    """Return the hexadecimal SHA-256 of a content; the order of keys does not matter."""
-    digest = hashlib.sha256()
-    _add(digest, content)
-    return digest.hexdigest()
-
-
-def _add(digest: hashlib._Hash, value: object) -> None:
-    if isinstance(value, torch.Tensor):
-        digest.update(f"t{value.dtype}{tuple(value.shape)}".encode())
-        flat = value.detach().cpu().contiguous().reshape(-1)
-        digest.update(flat.view(torch.uint8).numpy().tobytes())
-    elif isinstance(value, dict):
-        digest.update(f"d{len(value)};".encode())
-        for key in sorted(value, key=lambda key: (isinstance(key, str), key)):
-            _add(digest, key)
-            _add(digest, value[key])
-    elif isinstance(value, list | tuple):
-        digest.update(f"l{len(value)};".encode())
-        for item in value:
-            _add(digest, item)
-    elif isinstance(value, str):
-        text = value.encode("utf-8", "surrogatepass")
-        digest.update(f"s{len(text)};".encode() + text)
-    elif isinstance(value, float):
-        digest.update(b"f" + struct.pack(">d", value))
-    else:
-        digest.update(f"{type(value).__name__}{value};".encode())
 
 
 def in_main_memory(value: object) -> object:
@@ -308,22 +271,22 @@ FORMAT = 3  # version of the files' format
 
 @dataclass(frozen=True)
 class Interface:
-    """Actions and observations that a policy needs from its environments."""
+    """Actions and observations that a policy needs; ``vars`` are arguments of ``make_batch``."""
 
     kind: ActionKind = "continuous"  # kind of the actions
     max_links: int | None = None
     """Links that observations and actions are padded to; None: the number of the benchmark, or the
     links of the largest robot if it has more."""
-    channels: ObservationConfig = field(default_factory=ObservationConfig)
+    observe: ObservationConfig = field(default_factory=ObservationConfig)
     """Channels of the observations."""
 
 
 def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) -> Interface:
     """Return the interface of a policy."""
-    channels = observation_config(policy.channels, obstacles=obstacles)
-    channels = replace(channels, tool=channels.tool or policy.tool_position)
+    observe = observation_config(policy.channels, obstacles=obstacles)
+    observe = replace(observe, tool=observe.tool or policy.tool_position)
     any_size = AGENTS[policy.agent].any_size
-    return Interface(policy.kind, None if any_size else max_links, channels)
+    return Interface(policy.kind, None if any_size else max_links, observe)
 
 
 @dataclass(frozen=True)
@@ -452,9 +415,7 @@ def config_from(data: object) -> RunConfig:
     tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
-    for name, values in tasks.items():
-        values = read_record(values, dict[str, Any], f"run: {name}", TaskError)
-        read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
+    configs = tuple(_task_config(name, values) for name, values in tasks.items())
     for name, values in entries.items():
         if isinstance(values, Mapping) and name not in RunConfig.__dataclass_fields__:
             raise TaskError(
@@ -471,9 +432,15 @@ def config_from(data: object) -> RunConfig:
         source,
         policy_from(nested["policy"], "run: policy"),
         PPOConfig(**read_fields(nested["ppo"], PPOConfig, "run: ppo")),
-        tasks=task_configs(tasks),
+        tasks=configs,
         **values,
     )
+
+
+def _task_config(name: str, constants: object) -> TaskConfig:
+    where, kind = f"run: {name}", TASKS[name].config_type
+    fields = config_fields(name, read_record(constants, dict[str, Any], where, TaskError))
+    return kind(**read_fields(fields, kind, where))
 
 
 def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
@@ -511,22 +478,11 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
 
 def require_same_config(stored: RunConfig, config: RunConfig, where: str) -> None:
     """Require that a stored run has this config."""
-    theirs, ours = _flat(stored), _flat(config)
-    differences = [
-        f"{name} {_short(theirs.get(name))}, not {_short(value)}"
-        for name, value in ours.items()
-        if theirs.get(name) != value
-    ]
-    if differences:
-        raise TaskError(f"{where} has another run: {'; '.join(differences)}")
+    if wrong := differences(_flat(stored), _flat(config), ", not "):
+        raise TaskError(f"{where} has another run: {wrong}")
 
 
 def _flat(config: RunConfig) -> dict[str, Any]:
     """Return the entries of a config by dotted name; a run may continue on another GPU."""
     device = config.device.partition(":")[0]
     return dotted_values(config.as_data() | {"source": identity(config.source), "device": device})
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) < 60 and "\n" not in text else f"of {len(text)} letters"

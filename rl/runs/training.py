@@ -19,13 +19,14 @@ from torch import nn
 from morphgen.benchmark.tokens import require_max_links
 from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
+from morphgen.formats.records import read_record
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
 from morphgen.progress import show_progress
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.config import PPOConfig, policy_from
+from morphgen.rl.config import PPOConfig, differences, policy_from
 from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
-from morphgen.rl.observation_layout import last_link, layout_from, layout_of, require_layout
+from morphgen.rl.observation_layout import Layout, last_link, layout_of, require_layout
 from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
@@ -150,14 +151,14 @@ def _networks(learner: Learner) -> dict[str, nn.Module]:
 
 
 def _require_networks(learner: Learner, state: Mapping[str, Any]) -> None:
-    require_layout(layout_from(state["layout"]), learner.layout, "the checkpoint")
+    layout = read_record(state["layout"], Layout, "the checkpoint: layout", TaskError)
+    require_layout(layout, learner.layout, "the checkpoint")
     _require_same(asdict(policy_from(state["policy"])), asdict(learner.policy))
 
 
 def _require_same(stored: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-    wrong = [f"{k} {stored.get(k)}, here {ours[k]}" for k in ours if stored.get(k) != ours[k]]
-    if wrong:
-        raise TaskError(f"the checkpoint is of another run: {'; '.join(wrong)}")
+    if wrong := differences(stored, ours, ", here "):
+        raise TaskError(f"the checkpoint is of another run: {wrong}")
 
 
 SLICE_STEPS = 600
@@ -225,7 +226,7 @@ class TrainingBatches:
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
         self.most_links = max(len(spec.robot.links) for spec in self._specs)
         self.tasks = {spec.task for spec in self._specs}
-        self._channels = config.interface.channels
+        self._channels = config.interface.observe
         if config.slice_updates:
             joints = max(num_actuated(spec.robot, spec.task) for spec in self._specs)
             self._channels = replace(self._channels, tree_joints=joints)

@@ -10,7 +10,7 @@ import torch
 
 from morphgen.cli import main
 from morphgen.errors import TaskError
-from morphgen.rl.distributed import ALONE, ProcessGroup, merged_metrics, process_group
+from morphgen.rl.distributed import ALONE, ProcessGroup, process_group
 from morphgen.rl.runs.checkpoint import read_checkpoint
 
 TRAIN = ("train", "interpolation/arm3/reach", "--sim", "kinematic", "--envs", "40", "--steps")
@@ -62,6 +62,7 @@ def test_two_processes_learn_one_policy(two):
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["transitions"] for line in lines] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert len(lines[0]["scores"]) == 10
+    assert lines[0]["score"] == pytest.approx(sum(lines[0]["scores"]) / 10)
     _, state = read_checkpoint(folder)
     assert len(state["batch"]["next_episode"]) == 40
     assert len(state["generators"]["actions"]) == 2
@@ -87,21 +88,6 @@ def test_environments_are_shared_equally():
     assert ALONE.share(7, "--envs") == range(7)
     with pytest.raises(TaskError, match="--envs 42: expected a multiple of the 4 processes"):
         ProcessGroup(1, 4).share(42, "--envs")
-
-
-def test_metrics_of_processes_are_merged():
-    one = {"reward": 1.0, "score": 2.0, "success": 0.5, "episodes": 2}
-    one |= {"unstable": 1, "terms": {"near": 0.0}}
-    one |= {"robot_sums": [1.0, 6.0, 0.0, 0.0], "robot_envs": [1, 2, 0, 0]}
-    none = {**one, "reward": 3.0, "success": float("nan"), "episodes": 0}
-    none |= {"robot_sums": [9.0, 0.0, 8.0, 0.0], "robot_envs": [1, 0, 2, 0]}
-    merged = merged_metrics([one, {**none, "terms": {"near": 1.0}}])
-    assert merged["reward"] == 2.0
-    # A mean over environments, and none for a robot without one.
-    assert merged["scores"] == pytest.approx((5.0, 3.0, 4.0, float("nan")), nan_ok=True)
-    assert not merged.keys() & {"robot_sums", "robot_envs"}
-    assert (merged["success"], merged["episodes"], merged["unstable"]) == (0.5, 2, 2)
-    assert merged["terms"] == {"near": 0.5}
 
 
 @pytest.mark.slow

@@ -95,9 +95,9 @@ CASES = [
     ("learner/policy/agent", "hal", "policy: unknown agent 'hal'; "),
     ("learner/policy/colour", 1, "policy: unknown key 'colour'"),
     ("learner/config/gamma", "big", "config: gamma: invalid value 'big'; expected a number"),
-    ("learner/layout/links", 10**12, "layout: links 1000000000000: expected 0 to 100,000"),
-    ("learner/layout/links", -4, "layout: links -4: expected 0 to 100,000"),
-    ("learner/layout/channels", 5, "layout: channels: invalid value 5; expected a list"),
+    ("learner/layout/links", 10**12, "layout.links: invalid value 1000000000000; "),
+    ("learner/layout/links", -4, "layout.links: invalid value -4; expected"),
+    ("learner/layout/channels", 5, "layout.channels: invalid value 5; expected a list"),
     (
         MOMENT,
         torch.ones(2),

@@ -14,11 +14,12 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import explained_variance, merged_metrics
+from morphgen.rl.distributed import ProcessGroup
 from morphgen.rl.ppo import (
     KL_FACTOR,
     MIN_ACTOR_LR_SCALE,
     Learner,
+    explained_variance,
     gae,
     half_square,
     matching_loss,
@@ -89,9 +90,18 @@ def test_explained_variance_by_hand(factor, explained):
     assert explained_variance(returns, torch.ones(2, 2)) == 0
 
 
-def test_the_metrics_of_a_rollout_by_hand():
+class Twins(ProcessGroup):
+    """Two processes with the same values."""
+
+    def sum(self, values):
+        return 2 * values
+
+
+@pytest.mark.parametrize(("processes", "count"), [(ProcessGroup(), 1), (Twins(0, 2), 2)])
+def test_the_metrics_of_a_rollout_by_hand(processes, count):
     true, false = True, False
     trainer = learner(OnALine(3), num_steps=2, minibatches=1)
+    trainer.processes = processes
     trainer.batch.env_robot_index = torch.tensor([1, 0, 1])
     trainer.use(trainer.batch)
     trainer.rewards[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
@@ -101,11 +111,17 @@ def test_the_metrics_of_a_rollout_by_hand():
     trainer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
     trainer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
     terms = {"one": torch.tensor(0.25), "success": torch.tensor(7.0)}  # push has a term "success"
-    metrics = merged_metrics([trainer._rollout_metrics(terms)])
+    metrics = trainer._rollout_metrics(terms)
     assert metrics["terms"] == {"one": 0.25, "success": 7.0}
     assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
     assert metrics["scores"] == (2.0, 2.0)
-    assert (metrics["success"], metrics["episodes"], metrics["unstable"]) == (0.5, 4, 1)
+    assert (metrics["success"], metrics["episodes"]) == (0.5, 4 * count)
+    assert metrics["unstable"] == count
+    trainer.terminated[:] = trainer.truncated[:] = False
+    trainer.batch.env_robot_index = torch.tensor([1, 1, 1])
+    metrics = trainer._rollout_metrics(terms)
+    assert math.isnan(metrics["success"])
+    assert metrics["scores"] == pytest.approx((math.nan, 2.0), nan_ok=True)
 
 
 def test_the_slow_critic_follows_every_gradient_step():
