@@ -11,15 +11,14 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import cast
 
-from morphgen.checks import home_pose, inertia, joints, loaders
-from morphgen.checks.repairs import repaired
+from morphgen.checks import home_pose, rules
 from morphgen.model.findings import Finding
 from morphgen.model.mesh import require_bounded_meshes
 from morphgen.model.robot import Robot
 
 Check = Callable[[Robot], Iterator[Finding]]
 
-CHECKS: tuple[Check, ...] = (*inertia.CHECKS, *joints.CHECKS, *loaders.CHECKS, *home_pose.CHECKS)
+CHECKS: tuple[Check, ...] = (*rules.CHECKS, *home_pose.CHECKS)
 """The checks that apply to robots and parts; ``check_tool`` applies to robots only."""
 
 _SEVERITY_RANK = {"error": 0, "warning": 1, "info": 2}
@@ -45,7 +44,7 @@ def check(
         MeshError: If the meshes have too many triangles in all.
     """
     require_bounded_meshes(robot)
-    checks = (*CHECKS, loaders.check_tool) if tool_required else CHECKS
+    checks = (*CHECKS, rules.check_tool) if tool_required else CHECKS
     if home_tested:
         checks = tuple(run for run in checks if run is not home_pose.check_self_collision)
     findings = {_apply_accepted(finding, robot) for run in checks for finding in run(robot)}
@@ -78,7 +77,7 @@ def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
         The repaired robot, whose provenance lists the repairs, and the repaired findings.
     """
     fixable = tuple(f for f in check(robot, tool_required=False) if f.fixable)
-    return (record_repairs(repaired(robot), fixable) if fixable else robot), fixable
+    return (record_repairs(rules.repaired(robot, fixable), fixable) if fixable else robot), fixable
 
 
 def record_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.checks.joints import is_axis_valid
-from morphgen.checks.loaders import has_hull, is_readable
+from morphgen.checks.rules import found, has_hull, is_axis_valid, is_readable
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
@@ -60,17 +59,13 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
         millimetres = f"{1000 * gap:.3g}"
         if float(millimetres) > 1000 * MAX_GAP:  # as it is printed: 5 mm are not more than 5 mm
             where = f"links {robot.links[ancestor].name}, {link.name}"
-            why = f"at home their visual shapes are {millimetres} mm apart"
-            fix = "correct the origin of the joint between them or of a mesh, or a mesh's scale"
-            yield Finding("links-apart", "warning", where, why, fix)
+            yield found("links-apart", where, millimetres=millimetres)
 
 
 def check_self_collision(robot: Robot) -> Iterator[Finding]:
     """Find pairs of links that penetrate each other at home."""
     for (a, b), depth in sorted(home_penetrations(robot).items()):
-        why = f"at home they penetrate each other by {1000 * depth:.3g} mm"
-        fix = "move home, or ignore the pair if the overlap is by design"
-        yield Finding("self-collision", "warning", f"links {a}, {b}", why, fix)
+        yield found("self-collision", f"links {a}, {b}", millimetres=1000 * depth)
 
 
 def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:

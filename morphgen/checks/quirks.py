@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from morphgen.checks.loaders import PYBULLET_LINKS
+from morphgen.checks.rules import PYBULLET_LINKS
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.geometry import Pose
 from morphgen.typing import Array

@@ -12,7 +12,7 @@ from weakref import WeakSet
 
 import yaml
 
-from morphgen.checks.loaders import safe_names
+from morphgen.checks.rules import safe_names
 from morphgen.errors import (
     CompositionError,
     FormatError,

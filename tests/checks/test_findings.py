@@ -16,8 +16,7 @@ from helpers.faulty_robots import (
     with_joint,
 )
 from helpers.robots import arm
-from morphgen.checks import check
-from morphgen.checks import loaders as shapes
+from morphgen.checks import check, rules
 from morphgen.model.robot import Inertial, Link, Mimic
 from morphgen.model.tree import rename
 
@@ -38,7 +37,7 @@ def test_a_mimic_gripper_has_only_the_finding_about_loaders():
 
 @pytest.mark.parametrize("code", MESHES)
 def test_each_fault_of_a_mesh_has_its_finding(code, tmp_path, monkeypatch):
-    monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
+    monkeypatch.setattr(rules, "MAX_STL_FACES", 1000)
     assert code in {finding.code for finding in check(MESHES[code](tmp_path))}
 
 

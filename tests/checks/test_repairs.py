@@ -15,9 +15,8 @@ from helpers.faulty_robots import (
     with_link,
 )
 from helpers.robots import arm
-from morphgen.checks import check, fix
-from morphgen.checks import loaders as shapes
-from morphgen.checks.inertia import DEFAULT_DENSITY
+from morphgen.checks import check, fix, rules
+from morphgen.checks.rules import DEFAULT_DENSITY
 from morphgen.model.inertia import inertial_from_density
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY
 from morphgen.model.tree import rename
@@ -30,7 +29,7 @@ def keys(robot):
 
 @pytest.mark.parametrize("code", [code for code in (*ROBOTS, *MESHES) if "name-" not in code])
 def test_exactly_the_fixable_findings_are_fixed(code, tmp_path, monkeypatch):
-    monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
+    monkeypatch.setattr(rules, "MAX_STL_FACES", 1000)
     robot = ROBOTS[code]() if code in ROBOTS else MESHES[code](tmp_path)
     findings = check(robot)
     repaired, gone = fix(robot)
