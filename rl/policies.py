@@ -101,9 +101,6 @@ class Actor(nn.Module):
         self.network: Network = AGENTS[config.agent].network(
             config, layout, len(BINS) if config.discrete else 1, per_link=True
         )
-        self.scale = self.network.logit_scale if config.discrete else 1.0
-        with torch.no_grad():
-            self.network.last.weight.div_(self.scale)
         if not config.discrete:
             rows = 1 if self.network.shares_joints else layout.links
             self.raw_log_std = nn.Parameter(torch.zeros(rows), requires_grad=not config.fixed_std)
@@ -113,7 +110,7 @@ class Actor(nn.Module):
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers for ``head``: (n, L, 11) for discrete actions, else (n, L, 1), float32."""
         seen = observation if self.normalizer is None else self.normalizer(observation)
-        numbers: torch.Tensor = self.scale * self.network(seen).float()
+        numbers: torch.Tensor = self.network(seen).float()
         if self.residual:
             numbers = numbers + observation["ik"][..., IK_SHARE, None]
         return torch.where(observation["actions"][..., None], numbers, 0.0)

@@ -35,8 +35,6 @@ class Network(nn.Module, ABC):
     needs_all_entries = True
     """Whether the network needs all rows of links, and goal, object and line for every task;
     otherwise rows and entries that no environment uses are left out."""
-    logit_scale = 1.0
-    """Factor on the actor's logits."""
     shares_joints = False
     """Whether all joints share the weights of the head, and the standard deviation of actions."""
 
@@ -44,11 +42,7 @@ class Network(nn.Module, ABC):
     def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:
         """Build the network; ``outputs`` numbers ``per_link``, or for the whole observation."""
         super().__init__()
-
-    @property
-    @abstractmethod
-    def last(self) -> nn.Linear:
-        """The last layer."""
+        self.outputs, self.per_link = outputs, per_link
 
     @abstractmethod
     def forward(self, observation: Observation) -> torch.Tensor:
@@ -150,11 +144,11 @@ def smooth_position_code(layer: nn.Module, first: int) -> None:
         next(layer.parameters())[:, first : first + POSITION.size].mul_(scale)
 
 
-def last_layer(inputs: int, outputs: int) -> nn.Linear:
-    """Return a linear layer whose outputs start near zero; see ``LAST_LAYER_SCALE``."""
+def last_layer(inputs: int, outputs: int, scale: float = 1.0) -> nn.Linear:
+    """Return a linear layer whose outputs start near zero, also after the network scales them."""
     layer = nn.Linear(inputs, outputs)
     with torch.no_grad():
-        layer.weight.mul_(LAST_LAYER_SCALE)
+        layer.weight.mul_(LAST_LAYER_SCALE).div_(scale)
         layer.bias.zero_()
     return layer
 

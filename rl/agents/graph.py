@@ -64,7 +64,6 @@ class Network(encoder.Network):
         sizes = config.network
         assert isinstance(sizes, Config)
         features, hidden = sizes.graph_features, sizes.graph_hidden
-        self.per_link, self.outputs = per_link, outputs
         self.channels = layout.channels
         self.vectors = tuple(name for name, _ in layout.vectors)
         self.hides_morphology = config.hides_morphology
@@ -90,13 +89,6 @@ class Network(encoder.Network):
         self.head = nn.Sequential(
             nn.Linear(3 * features, hidden), nn.SiLU(), encoder.last_layer(hidden, outputs)
         )
-
-    @property
-    def last(self) -> nn.Linear:
-        """The last layer."""
-        layer = self.head[-1]
-        assert isinstance(layer, nn.Linear)
-        return layer
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers of shape (n, L, outputs) per link, else (n, outputs)."""

@@ -45,11 +45,6 @@ class Network(encoder.Network):
         self.shape = (layout.links, outputs) if per_link else (outputs,)
         self.leave = encoder.last_layer(width, layout.links * outputs if per_link else outputs)
 
-    @property
-    def last(self) -> nn.Linear:
-        """The last layer."""
-        return self.leave
-
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers of shape (n, L, outputs) per link, else (n, outputs)."""
         x = self.enter(self.entities(observation)[0].flatten(1))

@@ -50,7 +50,7 @@ class Network(encoder.Network):
         sizes = config.network
         assert isinstance(sizes, Config)
         features = sizes.features
-        self.per_link, self.logit_scale = per_link, sizes.logit_scale
+        self.scale = sizes.logit_scale if per_link and config.discrete else 1.0
         self.entities = encoder.Entities(
             layout, features, proprioceptive_only=config.hides_morphology
         )
@@ -62,15 +62,8 @@ class Network(encoder.Network):
             nn.LayerNorm(features),
             nn.Linear(features, sizes.decoder),
             nn.GELU(),
-            encoder.last_layer(sizes.decoder, outputs),
+            encoder.last_layer(sizes.decoder, outputs, self.scale),
         )
-
-    @property
-    def last(self) -> nn.Linear:
-        """The last layer."""
-        layer = self.decode[-1]
-        assert isinstance(layer, nn.Linear)
-        return layer
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers of shape (n, L, outputs) per link, else (n, outputs).
@@ -86,7 +79,7 @@ class Network(encoder.Network):
         if not self.per_link:
             present = mask[:, :links, None]
             x = torch.where(present, x, 0.0).sum(dim=1) / present.sum(dim=1)
-        numbers: torch.Tensor = self.decode(x)
+        numbers: torch.Tensor = self.scale * self.decode(x)
         return numbers
 
 

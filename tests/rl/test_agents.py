@@ -37,10 +37,6 @@ class Network(encoder.Network):
         rows = layout.links if per_link else 1
         self.leave = encoder.last_layer(config.network.width, rows * outputs)
 
-    @property
-    def last(self):
-        return self.leave
-
     def forward(self, observation):
         tokens = torch.where(observation["links"][..., None], observation["tokens"], 0.0)
         return self.leave(self.enter(tokens.flatten(1)).tanh()).reshape(-1, *self.shape)
@@ -171,7 +167,7 @@ def test_the_relations_of_joints_change_actions(batches):
     learner = Learner(batches[0], POLICY, PPOConfig(total_timesteps=64, num_steps=8, minibatches=2))
     observation = learner._network_input(batches[0].reset())
     with torch.no_grad():
-        learner.actor.network.last.weight.normal_()
+        learner.actor.network.head[-1].weight.normal_()
         learner.actor.network.relation.weight.normal_()
     unrelated = {**observation, "joint_relations": observation["joint_relations"] * 0}
     assert not learner.actor(observation).allclose(learner.actor(unrelated))

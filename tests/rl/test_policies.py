@@ -114,7 +114,7 @@ def test_logit_scale_keeps_initial_logits_and_enlarges_their_changes(discrete):
     torch.testing.assert_close(before, plain(seen))
     assert other(seen).equal(critic(seen))
     with torch.no_grad():
-        larger.network.last.bias.add_(0.1)
+        larger.network.decode[-1].bias.add_(0.1)
     moved = torch.where(seen["actions"][..., None], 1.6 if discrete else 0.1, 0.0)
     torch.testing.assert_close(larger(seen) - before, moved.expand_as(before))
 
