@@ -57,24 +57,6 @@ def test_a_run_on_a_gpu_is_written_and_resumed():
     assert again.iterate().value_loss == pytest.approx(report.value_loss, rel=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "part", ["optimiser", "generators", "batch", "target_critic", "update", "actor_lr_scale"]
-)
-def test_a_run_resumed_without_a_part_of_the_state_differs(part):
-    options = {"task_reweighting": True, "learning_rate": 3e-3, "desired_kl": 1e-3}
-    went_on = learner(**options)
-    went_on.iterate(), went_on.iterate()
-    checkpoint = stored(state_of(went_on))
-    went_on.restart_episodes()
-    went_on.iterate()
-    again = learner(OnALine(8, seed=99), seed=77, **options)
-    again.iterate()
-    resume_learner(again, {**checkpoint, part: state_of(again)[part]})
-    again.iterate()
-    assert not equal(weights(went_on), weights(again))
-
-
 def test_later_updates_do_not_change_a_saved_state():
     made = learner()
     made.iterate()
@@ -86,16 +68,6 @@ def test_later_updates_do_not_change_a_saved_state():
     assert all(checkpoint["actor"][k].equal(before["actor"][k]) for k in before["actor"])
     steps = [each["step"] for each in checkpoint["optimiser"]["state"].values()]
     assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
-
-
-@pytest.mark.slow
-def test_saving_the_state_does_not_change_the_learner():
-    looked_at, alone = learner(), learner()
-    for each in (looked_at, alone):
-        each.iterate()
-    state_of(looked_at)
-    assert untimed(looked_at.iterate()) == untimed(alone.iterate())
-    assert equal(weights(looked_at), weights(alone))
 
 
 def test_resume_rejects_checkpoints_of_other_runs_and_changes_nothing():
@@ -119,16 +91,3 @@ def test_a_constant_missing_in_an_old_checkpoint_has_its_default():
     del checkpoint["policy"]["network"]["mlp_width"], checkpoint["config"]["desired_kl"]
     resume_learner(again, checkpoint)
     assert equal(weights(made), weights(again))
-
-
-@pytest.mark.slow
-def test_load_networks_loads_only_the_networks():
-    pre = learner()
-    pre.iterate()
-    fine = learner(OnALine(16), gamma=0.9)
-    load_networks(fine, stored(state_of(pre)))
-    assert equal(weights(pre), weights(fine))
-    assert fine.update == 0
-    assert not fine.optimiser.state
-    fine.iterate()
-    assert not equal(weights(pre), weights(fine))

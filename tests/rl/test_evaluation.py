@@ -148,32 +148,6 @@ def test_se_policies_are_scored_on_their_own_robot_and_together_on_others(tmp_pa
     assert test.score == pytest.approx(np.mean([each.score for each in alone]))
 
 
-@pytest.mark.parametrize(
-    ("limit", "value", "calls", "whole"),
-    [
-        ("MAX_ENVS_PER_ROBOT", 34, 300, 6),
-        ("MAX_ENVS_PER_ROBOT", 2, 600, 8),
-        (None, 4, 600, 6),
-    ],
-    ids=["at once", "in rounds", "in batches"],
-)
-def test_progress_counts_finished_and_partial_episodes(monkeypatch, limit, value, calls, whole):
-    if limit is None:
-        at_most(value, monkeypatch)
-    else:
-        monkeypatch.setattr(evaluation, limit, value)
-    seen = []
-    config = replace(EVAL, episodes=3)
-    with show_progress(lambda *now: seen.append(now)):
-        evaluate_baseline("zero", small_source(), config)
-    parts = [done for done, _ in seen]
-    assert {total for _, total in seen} == {whole}
-    assert len(parts) == calls
-    assert 0 < parts[0] < 0.05
-    assert parts == sorted(set(parts))
-    assert parts[-1] == whole
-
-
 def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp_path):
     config, learner = read_checkpoint(run)
     learner["layout"]["obstacles"] = 0

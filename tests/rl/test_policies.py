@@ -40,16 +40,6 @@ def test_the_order_of_obstacles_and_points_changes_nothing(agent):
 
 
 @agents
-def test_environments_are_independent(agent):
-    seen = observed()
-    actor, critic = networks(agent, seen)
-    for i in range(N):
-        alone = {name: each[i : i + 1] for name, each in seen.items()}
-        torch.testing.assert_close(critic(alone), critic(seen)[i : i + 1], rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(actor(alone), actor(seen)[i : i + 1], rtol=1e-4, atol=1e-5)
-
-
-@agents
 def test_outputs_of_immovable_links_are_zero(agent):
     seen = observed()
     actor, _ = networks(agent, seen)
@@ -83,18 +73,6 @@ def test_every_observation_entry_changes_the_outputs(agent, name):
     moved = (critic(seen) != critic(other)) & (actor(seen) != actor(other)).any(dim=2).any(dim=1)
     there = mask_of(seen, name).reshape(N, -1).any(dim=1)
     assert moved.equal(there)
-
-
-def test_sizes_are_those_of_the_paper():
-    actor, _ = networks("me-tf")
-    net = actor.network
-    assert net.index.shape == (LINKS, 64)
-    assert len(net.blocks) == 4
-    assert [block.heads for block in net.blocks] == [4] * 4
-    assert net.blocks[0].feedforward[1].weight.shape == (512, 64)
-    mlp = networks("me-mlp")[0].network
-    assert mlp.entities.project["links"].weight.shape[0] == 16
-    assert [layer[1].weight.shape for layer in mlp.layers] == [(192, 192)] * 3
 
 
 @kinds
@@ -141,13 +119,12 @@ def test_the_seed_determines_the_weights_and_torchs_generator_is_unchanged():
 
 
 @agents
-@pytest.mark.parametrize("garbage", [1e30, math.nan])
-def test_bfloat16_outputs_are_close_and_masked(agent, garbage):
+def test_bfloat16_outputs_are_close_and_masked(agent):
     seen = observed()
     actor, critic = networks(agent, seen)
     with torch.autocast("cpu", torch.bfloat16):
         numbers, value = actor(seen), critic(seen)
-        dirty = filled(seen, garbage)
+        dirty = filled(seen, math.nan)
         assert numbers.equal(actor(dirty))
         assert value.equal(critic(dirty))
     assert numbers.dtype == value.dtype == torch.float32
@@ -194,7 +171,7 @@ def test_rows_of_entity_kinds_in_a_checkpoint_keep_their_order(extras):
 
 @agents
 @kinds
-@pytest.mark.parametrize("garbage", [-7.5, 1e30, -3e38, math.inf, math.nan])
+@pytest.mark.parametrize("garbage", [-3e38, math.nan])
 def test_invalid_numbers_in_the_padding_change_nothing(agent, discrete, garbage):
     seen = observed()
     pair = networks(agent, seen, discrete=discrete)

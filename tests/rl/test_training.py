@@ -31,10 +31,8 @@ from morphgen.rl.agents import mlp
 from morphgen.rl.runs import training
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
-    open_run,
     read_checkpoint,
     read_config,
-    write_checkpoint,
 )
 from morphgen.rl.runs.recorders import METRICS, read_metrics
 from morphgen.rl.runs.robot_source import robot_source, split_source
@@ -234,28 +232,6 @@ def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     ] * 2
 
 
-@pytest.mark.slow
-def test_a_stopped_se_run_resumes_at_the_same_robot(tmp_path):
-    config = small_config(small_source(), agent="se", total_timesteps=128)
-    train(tmp_path / "whole", config, execution=QUIET)
-    parts = subruns_of(tmp_path / "cut", config)
-    begun = []
-
-    def show(part):
-        begun.append(part.config.source.member)
-        return stop_after(1)(part) if len(begun) == 2 else lambda report, updates: None
-
-    for _ in range(2):
-        try:
-            train(tmp_path / "cut", config, resume=True, execution=QUIET, show=show)
-        except StoppedError:
-            continue
-    first, second = (part.config.source.member for part in parts)
-    assert begun == [first, second, second]
-    for part, same in zip(parts, subruns_of(tmp_path / "whole", config), strict=True):
-        assert equal(weights(part.folder), weights(same.folder))
-
-
 def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in ("base=planar ee=cube", "base=planar ee=plane"):
@@ -325,18 +301,6 @@ def test_training_requires_enough_links_for_the_test_robots(tmp_path):
 def test_a_run_folder_is_locked(tmp_path):
     with locked_folder(tmp_path), pytest.raises(FormatError, match="by another run"):
         train(tmp_path, small_config(), execution=QUIET)
-
-
-def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(tmp_path):
-    config = small_config(total_timesteps=64)
-    with pytest.raises(StoppedError):
-        train(tmp_path, replace(config, max_links=30), execution=QUIET, show=stop_after(1))
-    learner = read_checkpoint(tmp_path)[1]
-    (tmp_path / CHECKPOINT).unlink()
-    open_run(tmp_path, config, resume=True)
-    write_checkpoint(tmp_path, config, learner)
-    with pytest.raises(TaskError, match="other observations: links 30, here 23"):
-        train(tmp_path, config, resume=True, execution=QUIET)
 
 
 def arm_of_three_joints():
