@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from morphgen.rl.baselines import baselines_for
-from morphgen.rl.play import make_env_and_controller, play, read_controller
+from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.tasks.registry import TASKS
 
 ROBOTS = ("ur5-plane", "prims", "chain beads=3")

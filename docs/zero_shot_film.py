@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
+from morphgen.rl.inference import FPS, make_env_and_controller, play, read_controller
 from morphgen.tasks.render.renderer import write_video
 
 ROBOTS = (

@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from morphgen.rl.agents import preset_of
+from morphgen.rl.config import configs_of, parse_agent
 from morphgen.rl.evaluation import eval_config_of, evaluate_run
-from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
-from morphgen.rl.runs.agent_spec import configs_of, parse_agent
+from morphgen.rl.inference import FPS, make_env_and_controller, play, read_controller
 from morphgen.rl.runs.checkpoint import RunConfig
 from morphgen.rl.runs.robot_source import robot_source
 from morphgen.rl.runs.training import ExecutionConfig, train

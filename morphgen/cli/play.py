@@ -75,7 +75,7 @@ def _policy(text: str) -> str:
 def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
     with status(args, "loading"):
-        from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
+        from morphgen.rl.inference import FPS, make_env_and_controller, play, read_controller
         from morphgen.tasks.render.renderer import require_video_path, write_video
 
     spec = read_controller(args.policy, args.task)
@@ -264,7 +264,7 @@ def _table(scores: Mapping[str, Score], task: str) -> str:
 
 
 def _film(source: RobotSource, policy: Path, config: EvalConfig, args: argparse.Namespace) -> None:
-    from morphgen.rl.play import FPS, make_env_and_controller, play, read_controller
+    from morphgen.rl.inference import FPS, make_env_and_controller, play, read_controller
     from morphgen.tasks.render.renderer import write_video
     from morphgen.tasks.scenes.env_specs import GoalConfig
     from morphgen.tasks.sim.base import CONTROL_PERIOD

@@ -86,8 +86,8 @@ def study(args: argparse.Namespace) -> int:
 
 def _cells(args: argparse.Namespace) -> list[Cell]:
     """Return the cells of the study, baselines first."""
+    from morphgen.rl.config import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
-    from morphgen.rl.runs.agent_spec import parse_agents
     from morphgen.rl.runs.robot_source import other_side, tasks_of
     from morphgen.rl.scores.study import agent_cell, baseline_cells, matched_budget
     from morphgen.tasks.goals.eval_protocol import EvalProtocol

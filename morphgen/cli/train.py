@@ -25,7 +25,7 @@ from morphgen.tasks.registry import (
 )
 
 if TYPE_CHECKING:
-    from morphgen.rl.runs.agent_spec import AgentSpec
+    from morphgen.rl.config import AgentSpec
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import RobotSource
     from morphgen.rl.runs.training import ExecutionConfig
@@ -85,7 +85,7 @@ AGENT_OPTIONS = (*(on_off(name, switch_help(name)) for name in SWITCHES), OBSERV
 
 def agent_spec(args: argparse.Namespace) -> AgentSpec:
     """Return the agent with the switches that were given."""
-    from morphgen.rl.runs.agent_spec import OBSERVATION_SWITCHES, parse_agent
+    from morphgen.rl.config import OBSERVATION_SWITCHES, parse_agent
 
     values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
     spec = parse_agent(args.agent)
@@ -375,7 +375,7 @@ def _next_command(folder: Path, config: RunConfig) -> str:
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
     """Return the configuration of a run from the options."""
-    from morphgen.rl.runs.agent_spec import configs_of, parse_constants
+    from morphgen.rl.config import configs_of, parse_constants
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import tasks_of
 
@@ -458,7 +458,7 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 
     A study does not require it: its options may be for some of its agents.
     """
-    from morphgen.rl.runs.agent_spec import owners_of, parse_constants
+    from morphgen.rl.config import owners_of, parse_constants
 
     agent = config.policy.agent
     if args.whole and not AGENTS[agent].per_robot:
@@ -544,8 +544,7 @@ def finetune(args: argparse.Namespace) -> None:
 
 
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
-    from morphgen.rl.config import PPOConfig
-    from morphgen.rl.runs.agent_spec import parse_constants
+    from morphgen.rl.config import PPOConfig, parse_constants
     from morphgen.rl.runs.checkpoint import read_checkpoint
     from morphgen.rl.runs.robot_source import other_side, tasks_of
     from morphgen.rl.runs.training import finetuning_config

@@ -106,7 +106,7 @@ class Preset:
     total_timesteps: int  # control steps of all environments together
     num_envs: int  # number of environments
     switches: Mapping[str, bool] = field(default_factory=dict)
-    """Switches of ``morphgen.rl.runs.agent_spec.SWITCHES``."""
+    """Switches of ``morphgen.rl.config.SWITCHES``."""
     constants: Mapping[str, float] = field(default_factory=dict)
     """Numbers of ``PPOConfig`` and of the networks; those of other agents have no effect."""
 

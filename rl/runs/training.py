@@ -1,7 +1,9 @@
-"""Train runs: create the run's folder, learn, and write the checkpoints to resume from."""
+"""Train runs: create the run's folder, learn, and write metrics and checkpoints to resume from."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import signal
 import threading
@@ -9,16 +11,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
 import torch
-from torch import nn
 
 from morphgen.benchmark.tokens import require_max_links
-from morphgen.errors import TaskError
-from morphgen.formats.files import locked_folder
+from morphgen.errors import FormatError, MissingDependencyError, TaskError
+from morphgen.formats.data_files import parse_json, read_text
+from morphgen.formats.files import locked_folder, naming, write_atomic
 from morphgen.formats.records import read_record
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
@@ -38,7 +42,6 @@ from morphgen.rl.runs.checkpoint import (
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.runs.recorders import Recorder, recording, require_wandb
 from morphgen.rl.runs.robot_source import (
     RobotSource,
     draw,
@@ -48,10 +51,14 @@ from morphgen.rl.runs.robot_source import (
     specs_of,
     write_drawn,
 )
+from morphgen.rl.scores.scores import finite_or_none
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS, batch_device, require_device
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import batch_from_specs
+
+NETWORKS = ("actor", "critic", "target_critic")
+"""Networks of a learner, by their names in its state."""
 
 
 def state_of(learner: Learner) -> dict[str, Any]:
@@ -61,18 +68,15 @@ def state_of(learner: Learner) -> dict[str, Any]:
     new episodes, and equals one that continued only if that one calls ``restart_episodes`` when the
     state is saved.
     """
-    states = {name: net.state_dict() for name, net in _networks(learner).items()}
-    states["optimiser"] = learner.optimiser.state_dict()
-    batch: Any = in_main_memory(learner.batch.state_dict())
+    states = {name: getattr(learner, name).state_dict() for name in (*NETWORKS, "optimiser")}
+    states["batch"] = learner.batch.state_dict()
+    joined, copied = learner.processes.joined, {n: in_main_memory(s) for n, s in states.items()}
     return {
-        **{name: in_main_memory(state) for name, state in states.items()},
-        "generators": {
-            name: learner.processes.joined(each.get_state()[None])
-            for name, each in learner.generators.items()
-        },
+        **copied,
+        "generators": {n: joined(each.get_state()[None]) for n, each in learner.generators.items()},
         "batch": {
-            name: learner.processes.joined(value) if isinstance(value, torch.Tensor) else value
-            for name, value in batch.items()
+            name: joined(value) if isinstance(value, torch.Tensor) else value
+            for name, value in copied["batch"].items()
         },
         "actor_lr_scale": learner.actor_lr_scale,
         "update": learner.update,
@@ -96,17 +100,15 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         "device": learner.device.type,
         "processes": learner.processes.size,
     }
-    stored = asdict(PPOConfig(**state["config"]))
     processes = len(state["generators"]["actions"])
-    run = {"updates": state["updates"], "device": state["device"], "processes": processes}
-    _require_same({**stored, **run}, ours)
+    _require_same(asdict(PPOConfig(**state["config"])) | state | {"processes": processes}, ours)
     n, rank, batch = learner.batch.num_envs, learner.processes.rank, state["batch"]
     if processes > 1:  # a checkpoint has the environments of all processes, one after another
         own = slice(rank * n, (rank + 1) * n)
         batch = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
     learner.batch.load_state_dict(batch)
-    for name, network in _networks(learner).items():
-        network.load_state_dict(state[name])
+    for name in NETWORKS:
+        getattr(learner, name).load_state_dict(state[name])
     learner.optimiser.load_state_dict(state["optimiser"])
     for name, generator in learner.generators.items():
         generator.set_state(state["generators"][name][rank].cpu())
@@ -120,8 +122,8 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
     With a ``desired_kl``, the actor's learning rate begins at ``FINETUNING_ACTOR_LR_SCALE``.
     """
     _require_networks(learner, state)
-    for name, network in _networks(learner).items():
-        network.load_state_dict(state[name])
+    for name in NETWORKS:
+        getattr(learner, name).load_state_dict(state[name])
     if learner.config.desired_kl:
         learner.actor_lr_scale = FINETUNING_ACTOR_LR_SCALE
 
@@ -140,14 +142,6 @@ def use_batch(learner: Learner, batch: TaskBatch) -> None:
             f"a robot has {links} links; the learner has room for {learner.num_link_rows}"
         )
     learner.use(batch)
-
-
-def _networks(learner: Learner) -> dict[str, nn.Module]:
-    return {
-        "actor": learner.actor,
-        "critic": learner.critic,
-        "target_critic": learner.target_critic,
-    }
 
 
 def _require_networks(learner: Learner, state: Mapping[str, Any]) -> None:
@@ -419,19 +413,17 @@ def train(
                     part.config, envs=envs, device=device, workers=execution.workers
                 )
             with _learner(part, batches, processes, device) as learner:
-                if not processes.is_first:
-                    if _learn(learner, batches, part, None, None, stop):
-                        break
-                    continue
-                if not holds:
-                    folder.mkdir(parents=True, exist_ok=True)
-                    held.enter_context(hold(folder))
-                    open_run(folder, config, resume=resume)
+                if processes.is_first:
+                    if not holds:
+                        folder.mkdir(parents=True, exist_ok=True)
+                        held.enter_context(hold(folder))
+                        open_run(folder, config, resume=resume)
                     holds = True
-                open_run(part.folder, part.config, resume=True)
-                if batches.drawn is not None:
-                    write_drawn(part.folder, part.config.source, batches.drawn)
-                if _learn(learner, batches, part, execution, show(part) if show else None, stop):
+                    open_run(part.folder, part.config, resume=True)
+                    if batches.drawn is not None:
+                        write_drawn(part.folder, part.config.source, batches.drawn)
+                writes = execution if processes.is_first else None
+                if _learn(learner, batches, part, writes, show, stop):
                     break
     return parts if processes.is_first else []
 
@@ -534,14 +526,19 @@ def _learn(
     batches: TrainingBatches,
     part: Subrun,
     execution: ExecutionConfig | None,
-    show: ShowMetrics | None,
+    show: Callable[[Subrun], ShowMetrics] | None,
     stop: _StopRequest,
 ) -> bool:
-    """Make the remaining updates of a part, and record them; return whether it stopped early."""
+    """Make the remaining updates of a part; return whether it stopped early.
+
+    Without an execution, in processes besides the first, nothing is recorded, written or shown.
+    """
     is_stopped = False
     interval = updates_between(part.config)
+    report: ShowMetrics = lambda metrics, updates: None  # noqa: E731
     recorders: AbstractContextManager[Recorder] = nullcontext(lambda metrics: None)
     if execution is not None:
+        report = show(part) if show else report
         tensorboard, wandb = execution.tensorboard, execution.wandb
         recorders = recording(
             part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
@@ -565,8 +562,7 @@ def _learn(
                     write_checkpoint(part.folder, part.config, state)
                 # A resumed run begins new episodes here, and must end with the same weights.
                 learner.restart_episodes()
-            if show:
-                show(metrics, learner.num_updates)
+            report(metrics, learner.num_updates)
     return is_stopped
 
 
@@ -618,3 +614,112 @@ class _StopRequest:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers = {}
+
+
+METRICS, EVENTS = "metrics.jsonl", "events"
+
+Recorder = Callable[[UpdateMetrics], None]  # function that records the metrics of an update
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Return the recorded metrics of a run, a dictionary per update, oldest first.
+
+    An unfinished last line of a killed run is ignored.
+    """
+    path = folder / METRICS
+    if not path.is_file():
+        return []
+    lines = read_text(path).split("\n")[:-1]
+    reports = []
+    for number, line in enumerate(lines, 1):
+        try:
+            report = parse_json(line, f"{path}:{number}")
+            report["update"], report["transitions"], report["score"]
+        except (FormatError, KeyError, TypeError) as error:
+            raise FormatError(f"{path}, line {number}: not the report of an update") from error
+        reports.append(report)
+    return reports
+
+
+@contextmanager
+def recording(
+    folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
+) -> Iterator[Recorder]:
+    """Yield the recorder of a run that continues after an update; it is closed at the end.
+
+    It writes a line per update, with null for numbers not finite; lines of later updates, which a
+    killed run has written, are removed.
+    """
+    kept = [report for report in read_metrics(folder) if report["update"] <= update]
+    path = folder / METRICS
+    write_atomic(path, "".join(json.dumps(report) + "\n" for report in kept))
+    with ExitStack() as stack:
+        file = stack.enter_context(path.open("a", encoding="utf-8"))
+        writer = run = None
+        if tensorboard:
+            writer = stack.enter_context(closing(_summary_writer(folder, update)))
+        if wandb:
+            run = _wandb_run(folder, config)
+            stack.callback(run.finish)
+
+        def record(report: UpdateMetrics) -> None:
+            with naming(path):
+                file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
+                file.flush()  # a killed run keeps its lines
+            scalars = dict(_scalars(report))
+            if writer is not None:
+                for name, value in scalars.items():
+                    writer.add_scalar(name, value, report.update)
+            if run is not None:
+                run.log(scalars, step=report.update)
+
+        yield record
+
+
+def _summary_writer(folder: Path, update: int) -> Any:  # noqa: ANN401
+    """Return the writer of events for TensorBoard; those of later updates are hidden."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise MissingDependencyError(
+            "TensorBoard is not installed: pip install tensorboard, or say --no-tensorboard"
+        ) from error
+    return SummaryWriter(str(folder / EVENTS), purge_step=update + 1)
+
+
+def _wandb_run(folder: Path, config: RunConfig) -> Any:  # noqa: ANN401
+    """Begin a run of Weights & Biases, or continue that of the folder."""
+    wandb = require_wandb()
+    try:
+        return wandb.init(
+            project="morphgen",
+            name=str(folder),
+            # The same folder continues the same run; an id has at most 64 characters.
+            id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
+            resume="allow",
+            dir=folder,
+            config=config.as_data(),
+        )
+    except wandb.errors.Error as error:
+        raise TaskError(f"--wandb: {error}") from error
+
+
+def require_wandb() -> ModuleType:
+    """Return the module of Weights & Biases."""
+    try:
+        return import_module("wandb")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--wandb needs the package wandb: pip install wandb"
+        ) from error
+
+
+def _scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:
+    """Yield names and values of a report's numbers; those of robots and terms as ``name/key``."""
+    for name, value in asdict(report).items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}/{key}", float(each)) for key, each in value.items())
+        elif isinstance(value, tuple):
+            yield from ((f"{name}/{i}", float(each)) for i, each in enumerate(value))
+        elif math.isfinite(value):
+            yield name, float(value)

@@ -21,8 +21,7 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import write_file
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.runs.recorders import read_metrics
-from morphgen.rl.runs.training import subruns_of
+from morphgen.rl.runs.training import read_metrics, subruns_of
 from morphgen.rl.scores.episode_table import name_of
 from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores.scores import (

@@ -7,9 +7,8 @@ from morphgen.rl.agents import AGENTS, mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.evaluation import EvalConfig
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
-from morphgen.rl.runs.recorders import read_metrics
 from morphgen.rl.runs.robot_source import robot_source, split_source
-from morphgen.rl.runs.training import ExecutionConfig
+from morphgen.rl.runs.training import ExecutionConfig, read_metrics
 
 QUIET = ExecutionConfig(tensorboard=False)
 EVAL = EvalConfig(episodes=2, sim="mujoco")

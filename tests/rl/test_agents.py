@@ -11,10 +11,9 @@ import morphgen
 from helpers.runs import QUIET, small_config
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS, Agent, NetworkConfig, encoder
-from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.config import PolicyConfig, PPOConfig, parse_agent, parse_agents, parse_constants
 from morphgen.rl.inference import Policy, load_policy
 from morphgen.rl.ppo import Learner
-from morphgen.rl.runs.agent_spec import parse_agent, parse_agents, parse_constants
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.training import state_of, train
 from morphgen.rl.shipped_policies import POLICIES

@@ -16,9 +16,8 @@ from morphgen.rl.agents import (
     preset_of,
     transformer,
 )
-from morphgen.rl.config import NUMBERS, PolicyConfig, PPOConfig
+from morphgen.rl.config import NUMBERS, SWITCHES, PolicyConfig, PPOConfig, configs_of, parse_agent
 from morphgen.rl.ppo import normalized_advantages
-from morphgen.rl.runs.agent_spec import SWITCHES, configs_of, parse_agent
 
 
 def test_transitions_are_rounded_up_to_whole_updates():

@@ -27,9 +27,8 @@ from morphgen.rl.runs.checkpoint import (
     unpacked,
     write_checkpoint,
 )
-from morphgen.rl.runs.recorders import METRICS, read_metrics, recording
 from morphgen.rl.runs.robot_source import robot_source, specs_of
-from morphgen.rl.runs.training import ROBOTS, state_of
+from morphgen.rl.runs.training import METRICS, ROBOTS, read_metrics, recording, state_of
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
 

@@ -20,9 +20,8 @@ from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
 from morphgen.rl.inference import MODES
 from morphgen.rl.runs.checkpoint import CHECKPOINT
-from morphgen.rl.runs.recorders import METRICS
 from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
-from morphgen.rl.runs.training import subruns_of
+from morphgen.rl.runs.training import METRICS, subruns_of
 from morphgen.rl.scores import study
 from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
 from morphgen.rl.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables

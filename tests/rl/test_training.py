@@ -34,11 +34,12 @@ from morphgen.rl.runs.checkpoint import (
     read_checkpoint,
     read_config,
 )
-from morphgen.rl.runs.recorders import METRICS, read_metrics
 from morphgen.rl.runs.robot_source import robot_source, split_source
 from morphgen.rl.runs.training import (
+    METRICS,
     ExecutionConfig,
     checkpoint_files,
+    read_metrics,
     subruns_of,
     train,
     updates_between,

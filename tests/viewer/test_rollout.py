@@ -12,7 +12,7 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
-from morphgen.rl.play import make_env_and_controller, play, read_controller
+from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.rl.runs.training import train
 from morphgen.viewer.app.address import Address, parse_address
 from morphgen.viewer.app.app import start_address
