@@ -29,7 +29,7 @@ from morphgen.model.kinematics_torch import (
     pose_task,
     rotation_from_z,
     rotvec_from_matrix,
-    solve_from_starts,
+    solve_ik,
 )
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.typing import Array
@@ -124,7 +124,7 @@ class IkSolutions:
         now, lower, upper = targets[rows], self._lower[rows], self._upper[rows]
         random = lower + (upper - lower) * self._fractions[:, None]
         starts = torch.cat([now[None], torch.where(self._moves_tool[rows], random, now)])
-        q, error = solve_from_starts(
+        q, error = solve_ik(
             self._tables.tool_chain,
             self._index[rows],
             starts,

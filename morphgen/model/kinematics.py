@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,15 +89,13 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     """Return ``T_root_link``, the pose of every link in the root frame, (..., n_links, 4, 4)."""
     positions = movable_positions(robot, q)
-    batch = positions.shape[:-1]
-    T_root_link = np.empty((*batch, len(robot.links), 4, 4))
+    motions = _joint_motions([robot.joints[k] for k in robot.movable_joints], positions)
+    T_root_link = np.empty((*positions.shape[:-1], len(robot.links), 4, 4))
     T_root_link[..., 0, :, :] = np.eye(4)
     column = {k: i for i, k in enumerate(robot.movable_joints)}
     for k, joint in enumerate(robot.joints):
         T = T_root_link[..., robot.parents[k + 1], :, :] @ joint.T_parent_joint.matrix
-        if joint.is_movable:
-            T = T @ _joint_motion(joint.kind, joint.unit_axis, positions[..., column[k]])
-        T_root_link[..., k + 1, :, :] = T
+        T_root_link[..., k + 1, :, :] = T @ motions[..., column[k], :, :] if k in column else T
     return T_root_link
 
 
@@ -132,11 +131,13 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
     """
     target, positions = robot.frame(frame), movable_positions(robot, q)
     row = {k: i for i, k in enumerate(robot.movable_joints)}
-    chain, fixed, T = [], [], np.eye(4)  # movable joints, and the constant transform before each
+    # Movable joints, their rows, and the constant transform before each.
+    chain, rows, fixed, T = [], [], [], np.eye(4)
     for k in robot.joint_chain(target.link):
         T = T @ robot.joints[k].T_parent_joint.matrix
         if k in row:
-            chain.append(k)
+            chain.append(robot.joints[k])
+            rows.append(row[k])
             fixed.append(T)
             T = np.eye(4)
     T_last_frame = T @ target.T_link_frame.matrix
@@ -145,10 +146,8 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
             np.broadcast_to(T_last_frame, (*positions.shape[:-1], 4, 4)).copy(),
             np.zeros((*positions.shape[:-1], 6, robot.dof)),
         )
-    rows = [row[k] for k in chain]
-    axes = np.array([robot.joints[k].unit_axis for k in chain])
-    slides = np.array([robot.joints[k].kind == "prismatic" for k in chain])
-    T_joints = np.array(fixed) @ _joint_motions(slides, axes, positions[..., rows])
+    slides, axes = _slides_and_axes(chain)
+    T_joints = np.array(fixed) @ _joint_motions(chain, positions[..., rows])
     for i in range(1, len(chain)):
         T_joints[..., i, :, :] = T_joints[..., i - 1, :, :] @ T_joints[..., i, :, :]
     T_root_frame = T_joints[..., -1, :, :] @ T_last_frame
@@ -252,44 +251,37 @@ def with_root_at(robot: Robot, point: Vec3) -> Robot:
 def _distance(robot: Robot, q: Array, frame: str) -> Array:
     """Return distances of a frame from the root's origin at q (..., dof), shape (...) [m].
 
-    ``morphgen.model.kinematics`` would be faster, but differs in the last bits, and these are
-    stored in push sets.
+    ``FramePosition`` would be faster, but differs in the last bits, and these are in the edges of
+    the blocks of shipped push sets. Rotations use Rodrigues' formula.
     """
     positions = movable_positions(robot, q)
     target = robot.frame(frame)
     column = {k: i for i, k in enumerate(robot.movable_joints)}
     point = np.broadcast_to(np.array(target.T_link_frame.position), (*q.shape[:-1], 3))
     for k in reversed(robot.joint_chain(target.link)):
-        joint = robot.joints[k]
+        joint, T = robot.joints[k], robot.joints[k].T_parent_joint.matrix
         if joint.is_movable:
-            point = _move_point(point, joint.kind, joint.unit_axis, positions[..., column[k], None])
-        T = joint.T_parent_joint.matrix
+            position, axis = positions[..., column[k], None], np.array(joint.unit_axis)
+            if joint.kind == "prismatic":
+                point = point + position * axis
+            else:
+                (x, y, z), c = axis, np.cos(position)
+                cross = point @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+                along = (point @ axis)[..., None] * (1 - c) * axis
+                point = point * c + cross * np.sin(position) + along
         point = point @ T[:3, :3].T + T[:3, 3]
     return np.asarray(np.sqrt((point * point).sum(axis=-1)))
 
 
-def _move_point(point: Array, kind: str, axis: Vec3, position: Array) -> Array:
-    """Move points (..., 3) by a joint; rotations use Rodrigues' formula."""
-    a = np.array(axis)
-    if kind == "prismatic":
-        return np.asarray(point + position * a)
-    c, s = np.cos(position), np.sin(position)
-    x, y, z = axis
-    cross = point @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-    return np.asarray(point * c + cross * s + (point @ a)[..., None] * (1 - c) * a)
+def _slides_and_axes(joints: Sequence[Joint]) -> tuple[NDArray[np.bool_], Array]:
+    """Return which joints are prismatic, shape (k,), and their unit axes, shape (k, 3)."""
+    slides = np.array([joint.kind == "prismatic" for joint in joints], dtype=np.bool_)
+    return slides, np.array([joint.unit_axis for joint in joints]).reshape(-1, 3)
 
 
-def _joint_motion(kind: str, axis: Vec3, position: Array) -> Array:
-    """Return the transform of a joint at positions (...), shape (..., 4, 4)."""
-    slides = np.array([kind == "prismatic"])
-    return np.asarray(_joint_motions(slides, np.array([axis]), position[..., None])[..., 0, :, :])
-
-
-def _joint_motions(slides: NDArray[np.bool_], axes: Array, positions: Array) -> Array:
-    """Return transforms (..., k, 4, 4) of k joints, which are prismatic or not, (k,).
-
-    Their unit axes have shape (k, 3), their positions (..., k) [rad or m].
-    """
+def _joint_motions(joints: Sequence[Joint], positions: Array) -> Array:
+    """Return transforms (..., k, 4, 4) of k movable joints at positions (..., k) [rad or m]."""
+    slides, axes = _slides_and_axes(joints)
     T = np.zeros((*positions.shape, 4, 4))
     x, y, z = axes.T
     angles = np.where(slides, 0.0, positions)
@@ -303,103 +295,52 @@ def _joint_motions(slides: NDArray[np.bool_], axes: Array, positions: Array) -> 
     return T
 
 
-@dataclass(frozen=True, eq=False)
-class _AlignedJoint:
-    """A movable joint between the root and a frame, its axis along z."""
-
-    T_joint_next: Pose
-    """Pose of the next joint, or of the frame, in the frame of this joint after its motion."""
-    leader: int
-    """Independent joint that it follows."""
-    gain: float
-    offset: float
-    """Its position is gain x + offset where the leader's is x [rad or m]."""
-    slides: bool
-    """Whether the joint is prismatic."""
-
-
-def _aligned_joints(robot: Robot, frame: str) -> tuple[list[_AlignedJoint], Pose]:
-    """Return the joints from a frame to the root, and the pose of the last one in the root."""
-    gains, offsets = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable_joints)}
-    target, joints = robot.frame(frame), []
-    T_joint_next = target.T_link_frame
-    for k in reversed(robot.joint_chain(target.link)):
-        joint = robot.joints[k]
-        if joint.is_movable and not gains[row[k]].any():  # it follows a fixed joint, and stays
-            T_joint_next = _displacement(joint, float(offsets[row[k]])) @ T_joint_next
-        elif joint.is_movable:
-            leader = int(np.abs(gains[row[k]]).argmax())
-            gain, offset = float(gains[row[k], leader]), float(offsets[row[k]])
-            T_joint_axis = Pose(quaternion=rotation.from_z(joint.unit_axis))
-            T_axis_next = T_joint_axis.inverse() @ T_joint_next
-            slides = joint.kind == "prismatic"
-            joints.append(_AlignedJoint(T_axis_next, leader, gain, offset, slides))
-            T_joint_next = T_joint_axis
-        T_joint_next = joint.T_parent_joint @ T_joint_next
-    return joints, T_joint_next
-
-
-def _displacement(joint: Joint, position: float) -> Pose:
-    x, y, z = joint.unit_axis
-    if joint.kind == "prismatic":
-        return Pose((position * x, position * y, position * z))
-    s = math.sin(position / 2)
-    return Pose(quaternion=rotation.normalize((math.cos(position / 2), s * x, s * y, s * z)))
-
-
-def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
-    """Return positions of a named frame in the root frame, (3, n) [m], at ``q`` (dof, n)."""
-    points = np.zeros((3, q.shape[1]))
-    joints, T_root_next = _aligned_joints(robot, frame)
-    for joint in joints:
-        points = _transform(joint.T_joint_next, points)
-        position = joint.offset + joint.gain * q[joint.leader]
-        if joint.slides:
-            points[2] += position
-        else:
-            c, s, (x, y) = np.cos(position), np.sin(position), points[:2]
-            points[0], points[1] = c * x - s * y, s * x + c * y
-    return _transform(T_root_next, points)
-
-
 class FramePosition:
-    """Position of a named frame at one configuration after the other.
+    """Position of a named frame, without the rotations that ``frame_pose`` computes.
 
-    It computes in plain numbers: on so few of them, a call of NumPy takes longer than what it does.
+    The frame's point moves from joint to joint, each with its axis along z. Its components are
+    numbers or arrays: at one configuration, a call of NumPy takes longer than what it does.
     """
 
     def __init__(self, robot: Robot, frame: str = TOOL) -> None:
-        """Compile the joints."""
-        joints, T_root_next = _aligned_joints(robot, frame)
-        self._joints = [
-            (joint.leader, joint.gain, joint.offset, joint.slides, _rows(joint.T_joint_next))
-            for joint in joints
-        ]
-        self._root = _rows(T_root_next)
+        """Compile the joints from the frame to the root."""
+        gains, offsets = robot.mimic_map
+        row = {k: i for i, k in enumerate(robot.movable_joints)}
+        target = robot.frame(frame)
+        T_joint_next = target.T_link_frame
+        self._joints: list[tuple[tuple[float, ...], int | None, float, float, bool]] = []
+        for k in reversed(robot.joint_chain(target.link)):
+            joint = robot.joints[k]
+            if joint.is_movable:
+                gain = gains[row[k]]
+                leader = int(np.abs(gain).argmax()) if gain.any() else None
+                factor = 0.0 if leader is None else float(gain[leader])
+                T_joint_axis = Pose(quaternion=rotation.from_z(joint.unit_axis))
+                rows = _rows(T_joint_axis.inverse() @ T_joint_next)
+                slides = joint.kind == "prismatic"
+                self._joints.append((rows, leader, factor, float(offsets[row[k]]), slides))
+                T_joint_next = T_joint_axis
+            T_joint_next = joint.T_parent_joint @ T_joint_next
+        self._root = _rows(T_joint_next)
 
-    def __call__(self, q: Sequence[float]) -> Vec3:
-        """Return the position in the root frame [m] at independent joint positions."""
-        x = y = z = 0.0
-        for leader, gain, offset, slides, rows in self._joints:
-            xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz = rows
-            x, y, z = (
-                xx * x + xy * y + xz * z + tx,
-                yx * x + yy * y + yz * z + ty,
-                zx * x + zy * y + zz * z + tz,
-            )
-            position = gain * q[leader] + offset
+    def __call__(self, q: Sequence[Any] | Array) -> tuple[Any, Any, Any]:
+        """Return x, y and z in the root frame [m] at independent joint positions.
+
+        q: A number for each independent joint, or an array (dof, n), which gives arrays (n,).
+        """
+        cos, sin = (np.cos, np.sin) if isinstance(q, np.ndarray) else (math.cos, math.sin)
+        x: Any = 0.0
+        y: Any = 0.0
+        z: Any = 0.0
+        for rows, leader, gain, offset, slides in self._joints:
+            x, y, z = _transform(rows, x, y, z)
+            position = offset if leader is None else gain * q[leader] + offset
             if slides:
-                z += position
+                z = z + position
             else:
-                c, s = math.cos(position), math.sin(position)
+                c, s = cos(position), sin(position)
                 x, y = c * x - s * y, s * x + c * y
-        xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz = self._root
-        return (
-            xx * x + xy * y + xz * z + tx,
-            yx * x + yy * y + yz * z + ty,
-            zx * x + zy * y + zz * z + tz,
-        )
+        return _transform(self._root, x, y, z)
 
 
 def _rows(T: Pose) -> tuple[float, ...]:
@@ -407,9 +348,20 @@ def _rows(T: Pose) -> tuple[float, ...]:
     return tuple(T.matrix[:3].ravel().tolist())
 
 
-def _transform(T: Pose, points: Array) -> Array:
-    # einsum, because starting the threads of a matrix product costs more than it saves
-    return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
+def _transform(rows: tuple[float, ...], x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
+    xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz = rows
+    return (
+        xx * x + xy * y + xz * z + tx,
+        yx * x + yy * y + yz * z + ty,
+        zx * x + zy * y + zz * z + tz,
+    )
+
+
+def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
+    """Return positions of a named frame in the root frame, (3, n) [m], at ``q`` (dof, n)."""
+    points = np.empty((3, q.shape[1]))
+    points[0], points[1], points[2] = FramePosition(robot, frame)(q)
+    return points
 
 
 DAMPING = 0.02

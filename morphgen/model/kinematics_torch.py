@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from morphgen.model.kinematics import DAMPING, MAX_STEP
+from morphgen.model.kinematics import DAMPING
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 
@@ -405,10 +405,6 @@ def _select(poses: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
 
 
 ROTATION_DAMPING = 0.1  # damping of rotations [joint units per radian]
-START_DAMPING = 0.05
-"""Damping of ``solve_from_starts`` [joint units per metre]: more than of paths that start near."""
-START_MAX_STEP = 0.5  # largest change of a joint in one iteration of solve_from_starts [rad or m]
-
 _ROTATION_SHARES = (0.25, 0.5, 0.75, 1.0)
 """Fractions of a rotation step that are compared with the rotation budget."""
 
@@ -442,74 +438,46 @@ def pose_task(
 def solve_ik(
     chain: FrameChain,
     robot_index: torch.Tensor,
-    q: torch.Tensor,
+    starts: torch.Tensor,
     positions: torch.Tensor,
     rotations: torch.Tensor | None,
     limits: tuple[torch.Tensor, torch.Tensor],
     *,
     rotation_weight: float = 0.0,
     iterations: int = 25,
-    damping: float = DAMPING,
-    max_step: float = MAX_STEP,
+    damping: float = 0.05,
+    max_step: float = 0.5,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to positions, or to poses, by damped least squares, within the joint limits.
+    """Move tools to positions or poses by damped least squares, from several starts each.
 
     Position and rotation have the same priority. From random starts this finds more solutions than
     repeating ``pose_ik_step``, which is made for paths that start near their goals.
 
+    starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
     rotations: None if only positions matter.
+    damping: Damping [joint units per metre], more than of paths that start near.
 
     Returns:
-        Configurations, shape (n, J), and the remaining errors, shape (n, 3) or, for poses as of
-        ``pose_task``, (n, 6) [m].
+        Configurations, shape (S, n, J), within the joint limits, and the remaining errors, shape
+        (S, n, 3) or, for poses as of ``pose_task``, (S, n, 6) [m].
     """
+    count = len(starts)
+    robot_index, positions = robot_index.repeat(count), positions.repeat(count, 1)
+    lower, upper = (limit.repeat(count, 1) for limit in limits)
+    R = None if rotations is None else rotations.repeat(count, 1, 1)
 
     def task(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
-        if rotations is None:
+        if R is None:
             return J_root_tool[:, :3], positions - T_root_tool[:, :3, 3]
-        return pose_task(T_root_tool, J_root_tool, positions, rotations, rotation_weight)
+        return pose_task(T_root_tool, J_root_tool, positions, R, rotation_weight)
 
-    q = torch.clamp(q, *limits)
+    q = torch.clamp(starts.flatten(0, 1), lower, upper)
     for _ in range(iterations):
         J, error = task(q)
         step = dls_step(J, error, damping)
-        q = torch.clamp(q + step.clamp(-max_step, max_step), *limits)
-    return q, task(q)[1]
-
-
-def solve_from_starts(
-    chain: FrameChain,
-    robot_index: torch.Tensor,
-    starts: torch.Tensor,
-    positions: torch.Tensor,
-    rotations: torch.Tensor | None,
-    limits: tuple[torch.Tensor, torch.Tensor],
-    *,
-    rotation_weight: float,
-    iterations: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to positions or poses from several starts each; see ``solve_ik``.
-
-    starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
-
-    Returns:
-        Configurations, shape (S, n, J), and the remaining errors, shape (S, n, 3) or (S, n, 6) [m].
-    """
-    count = len(starts)
-    q, error = solve_ik(
-        chain,
-        robot_index.repeat(count),
-        starts.flatten(0, 1),
-        positions.repeat(count, 1),
-        None if rotations is None else rotations.repeat(count, 1, 1),
-        (limits[0].repeat(count, 1), limits[1].repeat(count, 1)),
-        rotation_weight=rotation_weight,
-        iterations=iterations,
-        damping=START_DAMPING,
-        max_step=START_MAX_STEP,
-    )
-    return q.view_as(starts), error.view(count, len(positions), -1)
+        q = torch.clamp(q + step.clamp(-max_step, max_step), lower, upper)
+    return q.view_as(starts), task(q)[1].view(*starts.shape[:2], -1)
 
 
 def pose_ik_step(

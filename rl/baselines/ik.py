@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from morphgen.model.kinematics_torch import solve_from_starts
+from morphgen.model.kinematics_torch import solve_ik
 from morphgen.rl.baselines.path_planner import (
     Path,
     PathFollower,
@@ -140,7 +140,7 @@ def _solve_ik(
     """
     tables, goals = task.robot_tables, reach_goals(task)
     robots = task.env_robot_index[envs]
-    q, error = solve_from_starts(
+    q, error = solve_ik(
         tables.tool_chain,
         robots,
         starts,

@@ -6,7 +6,7 @@ import torch
 
 from morphgen.model import kinematics, kinematics_torch
 from morphgen.model import kinematics_torch as batched
-from morphgen.model.kinematics import frame_positions, joint_limits
+from morphgen.model.kinematics import DAMPING, MAX_STEP, frame_positions, joint_limits
 
 BACKENDS = ("numpy", "float64", "float32")
 
@@ -91,13 +91,14 @@ class TorchBackend:
         return kinematics_torch.dls_step(*tensors, damping).numpy()
 
     def solve_position_ik(self, index, q, positions, **options):
+        options = {"damping": DAMPING, "max_step": MAX_STEP} | options
         robot_index, padded = self.rows(index, q)
         goals = torch.from_numpy(positions).to(self.dtype)
         limits = self.limits(robot_index)
         found, error = kinematics_torch.solve_ik(
-            self.chain, robot_index, padded, goals, None, limits, **options
+            self.chain, robot_index, padded[None], goals, None, limits, **options
         )
-        return found[:, : q.shape[1]].double().numpy(), error.numpy()
+        return found[0, :, : q.shape[1]].double().numpy(), error[0].numpy()
 
     def limits(self, robot_index):
         """Return lower and upper limits of every row, each (n, J)."""

@@ -11,6 +11,8 @@ from helpers.kinematic_backends import BACKENDS, backend
 from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.model.kinematics import (
+    DAMPING,
+    MAX_STEP,
     driving_joints,
     frame_pose,
     joint_limits,
@@ -152,15 +154,14 @@ def test_poses_are_reached_from_random_starts_within_the_limits():
     q, error = solve_ik(
         solver.chain,
         solver.robot_index,
-        low + (high - low) * random[1],
+        (low + (high - low) * random[1])[None],
         positions,
         rotations,
         solver.limits,
         rotation_weight=0.2,
         iterations=60,
-        damping=0.05,
-        max_step=0.5,
     )
+    q, error = q[0], error[0]
     assert ((low <= q) & (q <= high)).all()
     reached, turned = solver.poses(q)
     assert torch.allclose(error[:, :3], positions - reached, atol=1e-5)
@@ -210,8 +211,9 @@ def test_no_joint_exceeds_its_rotation_budget():
 def test_solutions_are_differentiable_in_their_goals():
     step = Stepper(0, 1)
     goals = (step.poses(step.home)[0] - 0.05).requires_grad_()
-    found, _ = solve_ik(step.chain, step.robot_index, step.home, goals, None, step.limits)
-    tools = step.poses(found)[0]
+    starts, options = step.home[None], {"damping": DAMPING, "max_step": MAX_STEP}
+    found, _ = solve_ik(step.chain, step.robot_index, starts, goals, None, step.limits, **options)
+    tools = step.poses(found[0])[0]
     (gradient,) = torch.autograd.grad(tools.sum(), goals)
     torch.testing.assert_close(gradient, torch.ones_like(goals), atol=0.02, rtol=0)
 
