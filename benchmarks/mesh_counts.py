@@ -178,7 +178,7 @@ def compare_triangles(files: Iterable[Path]) -> tuple[int, list[list[object]]]:
             reason = str(error).split("mesh: ")[-1]
             found = [f"{counted} triangles, refused: {re.sub(r'[0-9]+', 'N', reason)}"]
         else:
-            read = sum(len(faces) for _, (_, faces) in content.pieces)
+            read = sum(len(part.faces) for part in content.parts)
             found = [re.sub(r"'[^']*'|\d+", "N", note) for note in content.left_out]
             if counted != read:
                 found.append(f"triangles differ{'' if content.left_out else ' without a note'}")

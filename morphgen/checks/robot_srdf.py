@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from lxml import etree
 
-from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker
+from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker, adjacent_pairs
 from morphgen.formats.srdf import LinkSpheres, require_tool
 from morphgen.model.geometry import Mesh
 from morphgen.model.kinematics import random_configurations
@@ -62,7 +62,7 @@ def collision_matrix(
     penetrations = checker.penetrations(q)
     at_home = next(penetrations)
     collisions = Counter(pair for depths in penetrations for pair in depths)
-    adjacent = linked_pairs(robot)
+    adjacent = adjacent_pairs(loose)  # as in MoveIt, links on fixed joints are not merged
     reasons: dict[Pair, Reason] = dict.fromkeys(robot.ignore_pairs, "User")
     for pair in pairs:
         if pair in adjacent:
@@ -76,23 +76,6 @@ def collision_matrix(
     return CollisionMatrix(
         dict(sorted(reasons.items())), dict(sorted(collisions.items())), len(pairs), samples, seed
     )
-
-
-def linked_pairs(robot: Robot) -> frozenset[Pair]:
-    """Return the pairs of a link and its nearest ancestor, of links with collision shapes.
-
-    Unlike ``morphgen.checks.self_collision.adjacent_pairs``, links on fixed joints are not merged:
-    only a joint makes two links adjacent, as in MoveIt.
-    """
-    nearest_collidable: list[int] = []
-    """For every link, itself if it has collision shapes, else its nearest ancestor with some."""
-    pairs = set()
-    for i, (link, parent) in enumerate(zip(robot.links, robot.parents, strict=True)):
-        ancestor = nearest_collidable[parent] if parent >= 0 else -1
-        nearest_collidable.append(i if link.collisions else ancestor)
-        if link.collisions and ancestor >= 0:
-            pairs.add(sorted_pair(link.name, robot.links[ancestor].name))
-    return frozenset(pairs)
 
 
 def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:

@@ -222,7 +222,7 @@ def _split_shape(shape: Shape) -> tuple[Shape, ...]:
     return tuple(
         replace(shape, geometry=replace(mesh, part=i), rgba=part.rgba or shape.rgba)
         for i, part in enumerate(parts)
-        if part.faces > 1  # MuJoCo refuses three vertices
+        if len(part.faces) > 1  # MuJoCo refuses three vertices
     )
 
 

@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.model import rotation
 from morphgen.model.rotation import Quat, Vec3
@@ -127,7 +129,16 @@ class Mesh:
     scale: Vec3 = (1.0, 1.0, 1.0)
     """Scale factors along x, y and z; negative ones mirror the mesh."""
     part: int | None = None
-    """Index of one colour group of the file (see ``mesh_parts``); None for the whole file."""
+    """Index of one colour of the file (see ``mesh_parts``); None for the whole file."""
+
+
+class MeshPart(NamedTuple):
+    """Triangles of a mesh file that share a colour."""
+
+    rgba: Rgba | None
+    """Colour, each channel in [0, 1], the mean of a texture; None if the file names none."""
+    vertices: Array  # shape (n, 3) [m]
+    faces: NDArray[np.int64]  # shape (m, 3)
 
 
 Primitive = Box | Sphere | Cylinder | Capsule

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
-from morphgen.model.geometry import Mesh, Rgba
+from morphgen.model.geometry import Mesh, MeshPart, Rgba
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
     import trimesh
 
+    from morphgen.model.mesh_files import MeshContent
     from morphgen.model.robot import Robot
 
 MAX_STL_FACES = 200_000  # number of triangles of the largest STL file that MuJoCo reads
@@ -30,28 +31,6 @@ MAX_ROBOT_FACES = 1_500_000
 """Number of triangles in all mesh files of a robot. The largest, Vega, has 0.94 million."""
 MAX_ROBOT_PIXELS = 2**26  # number of pixels in all textures of a robot's mesh files
 FLATNESS_TOLERANCE = 1e-7  # ratio of thickness to size below which points count as flat
-
-_Triangles: TypeAlias = tuple[Array, NDArray[np.int64]]  # vertices (n, 3) [m] and faces (m, 3)
-
-
-@dataclass(frozen=True)
-class MeshPart:
-    """The triangles of a mesh file that share a colour."""
-
-    rgba: Rgba | None
-    """Colour, each channel in [0, 1], the mean of a texture; None if the file names none."""
-    faces: int  # number of triangles
-
-
-@dataclass(frozen=True)
-class _Group:
-    part: MeshPart
-    vertices: Array
-    faces: NDArray[np.int64]
-
-
-_Content: TypeAlias = tuple[tuple[_Group, ...], tuple[str, ...], int]
-"""A file's triangles by colour, what is left out, and the number of pixels of its textures."""
 
 
 def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
@@ -66,7 +45,7 @@ def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
 
 def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
     """Return the colour groups of a mesh file, in the order of their first triangles."""
-    return tuple(group.part for group in _content(str(path.absolute()), _stamp(path))[0])
+    return _content(path).parts
 
 
 def require_bounded_files(paths: Iterable[Path], origin: str) -> None:
@@ -85,9 +64,9 @@ def require_bounded_meshes(robot: Robot) -> None:
     meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
     for path in dict.fromkeys(mesh.path for mesh in meshes):
         with suppress(MeshError):
-            groups, _, more_pixels = _content(str(path.absolute()), _stamp(path))
-            faces += sum(group.part.faces for group in groups)
-            pixels += more_pixels
+            content = _content(path)
+            faces += sum(len(part.faces) for part in content.parts)
+            pixels += content.pixels
         _require_bounded(faces, MAX_ROBOT_FACES, "triangles", origin)
         _require_bounded(pixels, MAX_ROBOT_PIXELS, "pixels of textures", origin)
 
@@ -102,7 +81,7 @@ def _require_bounded(count: int, most: int, what: str, origin: str) -> None:
 
 def left_out(path: Path) -> tuple[str, ...]:
     """Return what a mesh file holds beside its triangles and was left out, each as a phrase."""
-    return _content(str(path.absolute()), _stamp(path))[1]
+    return _content(path).left_out
 
 
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
@@ -139,12 +118,12 @@ def _scaled(
 
     if len(scale) != 3 or not all(math.isfinite(s) and s != 0 for s in scale):
         raise MeshError(f"{path}: scale {scale} is not three finite numbers other than zero")
-    groups = _content(path, stamp)[0]
+    parts = _content(Path(path)).parts
     if part is not None:
-        if not 0 <= part < len(groups):
-            raise MeshError(f"{path}: no part {part}; valid: 0 to {len(groups) - 1}")
-        groups = (groups[part],)
-    vertices, faces = _concatenate([(group.vertices, group.faces) for group in groups])
+        if not 0 <= part < len(parts):
+            raise MeshError(f"{path}: no part {part}; valid: 0 to {len(parts) - 1}")
+        parts = (parts[part],)
+    _, vertices, faces = _joined(None, parts)
     # A mirror turns triangles inside out.
     vertices, faces = _clean(vertices * scale, faces[:, ::-1] if math.prod(scale) < 0 else faces)
     if not len(faces):
@@ -152,50 +131,43 @@ def _scaled(
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _content(path: str, stamp: tuple[int, int]) -> _Content:
-    """Return what a file holds; ``stamp`` voids the cache."""
-    content = _content_or_fault(path, stamp)
+def _content(path: Path) -> MeshContent:
+    """Return what a file holds, its triangles by colour."""
+    content = _content_or_fault(str(path.absolute()), _stamp(path))
     if isinstance(content, str):
         raise MeshError(content)
     return content
 
 
 @lru_cache(maxsize=128)
-def _content_or_fault(path: str, stamp: tuple[int, int]) -> _Content | str:
+def _content_or_fault(path: str, stamp: tuple[int, int]) -> MeshContent | str:
     """Return what a file holds, or why it is refused: a large one is refused only once."""
-    try:
-        return _read_content(path)
-    except MeshError as error:
-        return str(error)
-
-
-def _read_content(path: str) -> _Content:
     from morphgen.model.mesh_files import read_mesh_file
 
-    content = read_mesh_file(Path(path))
-    pieces: dict[Rgba | None, list[_Triangles]] = {}
-    for rgba, triangles in content.pieces:
-        pieces.setdefault(rgba, []).append(triangles)
-    groups = []
-    for rgba, parts in pieces.items():
-        vertices, faces = _clean(*_concatenate(parts))
-        if len(faces):
-            groups.append(_Group(MeshPart(rgba, len(faces)), vertices, faces))
-    if not groups:
-        count = sum(len(faces) for _, (_, faces) in content.pieces)
-        raise MeshError(f"{path}: none of its {count} triangles has an area")
-    return tuple(groups), content.left_out, content.pixels
+    try:
+        content = read_mesh_file(Path(path))
+    except MeshError as error:
+        return str(error)
+    by_colour: dict[Rgba | None, list[MeshPart]] = {}
+    for part in content.parts:
+        by_colour.setdefault(part.rgba, []).append(part)
+    joined = (_joined(rgba, parts) for rgba, parts in by_colour.items())
+    cleaned = (MeshPart(part.rgba, *_clean(part.vertices, part.faces)) for part in joined)
+    parts = tuple(part for part in cleaned if len(part.faces))
+    if not parts:
+        count = sum(len(part.faces) for part in content.parts)
+        return f"{path}: none of its {count} triangles has an area"
+    return replace(content, parts=parts)
 
 
-def _concatenate(parts: list[_Triangles]) -> _Triangles:
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
-    return (
-        np.concatenate([vertices for vertices, _ in parts]),
-        np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)]),
-    )
+def _joined(rgba: Rgba | None, parts: Sequence[MeshPart]) -> MeshPart:
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+    vertices = np.concatenate([part.vertices for part in parts])
+    return MeshPart(rgba, vertices, np.concatenate(faces))
 
 
-def _clean(vertices: Array, faces: NDArray[np.int64]) -> _Triangles:
+def _clean(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Merge coincident vertices; remove unused ones and triangles without area."""
     import trimesh
 

@@ -20,19 +20,18 @@ import trimesh
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
-from morphgen.model.geometry import MESH_SUFFIXES
+from morphgen.model.geometry import MESH_SUFFIXES, MeshPart
 from morphgen.model.scene_files import (
     MAX_SETS,
     UNREADABLE,
     FolderResolver,
-    Piece,
     note_missing,
     parse_numbers,
     read_dae,
     read_glb,
     read_gltf,
     require_faces,
-    scene_pieces,
+    scene_parts,
 )
 from morphgen.typing import Array
 
@@ -45,7 +44,7 @@ _ROW_SIZES = (12, 12, 8, 12)
 """Size of a vertex, a normal, a texture coordinate and a triangle [bytes]."""
 
 
-def _read_msh(data: bytes, files: FolderResolver) -> list[Piece]:
+def _read_msh(data: bytes, files: FolderResolver) -> list[MeshPart]:
     """Read a ``.msh`` file, MuJoCo's legacy binary format.
 
     Nothing is allocated before the counts agree with the file's size. Normals and texture
@@ -79,19 +78,19 @@ def _read_msh(data: bytes, files: FolderResolver) -> list[Piece]:
             )
         if np.linalg.matrix_rank(points - points.mean(axis=0), rtol=_FLAT) < 3:
             raise ValueError("has no triangles, and its vertices are flat")
-        return _pieces(trimesh.convex.convex_hull(points))
+        return _parts(trimesh.convex.convex_hull(points))
     faces = np.frombuffer(data, "<i4", 3 * triangles, len(data) - sizes[-1]).reshape(-1, 3)
     if faces.min() < 0 or faces.max() >= vertices:
         raise ValueError(
             f"a triangle has the vertex {faces.min() if faces.min() < 0 else faces.max()}; "
             f"expected 0 to {vertices - 1}"
         )
-    return _pieces(trimesh.Trimesh(points, faces.astype(np.int64), process=False))
+    return _parts(trimesh.Trimesh(points, faces.astype(np.int64), process=False))
 
 
-def _pieces(mesh: trimesh.Trimesh) -> list[Piece]:
+def _parts(mesh: trimesh.Trimesh) -> list[MeshPart]:
     require_faces(len(mesh.faces))
-    return scene_pieces(trimesh.Scene(mesh))
+    return scene_parts(trimesh.Scene(mesh))
 
 
 _MAX_TOKENS = 20_000_000  # number of words in the largest OBJ file that is read
@@ -103,7 +102,7 @@ _MAX_HEADER = 2**16
 class MeshContent:
     """The content of a mesh file."""
 
-    pieces: tuple[Piece, ...]  # colour and triangles of every geometry
+    parts: tuple[MeshPart, ...]  # one for each geometry
     left_out: tuple[str, ...]
     """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
     pixels: int  # number of pixels of the textures that were read, each use counted
@@ -119,14 +118,14 @@ def read_mesh_file(path: Path) -> MeshContent:
     try:
         data = files.get(path.name)
         _require_mesh(data, suffix)
-        pieces = _READERS[suffix](data, files)
+        parts = _READERS[suffix](data, files)
     except UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
     notes = [
         f"{note} ({n} times)" if n > 1 else note for note, n in Counter(files.left_out).items()
     ]
-    return MeshContent(tuple(pieces), tuple(notes), files.pixels)
+    return MeshContent(tuple(parts), tuple(notes), files.pixels)
 
 
 def _require_mesh(data: bytes, suffix: str) -> None:
@@ -153,7 +152,7 @@ def _require_mesh(data: bytes, suffix: str) -> None:
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def _read_stl(data: bytes, files: FolderResolver) -> list[Piece]:
+def _read_stl(data: bytes, files: FolderResolver) -> list[MeshPart]:
     """Read all solids of an STL file, which may have been concatenated from several."""
     if data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:1024]:
         corners = _ascii_stl(data)
@@ -163,7 +162,7 @@ def _read_stl(data: bytes, files: FolderResolver) -> list[Piece]:
         raise ValueError("holds no triangle")
     vertices = corners.reshape(-1, 3)
     faces = np.arange(len(vertices)).reshape(-1, 3)
-    return _pieces(trimesh.Trimesh(vertices, faces, process=False))
+    return _parts(trimesh.Trimesh(vertices, faces, process=False))
 
 
 def _ascii_stl(data: bytes) -> Array:
@@ -222,7 +221,7 @@ _PLY_TYPES = {
 }
 
 
-def _read_ply(data: bytes, files: FolderResolver) -> list[Piece]:
+def _read_ply(data: bytes, files: FolderResolver) -> list[MeshPart]:
     end = data.find(b"end_header", 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end < 0:
         raise ValueError(f"no PLY header of at most {_MAX_HEADER} bytes: it is truncated")
@@ -248,7 +247,7 @@ def _read_ply(data: bytes, files: FolderResolver) -> list[Piece]:
     start = 0
     for element, length, properties in elements:
         columns[element], start = _ply_element(body, start, element, length, properties)
-    return _ply_pieces(columns, {name: count for name, count, _ in elements}, files)
+    return _ply_parts(columns, {name: count for name, count, _ in elements}, files)
 
 
 def _ply_element(
@@ -308,18 +307,18 @@ _Rows = NDArray[Any] | Sequence[NDArray[Any]]
 """Lists of a PLY file: an array with a row for each, or an array for each."""
 
 
-def _ply_pieces(
+def _ply_parts(
     columns: dict[str, dict[str, Any]], counts: dict[str, int], files: FolderResolver
-) -> list[Piece]:
+) -> list[MeshPart]:
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
     polygons: _Rows = face.get("vertex_indices", face.get("vertex_index", ()))
-    strips: _Rows = columns.get("tristrips", {}).get("vertex_indices", ())
     for name, count in counts.items():
         if count and name not in ("vertex", "face", "tristrips"):
             files.left_out.append(f"{count} elements {name!r}")
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("holds no vertex with x, y and z")
     vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
+    strips: _Rows = columns.get("tristrips", {}).get("vertex_indices", ())
     triangles = np.concatenate([*_fans(polygons, files), *_strips(strips)])
     require_faces(len(triangles))
     if not len(triangles):
@@ -331,7 +330,7 @@ def _ply_pieces(
         vertex_colors=_ply_colours(vertex, len(vertices)),
         process=False,
     )
-    return _pieces(mesh)
+    return _parts(mesh)
 
 
 def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:
@@ -372,7 +371,7 @@ def _strips(strips: _Rows) -> Iterator[NDArray[np.int64]]:
         yield triangles[(triangles >= 0).all(axis=1)]
 
 
-def _read_obj(data: bytes, files: FolderResolver) -> list[Piece]:
+def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
     """Read an OBJ file by trimesh, rewritten where trimesh misreads it."""
     if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
         raise ValueError(f"more than {_MAX_TOKENS} words")
@@ -404,9 +403,9 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[Piece]:
     scene = trimesh.load_scene(
         io.BytesIO(text.encode()), file_type="obj", process=False, resolver=files
     )
-    pieces = scene_pieces(scene)
-    note_missing(files, triangles, pieces)
-    return pieces
+    parts = scene_parts(scene)
+    note_missing(files, triangles, parts)
+    return parts
 
 
 _MAX_WORK = 500_000_000
@@ -498,7 +497,7 @@ def _materials(libraries: list[str], used: set[str], files: FolderResolver) -> s
     return "\n".join(lines)
 
 
-_READERS: dict[str, Callable[[bytes, FolderResolver], list[Piece]]] = {
+_READERS: dict[str, Callable[[bytes, FolderResolver], list[MeshPart]]] = {
     ".dae": read_dae,
     ".glb": read_glb,
     ".gltf": read_gltf,

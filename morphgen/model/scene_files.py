@@ -42,7 +42,7 @@ from PIL import Image, UnidentifiedImageError
 from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MALFORMED
-from morphgen.model.geometry import Rgba
+from morphgen.model.geometry import MeshPart, Rgba
 from morphgen.typing import Array
 
 MAX_FILE_SIZE = 64 * 2**20
@@ -70,9 +70,6 @@ UNREADABLE = (
 
 # Without a handler, trimesh's warnings about a file would be printed on the terminal.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
-
-Piece = tuple[Rgba | None, tuple[Array, NDArray[np.int64]]]
-"""A colour, vertices (n, 3) [m] and faces (m, 3)."""
 
 
 def read_picture(source: bytes | Path) -> Image.Image:
@@ -187,23 +184,23 @@ def parse_numbers(text: bytes | str, dtype: type = np.float64) -> NDArray[Any]:
             raise ValueError("a number is malformed") from error
 
 
-def scene_pieces(scene: trimesh.Scene) -> list[Piece]:
+def scene_parts(scene: trimesh.Scene) -> list[MeshPart]:
     """Return the colour and the triangles of every geometry of a scene, in the scene frame."""
     return [
-        (_colour(geometry), _in_scene(geometry, T_scene_node))
+        MeshPart(_colour(geometry), *_in_scene(geometry, T_scene_node))
         for T_scene_node, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
         if isinstance(geometry := scene.geometry[name], trimesh.Trimesh)
     ]
 
 
-def count_triangles(pieces: list[Piece]) -> int:
-    """Return the number of triangles of all pieces."""
-    return sum(len(faces) for _, (_, faces) in pieces)
+def count_triangles(parts: list[MeshPart]) -> int:
+    """Return the number of triangles of all parts."""
+    return sum(len(part.faces) for part in parts)
 
 
-def note_missing(files: FolderResolver, expected: int, pieces: list[Piece]) -> None:
+def note_missing(files: FolderResolver, expected: int, parts: list[MeshPart]) -> None:
     """Note how many of the triangles that a file holds were not read."""
-    if (missing := expected - count_triangles(pieces)) > 0:
+    if (missing := expected - count_triangles(parts)) > 0:
         files.left_out.append(f"{missing} of {expected} triangles, which are malformed")
 
 
@@ -277,7 +274,7 @@ _HARMLESS_EXTENSIONS = re.compile(r"KHR_(materials|texture|lights)_\w+|EXT_textu
 _GLTF_MODES = {0: "point sets", 1: "line sets", 2: "line loops", 3: "line strips", 6: "fans"}
 
 
-def read_glb(data: bytes, files: FolderResolver) -> list[Piece]:
+def read_glb(data: bytes, files: FolderResolver) -> list[MeshPart]:
     """Read a binary glTF file as ``read_gltf`` reads a document."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ValueError("does not begin as a binary glTF file")
@@ -295,7 +292,7 @@ def read_glb(data: bytes, files: FolderResolver) -> list[Piece]:
     return read_gltf(data[20 : 20 + length], files, binary)
 
 
-def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -> list[Piece]:
+def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -> list[MeshPart]:
     """Read a glTF document by trimesh, reduced to triangles whose bytes exist."""
     if sum(text.count(mark) for mark in b",:[{") > _MAX_MARKUP:
         raise ValueError(f"more than {_MAX_MARKUP} JSON values")
@@ -324,7 +321,7 @@ def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -
     scene = trimesh.load_scene(
         io.BytesIO(json.dumps(document).encode()), file_type="gltf", process=False, resolver=files
     )
-    read = scene_pieces(scene)
+    read = scene_parts(scene)
     note_missing(files, triangles, read)
     return read
 
@@ -523,7 +520,7 @@ _COLLADA_LOST = {
 }
 
 
-def read_dae(data: bytes, files: FolderResolver) -> list[Piece]:
+def read_dae(data: bytes, files: FolderResolver) -> list[MeshPart]:
     """Read a COLLADA file by trimesh, with skins as plain geometries and readable textures only."""
     root = _collada(data)
     _place_skins(root, files)
@@ -540,24 +537,22 @@ def read_dae(data: bytes, files: FolderResolver) -> list[Piece]:
     if not triangles:
         raise ValueError("its scene holds no triangle")
     try:
-        pieces = _collada_pieces(root, files)
+        parts = _collada_parts(root, files)
     except UNREADABLE:
-        pieces = []
-    if count_triangles(pieces) < triangles and _remove(root, "bind_material"):
+        parts = []
+    if count_triangles(parts) < triangles and _remove(root, "bind_material"):
         # pycollada drops a geometry whose material is broken.
-        plain = _collada_pieces(root, files)
-        if count_triangles(plain) > count_triangles(pieces):
+        plain = _collada_parts(root, files)
+        if count_triangles(plain) > count_triangles(parts):
             files.left_out.append("materials, of which one is broken")
-            pieces = plain
-    note_missing(files, triangles, pieces)
-    return pieces
+            parts = plain
+    note_missing(files, triangles, parts)
+    return parts
 
 
-def _collada_pieces(root: etree._Element, files: FolderResolver) -> list[Piece]:
+def _collada_parts(root: etree._Element, files: FolderResolver) -> list[MeshPart]:
     document = io.BytesIO(etree.tostring(root))
-    return scene_pieces(
-        trimesh.load_scene(document, file_type="dae", process=False, resolver=files)
-    )
+    return scene_parts(trimesh.load_scene(document, file_type="dae", process=False, resolver=files))
 
 
 def _collada(data: bytes) -> etree._Element:

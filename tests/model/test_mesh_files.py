@@ -33,11 +33,11 @@ def read(folder, name, content):
 
 
 def count(content):
-    return sum(len(faces) for _, (_, faces) in content.pieces)
+    return sum(len(part.faces) for part in content.parts)
 
 
 def volume(content):
-    corners = np.concatenate([vertices[faces] for _, (vertices, faces) in content.pieces])
+    corners = np.concatenate([part.vertices[part.faces] for part in content.parts])
     return float(np.linalg.det(corners).sum() / 6)
 
 
@@ -188,7 +188,7 @@ def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(order, tmp_pat
     faces = struct.pack(f"{code}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
     mesh = read(tmp_path, "m.ply", header + points + faces)
     assert count(mesh) == 3
-    assert mesh.pieces[0][0] == (1, 0, 0, 1)
+    assert mesh.parts[0].rgba == (1, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_a_skin_or_morph_of_a_collada_file_is_read_at_rest(instance, notes, tmp_
     mesh = read(tmp_path, "mesh_with_skin.dae", text)
     assert count(mesh) == 8
     assert mesh.left_out == notes
-    highest = max(vertices[:, 0].max() for _, (vertices, _) in mesh.pieces)
+    highest = max(part.vertices[:, 0].max() for part in mesh.parts)
     assert highest == (6 if instance == "c" else 1)
 
 
@@ -282,7 +282,7 @@ BLUE, GREEN = (0.2, 0.4, 0.6, 1.0), (0.0, 1.0, 0.0, 1.0)
 def test_the_opacity_of_a_material_is_read(properties, alpha, tmp_path):
     (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 0.2 0.4 0.6\n{properties}\nnewmtl b\nKd 0 1 0\n")
     mesh = read(tmp_path, "e_d_alpha.obj", "mtllib m.mtl\n" + OBJ)
-    assert {rgba for rgba, _ in mesh.pieces} == {(*BLUE[:3], alpha / 255), GREEN}
+    assert {part.rgba for part in mesh.parts} == {(*BLUE[:3], alpha / 255), GREEN}
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_all_material_files_are_read(libraries, tmp_path):
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.2 0.4 0.6")
     (tmp_path / "b c.mtl").write_text("newmtl b\nKd 0 1 0\n")
     mesh = read(tmp_path, "m.obj", libraries + OBJ)
-    assert {rgba for rgba, _ in mesh.pieces} == {BLUE, GREEN}
+    assert {part.rgba for part in mesh.parts} == {BLUE, GREEN}
     expected = ("material file 'x.mtl': no such file",) if "x.mtl" in libraries else ()
     assert mesh.left_out == expected
 
@@ -327,8 +327,8 @@ def test_without_its_texture_a_material_has_its_own_colour(name, content, reason
         )  # fmt: skip
         document["meshes"][0]["primitives"][0]["material"] = 0
         other = read(tmp_path / "f", "m.gltf", document)
-    assert {rgba for rgba, _ in mesh.pieces} == {BLUE, GREEN}
-    assert {rgba for rgba, _ in other.pieces} == {BLUE}
+    assert {part.rgba for part in mesh.parts} == {BLUE, GREEN}
+    assert {part.rgba for part in other.parts} == {BLUE}
     for notes in (mesh.left_out, other.left_out):
         assert len(notes) == 1
         assert notes[0].startswith(f"texture {name!r}: ")
