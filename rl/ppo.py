@@ -135,41 +135,32 @@ T = TypeVar("T")
 def prepared(
     function: Callable[P, T], device: torch.device, *, bf16: bool, compiled: bool
 ) -> Callable[P, T]:
-    """Return a function that runs another one in bfloat16, or compiled.
+    """Return a function that runs another one in bfloat16, or compiled by ``torch.compile``.
 
     On a GPU the compiled function is a CUDA graph: a gradient step of a small network is hundreds
     of kernels, and to launch them one by one takes longer than they run. The next call of any graph
-    overwrites what a graph returned; copy results that you keep.
+    overwrites what a graph returned; copy results that you keep. Calls raise TaskError if torch
+    cannot compile, for example without a C++ compiler.
     """
     graphs = compiled and device.type == "cuda"
-    inner = _compiled(function, graphs) if compiled else function
+    failures: tuple[type[Exception], ...] = ()
+    if compiled:
+        from torch._dynamo import config  # takes a second to load
+        from torch._dynamo.exc import TorchDynamoException
+
+        # By default torch stops after eight functions and shapes; four learners have as many.
+        config.recompile_limit = max(config.recompile_limit, MAX_COMPILED)
+        mode = "reduce-overhead" if graphs else None
+        function = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+        failures = (TorchDynamoException,)
 
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         if graphs:
             torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
-        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-            return inner(*args, **kwargs)
-
-    return call
-
-
-def _compiled(function: Callable[P, T], graphs: bool) -> Callable[P, T]:
-    """Return the function compiled by ``torch.compile``.
-
-    By default torch stops compiling after eight functions and shapes; four learners of a study have
-    as many. Calls raise TaskError if torch cannot compile, for example without a C++ compiler.
-    """
-    from torch._dynamo import config  # takes a second to load
-    from torch._dynamo.exc import TorchDynamoException
-
-    config.recompile_limit = max(config.recompile_limit, MAX_COMPILED)
-    mode = "reduce-overhead" if graphs else None
-    compiled = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
-
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
-            return compiled(*args, **kwargs)
-        except TorchDynamoException as error:
+            with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+                return function(*args, **kwargs)
+        except failures as error:
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise TaskError(f"--compile: torch cannot compile here: {why}") from error
 

@@ -19,7 +19,6 @@ from morphgen.rl.baselines.simple import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
@@ -62,17 +61,13 @@ class InverseKinematics:
         robot = int(task.env_robot_index[env])
         key = robot, int(task.layouts.current[env])
         if key not in self._planners:
-            self._planners[key] = self._new_planner(task, robot, task.layouts.scene(env))
+            joints = slice(0, task.specs[robot].robot.dof)
+            step = task.robot_tables.max_step[robot, joints]
+            movable = task.robot_tables.moves_tool[robot, joints].cpu().numpy()
+            seed = int(np.random.SeedSequence([self._seed, robot]).generate_state(1)[0])
+            space = FreeSpace(task.layouts.scene(env))
+            self._planners[key] = PathPlanner(space, _array(step), seed, movable)
         return self._planners[key]
-
-    def _new_planner(self, task: TaskBatch, robot: int, scene: Scene) -> PathPlanner:
-        dof = task.specs[robot].robot.dof
-        step, movable = (
-            task.robot_tables.max_step[robot, :dof],
-            task.robot_tables.moves_tool[robot, :dof],
-        )
-        seed = int(np.random.SeedSequence([self._seed, robot]).generate_state(1)[0])
-        return PathPlanner(FreeSpace(scene), _array(step), seed, movable.cpu().numpy())
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
         """Plan a path in some environments."""

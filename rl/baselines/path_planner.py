@@ -60,7 +60,7 @@ class Tree:
     """Configurations that are connected to roots by collision-free straight lines."""
 
     def __init__(self, roots: Array, step: Array, free_fraction: FreeFraction) -> None:
-        """Start with roots, shape (n, dof); ``rrt_connect`` describes the other arguments."""
+        """Start with roots (n, dof); ``step`` is the largest change of joints in a control step."""
         self._step, self._free_fraction = step, free_fraction
         self.nodes = [*roots]
         self._parents = [-1] * len(roots)
@@ -98,38 +98,6 @@ class Tree:
             path.append(self.nodes[node])
             node = self._parents[node]
         return path
-
-
-def rrt_connect(
-    start: Array,
-    goals: Array,
-    limits: Array,
-    step: Array,
-    free_fraction: FreeFraction,
-    rng: np.random.Generator,
-    iterations: int = ITERATIONS,
-) -> tuple[list[Array] | None, Tree]:
-    """Grow a tree from the start (dof,) and one from the goals (n, dof) until they meet.
-
-    RRT-Connect (Kuffner and LaValle 2000) between joint limits (dof, 2). Without goals, the tree of
-    the start grows alone. ``step`` is the largest change of every joint in a control step, (dof,),
-    and lengths are in control steps. Returns waypoints from the start to a goal, None if the trees
-    did not meet; and the tree of the start, whose nodes can all be reached.
-    """
-    start_tree = Tree(start[None], step, free_fraction)
-    growing, other = start_tree, Tree(goals, step, free_fraction)
-    for _ in range(iterations):
-        sample = rng.uniform(limits[:, 0], limits[:, 1])
-        new = growing.extend(growing.nearest(sample), sample)
-        if not len(goals):
-            continue
-        met = None if new is None else other.connect(growing.nodes[new])
-        if new is not None and met is not None:
-            ends = growing.to_root(new), other.to_root(met)
-            first, second = ends if growing is start_tree else ends[::-1]
-            return [*first[::-1], *second[1:]], start_tree
-        growing, other = other, growing
-    return None, start_tree
 
 
 def shortcut(
@@ -214,20 +182,32 @@ class PathPlanner:
         attempt: int = 0,
         iterations: int = ITERATIONS,
     ) -> tuple[Path | None, Tree]:
-        """Plan by RRT-Connect from a start (dof,) to any of n goals (n, dof); n may be 0.
+        """Plan from a start (dof,) to any of n goals (n, dof); n may be 0.
 
-        Returns the shortened path, None if the search failed; and the tree of the start.
+        Two trees grow from the start and the goals until they meet (RRT-Connect, Kuffner and
+        LaValle 2000); without goals, that of the start grows alone. Returns the shortened path,
+        None if the trees did not meet; and the tree of the start, whose nodes can all be reached.
         """
         free_fraction = partial(self.space.free_fraction, block=block)
         rng = np.random.default_rng([self._seed, attempt])
         # Joints that may not move have limits without width.
         limits = np.where(self._movable[:, None], self._limits, start[:, None])
-        points, tree = rrt_connect(start, goals, limits, self._step, free_fraction, rng, iterations)
-        if points is None:
-            return None, tree
-        points = shortcut(points, free_fraction, rng)
-        goal = int(np.abs(goals - points[-1]).max(axis=1).argmin())
-        return Path(tuple(points[1:]), goal), tree
+        start_tree = Tree(start[None], self._step, free_fraction)
+        growing, other = start_tree, Tree(goals, self._step, free_fraction)
+        for _ in range(iterations):
+            sample = rng.uniform(limits[:, 0], limits[:, 1])
+            new = growing.extend(growing.nearest(sample), sample)
+            if not len(goals):
+                continue
+            met = None if new is None else other.connect(growing.nodes[new])
+            if new is not None and met is not None:
+                ends = growing.to_root(new), other.to_root(met)
+                first, second = ends if growing is start_tree else ends[::-1]
+                points = shortcut([*first[::-1], *second[1:]], free_fraction, rng)
+                goal = int(np.abs(goals - points[-1]).max(axis=1).argmin())
+                return Path(tuple(points[1:]), goal), start_tree
+            growing, other = other, growing
+        return None, start_tree
 
 
 class PathFollower:
