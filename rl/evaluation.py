@@ -26,13 +26,12 @@ from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores.scores import (
     RobotOutcomes,
     Score,
-    episode_interval,
     finite_or_none,
-    relative_scores,
+    score_of,
     success_of,
 )
 from morphgen.rl.shipped_policies import name_of
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, evaluation_simulator
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.task import EnvSpec, TaskConfig
@@ -261,29 +260,7 @@ def _score(
         random_score=tuple(each.score for each in random_episodes),
         random_success=tuple(each.success for each in random_episodes),
     )
-    task, distance = TASKS[spec.task], float(np.mean(outcomes.distance))
-    interval = episode_interval(
-        [relative_scores(outcomes)], [outcomes.success], relative=task.relative_to_random
-    )
-    return Score(
-        robot=spec.robot.name,
-        side=side,
-        task=spec.task,
-        episodes=len(episodes),
-        steps=sum(outcomes.steps),
-        score=interval.value,
-        low=interval.low,
-        high=interval.high,
-        raw=float(np.mean(outcomes.score)),
-        random=float(np.mean(outcomes.random_score)),
-        success=float(np.mean(outcomes.success)),
-        random_success=float(np.mean(outcomes.random_success)),
-        distance=distance,
-        relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
-        unstable=sum(outcomes.diverged),
-        angle=float(np.mean([episode.angle for episode in episodes])),
-        outcomes=outcomes,
-    )
+    return score_of(outcomes, [each.angle for each in episodes], reach(spec.robot))
 
 
 def eval_config_of(

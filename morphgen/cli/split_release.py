@@ -151,7 +151,7 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 )
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
-    from morphgen.rl.scores.leaderboard import ranking_data, ranking_table, score_submission
+    from morphgen.rl.scores.leaderboard import ranked, ranking_data, ranking_table, score_submission
     from morphgen.rl.scores.submission import check_submission, read_submission, require_same_random
     from morphgen.tasks.goals.eval_protocol import expected_robots
 
@@ -184,7 +184,7 @@ def score(args: argparse.Namespace) -> None:
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
-        "rows": ranking_data(rows),
+        "rows": ranking_data(ranked(rows)),
     }
     notes = [
         "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of each robot; "

@@ -57,10 +57,16 @@ class SideScore:
     side: Side
     task: str
     robots: int
-    score: float  # mean score, relative to the random policy where the task wants it
-    success: float  # mean success rate, 0 to 1
-    low: float | None = None  # lower end of the 95% interval of `score`; None if it is not known
-    high: float | None = None  # upper end of the interval
+    score: Interval  # mean score, relative to the random policy where the task wants it
+    success: Interval  # mean success rate, 0 to 1, with its Wilson interval over all episodes
+
+    def as_data(self) -> dict[str, Any]:
+        """Return JSON values, with null for ends of intervals that are not known."""
+        score, success = self.score, self.success
+        values: dict[str, Any] = {"side": self.side, "task": self.task, "robots": self.robots}
+        values |= {"score": score.value, "success": success.value, "low": score.low}
+        values |= {"high": score.high, "success_low": success.low, "success_high": success.high}
+        return dict(finite_or_none(values))
 
 
 @dataclass(frozen=True)
@@ -83,11 +89,6 @@ class Row:
             remarks.append(f"fine-tuned {self.finetuned:,}")
         return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
 
-    def success(self, side: SideScore) -> Interval:
-        """Return the success rate of a side with its Wilson interval over all episodes."""
-        episodes = side.robots * self.episodes * max(len(self.seeds), 1)
-        return success_interval(side.success, episodes)
-
     def group(self, side: Side, task: str) -> SideScore | None:
         """Return the result of a side at a task."""
         return next((s for s in self.sides if (s.side, s.task) == (side, task)), None)
@@ -102,14 +103,14 @@ def score_submission(
         groups.setdefault((outcomes.side, outcomes.task), []).append(outcomes)
     sides = []
     for (side, task), robots in groups.items():
-        interval = episode_interval(
+        successes = [each.success for each in robots]
+        score = episode_interval(
             [relative_scores(each, random) for each in robots],
-            [each.success for each in robots],
+            successes,
             relative=TASKS[task].relative_to_random,
         )
-        success = float(np.mean([np.mean(each.success) for each in robots]))
-        ends = finite_or_none((interval.low, interval.high))
-        sides.append(SideScore(side, task, len(robots), interval.value, success, *ends))
+        success = success_interval(list(map(np.mean, successes)), list(map(len, successes)))
+        sides.append(SideScore(side, task, len(robots), score, success))
     seed = submission.training_seed
     return Row(
         submission.method,
@@ -141,9 +142,9 @@ def ranked(rows: Sequence[Row]) -> list[Row]:
         if not test or len(test) < len(tasks):
             return -math.inf
         if len(tasks) == 1:
-            return test[0].score
+            return test[0].score.value
         robots = sum(side.robots for side in test)
-        return sum(side.success * side.robots for side in test) / robots
+        return sum(side.success.value * side.robots for side in test) / robots
 
     return sorted(rows, key=result, reverse=True)
 
@@ -158,35 +159,29 @@ def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
     decimals = {}
     for group in groups:
         scores = [row.group(*group) for row in rows]
-        decimals[group] = score_decimals(side.score for side in scores if side is not None)
+        decimals[group] = score_decimals(side.score.value for side in scores if side is not None)
     lines = []
     for rank, row in enumerate(ranked(rows), 1):
         cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
         for side, task in groups:
-            cells += _cells(row, row.group(side, task), decimals[side, task])
+            cells += _cells(row.group(side, task), decimals[side, task])
         lines.append([*cells, str(row.episodes)])
     return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
 
 
 def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the ranking for JSON; every side has the ends of its success rate's interval, too."""
-    table = []
-    for row in ranked(rows):
-        sides = []
-        for side in row.sides:
-            success = row.success(side)
-            ends = {"success_low": success.low, "success_high": success.high}
-            sides.append(msgspec.to_builtins(side) | ends)
-        table.append(msgspec.to_builtins(row) | {"sides": sides})
-    return table
+    """Return the rows for JSON, in their order."""
+    return [
+        {**vars(row), "seeds": list(row.seeds), "sides": [side.as_data() for side in row.sides]}
+        for row in rows
+    ]
 
 
-def _cells(row: Row, side: SideScore | None, decimals: int) -> list[str]:
+def _cells(side: SideScore | None, decimals: int) -> list[str]:
     if side is None:
         return ["-", "", ""]
-    ends = (math.nan if end is None else end for end in (side.low, side.high))
-    interval = Interval(side.score, *ends).ends(f".{decimals}f")
-    return [f"{side.score:.{decimals}f}", interval, row.success(side).as_percent()]
+    form = f".{decimals}f"
+    return [f"{side.score.value:{form}}", side.score.ends(form), side.success.as_percent()]
 
 
 FORMAT = 2
@@ -252,7 +247,7 @@ def collect_references(
 def reference_files(references: References) -> dict[str, bytes]:
     """Return the files of a release with reference scores, by path."""
     files = {_path(each): submission_text(each).encode() for each in references.submissions}
-    data = {"format": FORMAT, "rows": msgspec.to_builtins(references.rows())}
+    data = {"format": FORMAT, "rows": ranking_data(references.rows())}
     return files | {SCORES_FILE: (json.dumps(data, indent=2) + "\n").encode()}
 
 

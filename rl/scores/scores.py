@@ -65,7 +65,7 @@ def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
 
     A stratum has independent samples, shape (k,), such as the episodes of a robot.
     """
-    tables = tuple(_table(samples, 1) for samples in strata)
+    tables = tuple(np.asarray(samples, dtype=np.float64) for samples in strata)
     mean = float(np.mean([table.mean() for table in tables]))
     if min(len(table) for table in tables) < 2:
         return Interval(mean, math.nan, math.nan)
@@ -103,8 +103,7 @@ def episode_interval(
     else ``stratified_mean_interval``. Scores and successes of a robot have the shape (episodes,).
     """
     if not relative and all(map(np.array_equal, scores, successes)):
-        tables = [_table(each, 1) for each in successes]
-        return success_interval([each.mean() for each in tables], [len(each) for each in tables])
+        return success_interval(list(map(np.mean, successes)), list(map(np.size, successes)))
     return stratified_mean_interval(scores)
 
 
@@ -113,7 +112,7 @@ def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
 
     Robots are the strata: every resample has as many scores of each robot as the original.
     """
-    table = _table(scores, 2)
+    table = np.asarray(scores, dtype=np.float64)
     iqm = float(trim_mean(table.ravel(), TRIM))
     if len(table) < 2:
         return Interval(iqm, math.nan, math.nan)
@@ -149,13 +148,6 @@ def _interval(
     if interval.low == interval.high:
         return Interval(value, math.nan, math.nan)
     return Interval(value, float(interval.low), float(interval.high))
-
-
-def _table(values: ArrayLike, axes: int) -> NDArray[np.float64]:
-    table = np.asarray(values, dtype=np.float64)
-    if table.ndim != axes or not table.size:
-        raise ValueError(f"scores of shape {table.shape}: expected {axes} axes, none of them empty")
-    return table
 
 
 Name = Annotated[str, Meta(min_length=1, max_length=200)]
@@ -224,14 +216,44 @@ class Score:
     """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
     unstable: int  # number of episodes that ended because the simulation diverged
     angle: float  # mean angle from success at the end of an episode [rad]; nan without orientation
+    success_low: float  # lower end of the 95% Wilson interval of `success`
+    success_high: float  # upper end of the interval
     outcomes: RobotOutcomes = field(repr=False, compare=False)
     """The episodes, for submissions; tables leave them out."""
 
 
-_FIELDS = tuple(each.name for each in fields(Score) if each.name != "outcomes")
-SCORE_KEYS = (*_FIELDS, "success_low", "success_high")
-"""Keys of a score in JSON, and columns of CSV; the last two are the ends of the 95% Wilson interval
-of ``success``."""
+SCORE_KEYS = tuple(each.name for each in fields(Score) if each.name != "outcomes")
+"""Keys of a score in JSON, and columns of CSV."""
+
+
+def score_of(outcomes: RobotOutcomes, angles: Sequence[float], reach: float) -> Score:
+    """Return the score of a robot of a reach [m] from its episodes and their last angles."""
+    task, distance = TASKS[outcomes.task], float(np.mean(outcomes.distance))
+    interval = episode_interval(
+        [relative_scores(outcomes)], [outcomes.success], relative=task.relative_to_random
+    )
+    success = success_interval(np.mean(outcomes.success), len(outcomes.success))
+    return Score(
+        robot=outcomes.robot,
+        side=outcomes.side,
+        task=outcomes.task,
+        episodes=len(outcomes.score),
+        steps=sum(outcomes.steps),
+        score=interval.value,
+        low=interval.low,
+        high=interval.high,
+        raw=float(np.mean(outcomes.score)),
+        random=float(np.mean(outcomes.random_score)),
+        success=success.value,
+        random_success=float(np.mean(outcomes.random_success)),
+        distance=distance,
+        relative_distance=distance / reach if task.relative_distance else math.nan,
+        unstable=sum(outcomes.diverged),
+        angle=float(np.mean(angles)),
+        success_low=success.low,
+        success_high=success.high,
+        outcomes=outcomes,
+    )
 
 
 def success_of(scores: Sequence[Score]) -> Interval:
@@ -240,13 +262,8 @@ def success_of(scores: Sequence[Score]) -> Interval:
 
 
 def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:
-    """Return scores as JSON values, with null instead of nan, and the interval of the success."""
-    table = []
-    for score in scores:
-        success = success_of([score])
-        row = [*(getattr(score, name) for name in _FIELDS), success.low, success.high]
-        table.append(dict(zip(SCORE_KEYS, finite_or_none(row), strict=True)))
-    return table
+    """Return scores as JSON values, with null instead of nan."""
+    return [finite_or_none({key: getattr(each, key) for key in SCORE_KEYS}) for each in scores]
 
 
 def finite_or_none(value: Any) -> Any:  # noqa: ANN401

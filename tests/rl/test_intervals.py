@@ -51,12 +51,6 @@ def test_robots_are_strata_of_the_bootstrap():
         assert (found.value, math.isnan(found.low), math.isnan(found.high)) == (7.0, True, True)
 
 
-@pytest.mark.parametrize("scores", [[], [[]], [1.0, 2.0]])
-def test_empty_or_one_dimensional_scores_are_rejected(scores):
-    with pytest.raises(ValueError, match="expected 2 axes"):
-        iqm_interval(scores, together=True)
-
-
 def test_the_wilson_interval_stays_within_0_and_1():
     for successes, low, high in ((0, 0.0, 0.1611), (10, 0.2993, 0.7007), (20, 0.8389, 1.0)):
         interval = success_interval(successes / 20, 20)

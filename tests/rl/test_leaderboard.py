@@ -1,9 +1,9 @@
 """Scores of submissions, their ranking, and the reference scores of releases and studies."""
 
 import json
+import math
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -31,13 +31,14 @@ from morphgen.rl.scores.leaderboard import (
     collect_references,
     random_scores,
     ranked,
+    ranking_data,
     ranking_table,
     read_references,
     reference_files,
     score_submission,
     study_results,
 )
-from morphgen.rl.scores.scores import stratified_mean_interval
+from morphgen.rl.scores.scores import Interval, stratified_mean_interval, success_interval
 from morphgen.rl.scores.submission import require_same_random
 from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
@@ -58,17 +59,16 @@ def test_scores_are_computed_from_the_episodes():
     ]
     test = row.group("test", "reach")
     relative = np.array([150, 151, 152, -1]) + 2
-    assert (test.score, test.success) == (relative.mean(), 0.75)
-    interval = stratified_mean_interval([relative])
-    assert (test.low, test.high) == (interval.low, interval.high)
+    assert (test.score.value, test.success) == (relative.mean(), success_interval(0.75, 4))
+    assert test.score == stratified_mean_interval([relative])
     train = row.group("train", "reach")
-    assert train.score == relative.mean()
-    assert test.high - test.low > train.high - train.low > 0
+    assert train.score.value == relative.mean()
+    assert test.score.high - test.score.low > train.score.high - train.score.low > 0
 
 
 def test_the_random_scores_of_a_release_replace_those_of_a_submission():
     forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
-    assert score_submission(submission(forged)).group("test", "reach").score > 600
+    assert score_submission(submission(forged)).group("test", "reach").score.value > 600
     random = random_scores(submission())
     fair = score_submission(submission(forged), random)
     assert fair.sides == score_submission(submission()).sides
@@ -78,12 +78,18 @@ def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
     random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
     for episodes in (4, 5, 8):
         each = submission(data(episodes=episodes))
-        score = score_submission(each, random).group("test", "reach").score
+        score = score_submission(each, random).group("test", "reach").score.value
         assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
 
 
 def row(method, *sides):
-    return Row(method, "submission", "", (), 34, tuple(SideScore(*side) for side in sides))
+    sides = (
+        SideScore(
+            *group, Interval(score, math.nan, math.nan), success_interval(rate, 34 * group[2])
+        )
+        for *group, score, rate in sides
+    )
+    return Row(method, "submission", "", (), 34, tuple(sides))
 
 
 def test_rows_are_ranked_by_the_test_robots():
@@ -147,9 +153,7 @@ def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_versi
         ("random", "reference", (0,)),
         ("me-mlp", "reference", (3,)),
     }
-    assert json.loads(files["scores.json"])["rows"] == json.loads(
-        json.dumps(msgspec.to_builtins(rows))
-    )
+    assert json.loads(files["scores.json"])["rows"] == ranking_data(rows)
     assert read_references(tmp_path).rows() == []
     baseline["robots"] = baseline["robots"][TEST:]
     (tmp_path / "random.json").write_text(json.dumps(baseline))
