@@ -60,7 +60,7 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.split_file import read_split
+from morphgen.splits.split_file import read_split
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.sim import bullet_batch as bullet_scene

@@ -10,8 +10,8 @@ import time
 
 from tabulate import tabulate
 
-from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
+from morphgen.splits.split_file import read_split
 from morphgen.tasks.goals.split_goals import certify_goal_set
 from morphgen.tasks.scenes.env_specs import env_spec, member_with_primitives
 

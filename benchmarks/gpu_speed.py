@@ -32,9 +32,9 @@ import torch
 import warp as wp
 from tabulate import tabulate
 
-from morphgen.benchmark.split_file import read_split
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
+from morphgen.splits.split_file import read_split
 from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.registry import COLLISION_GEOMETRIES, CollisionGeometry

@@ -54,7 +54,7 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.tokens import MAX_LINKS, TOKEN_SIZE
+from morphgen.encoding.tokens import MAX_LINKS, TOKEN_SIZE
 from morphgen.model.robot import Robot
 from morphgen.rl.agents import mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig

@@ -29,14 +29,14 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.split import SIDES, Member
-from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.rollouts import run_episodes
+from morphgen.splits.split import SIDES, Member
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.reach.config import ReachConfig

@@ -42,15 +42,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from morphgen.benchmark.generate import ComposedRecipe, RobotFactory, members
-from morphgen.benchmark.similarity import MEASURES, most_alike
-from morphgen.benchmark.split import Member, Split
-from morphgen.benchmark.split_file import read_split
 from morphgen.benchmark.survey import DIFFICULTY_DIGITS, Fault, SplitSurvey, survey_split
+from morphgen.encoding.similarity import MEASURES, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.robot_source import read_drawn
+from morphgen.splits.candidates import ComposedRecipe, RobotFactory, members
+from morphgen.splits.split import Member, Split
+from morphgen.splits.split_file import read_split
 from morphgen.typing import Array
 from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 

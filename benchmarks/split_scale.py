@@ -22,12 +22,12 @@ from tqdm import tqdm
 
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest, extrapolation
-from morphgen.benchmark.split import Split
-from morphgen.benchmark.split_file import split_text, write_split
 from morphgen.benchmark.split_folder import BuildSettings, build_split
 from morphgen.benchmark.verify import verify
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
+from morphgen.splits.split import Split
+from morphgen.splits.split_file import split_text, write_split
 
 T = TypeVar("T")
 

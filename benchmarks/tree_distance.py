@@ -22,7 +22,7 @@ from typing import Any
 from tabulate import tabulate
 
 import morphgen
-from morphgen.benchmark.similarity import LabelledTree, edit_distance, labelled_tree
+from morphgen.encoding.similarity import LabelledTree, edit_distance, labelled_tree
 from morphgen.fitting.token_shapes import token_shapes
 
 

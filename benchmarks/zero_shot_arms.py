@@ -31,7 +31,7 @@ from morphgen.processes import parallel_map
 from morphgen.rl.evaluation import EvalConfig, eval_config_of, evaluate, zero_shot, zero_shot_data
 from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source
-from morphgen.rl.scores.scores import Score, success_of
+from morphgen.rl.scores import Score, success_of
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import IK_SHARE

@@ -11,10 +11,10 @@ from pathlib import Path
 from PIL import Image
 
 import morphgen
-from morphgen.benchmark.split import compose_member
-from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
+from morphgen.splits.split import compose_member
+from morphgen.splits.split_file import read_split
 
 REQUESTS = (
     "arm=ur5 ee=plane",

@@ -14,17 +14,17 @@ from pathlib import Path
 from tqdm import tqdm
 
 from morphgen.benchmark.figures import MapPanel, Panel, heatmap_png, map_png
-from morphgen.benchmark.similarity import (
+from morphgen.encoding.similarity import (
     MEASURES,
     classical_mds,
     features,
     similarity_matrix,
     to_distances,
 )
-from morphgen.benchmark.split import Member, compose_member
-from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
+from morphgen.splits.split import Member, compose_member
+from morphgen.splits.split_file import read_split, split_names
 
 
 def main() -> int:

@@ -15,10 +15,10 @@ from typing import Any, cast, get_type_hints
 import msgspec
 from msgspec import NODEFAULT
 
-from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
+from morphgen.splits.split import Side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.registry import CHANNELS, TASKS

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress
@@ -23,7 +22,7 @@ from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files
-from morphgen.rl.scores.scores import (
+from morphgen.rl.scores import (
     RobotOutcomes,
     Score,
     finite_or_none,
@@ -31,6 +30,7 @@ from morphgen.rl.scores.scores import (
     success_of,
 )
 from morphgen.rl.shipped_policies import name_of
+from morphgen.splits.split import Side
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from morphgen.benchmark.tokens import GEOMETRY, SHAPE_POSE
+from morphgen.encoding.tokens import GEOMETRY, SHAPE_POSE
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import (
     FrameChain,

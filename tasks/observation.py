@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from morphgen.benchmark.tokens import FREQUENCIES, POSITION
+from morphgen.encoding.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics_torch import FramePositions, matrix_from_quaternion
 from morphgen.tasks.free_space import FreeSpace

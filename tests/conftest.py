@@ -19,6 +19,12 @@ def module_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of stored goal sets, which the tests of a process share."""
+    return tmp_path_factory.mktemp("goals")
+
+
 @pytest.fixture
 def robot_urdf(tmp_path):
     """Write a robot as ``some_robot.urdf``."""

@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 from helpers.outside_robots import add_outside_robots
+from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.cli import build_parser, main
 from morphgen.cli.command import parse
 from morphgen.grammar.library import default_library
-from morphgen.tasks.goals.eval_protocol import EvalProtocol
 from morphgen.tasks.registry import register_gym_envs
 
 ROOT = Path(__file__).parent.parent

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from morphgen.benchmark.split import sided_members
-from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.scores.episode_table import EPISODES, read_table
 from morphgen.cli import main
-from morphgen.rl.scores.episode_table import EPISODES, read_table
+from morphgen.splits.split import sided_members
+from morphgen.splits.split_file import read_split, split_names
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = re.findall(

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from morphgen.benchmark.similarity import MEASURES, features
-from morphgen.benchmark.tokens import default_max_links
+from morphgen.encoding.similarity import MEASURES, features
+from morphgen.encoding.tokens import default_max_links
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library

@@ -34,7 +34,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.formats.zip_files import read_all

@@ -16,8 +16,6 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import SIDES, split_id
-from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
@@ -30,6 +28,8 @@ from morphgen.model.kinematics_torch import forward_kinematics as batch_forward_
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
 from morphgen.progress import report
+from morphgen.splits.split import SIDES, split_id
+from morphgen.splits.split_file import split_names
 from morphgen.typing import Array
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.comparison import all_roles, joint_roles

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from morphgen.benchmark.split import SIDES, Split
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
@@ -18,6 +17,7 @@ from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings
 from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.splits.split import SIDES, Split
 from morphgen.viewer.robot_uri import (
     DERIVATION,
     WORDS,

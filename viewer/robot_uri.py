@@ -26,8 +26,6 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from morphgen.benchmark.split import SIDES, Member, Side, Split, compose_member
-from morphgen.benchmark.split_file import find_split, read_split_file, split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.bundle import CARD, MJCF, URDF, split_colours
@@ -42,6 +40,8 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_source import RobotSource, light_derivation, read_source
 from morphgen.model.robot import Robot
+from morphgen.splits.split import SIDES, Member, Side, Split, compose_member
+from morphgen.splits.split_file import find_split, read_split_file, split_names
 
 WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 """Schemes of robot URIs; a URI without scheme is a path."""

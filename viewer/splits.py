@@ -11,10 +11,6 @@ import numpy as np
 import viser
 
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Side, Split
-from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.benchmark.survey import (
     Fault,
     MeasuredRobot,
@@ -23,11 +19,15 @@ from morphgen.benchmark.survey import (
     measure_robot,
     summarize_survey,
 )
+from morphgen.encoding.robot_hash import robot_hash
+from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.progress import report
+from morphgen.splits.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Side, Split
+from morphgen.splits.split_file import require_split_name, write_split
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.arguments import checked_signature, text_argument
-from morphgen.benchmark import tokens as encoding
-from morphgen.benchmark.similarity import MEASURES, features, get_measure, similarity_matrix
-from morphgen.benchmark.tokens import default_max_links
+from morphgen.encoding import tokens as encoding
+from morphgen.encoding.similarity import MEASURES, features, get_measure, similarity_matrix
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.token_shapes import token_shapes
@@ -44,7 +44,7 @@ def tokens(
 
     Returns:
         Tokens of the links, root first, shape (..., n_links, 48);
-        ``morphgen.benchmark.tokens.LAYOUT`` describes their fields.
+        ``morphgen.encoding.tokens.LAYOUT`` describes their fields.
 
     Raises:
         BenchmarkError: If the robot has more links than ``max_links`` or cannot be encoded.

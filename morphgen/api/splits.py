@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING, Any, TypedDict, overload
 from morphgen.arguments import checked_signature, path_argument, truth, whole_number
 from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.generate import SplitRequest
+from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
-from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds
-from morphgen.benchmark.split import HOLD_OUT, Regime, Split, compose_side
-from morphgen.benchmark.split_file import require_split_name, split_paths, write_new_splits
 from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
+from morphgen.benchmark.split_release import build_with_goals
 from morphgen.benchmark.survey import statistics
-from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.benchmark.verify import Difference, compare_robots, verify
+from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds
+from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.model.robot import Robot
-from morphgen.tasks.goals.goal_audit import audit_goals, goals_to_audit, with_goal_findings
+from morphgen.splits.split import HOLD_OUT, Regime, Split, compose_side
+from morphgen.splits.split_file import require_split_name, split_paths, write_new_splits
 from morphgen.tasks.goals.split_goals import sample_split_goals
-from morphgen.tasks.goals.split_release import build_with_goals
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -110,7 +110,7 @@ class LoadedSplit:
     ) -> Audit:
         """Find leaks between train and test robots, and between the goal sets of a built split.
 
-        See ``morphgen.benchmark.audit.audit`` and ``morphgen.tasks.goals.goal_audit.audit_goals``.
+        See ``morphgen.benchmark.audit.audit`` and ``morphgen.benchmark.goal_audit.audit_goals``.
 
         Args:
             near: Thresholds of near duplicates.

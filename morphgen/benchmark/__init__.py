@@ -1,1 +1,1 @@
-"""Bodies as data: tokens, similarity, and splits of train and test robots."""
+"""The life of a split: rules, audit, build, goals, licences, release and scores."""

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
-from morphgen.benchmark.split import SIDES, Member, Side, Split, sided_members
 from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, nearest_train, survey_split
+from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
+from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
 
 _FIXES = {
     "part-missing": "name the folder of your parts with --library, or correct the derivation",

@@ -17,7 +17,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
-from morphgen.benchmark.similarity import MdsMap
+from morphgen.encoding.similarity import MdsMap
 from morphgen.typing import Array
 
 MAX_NAMED = 60

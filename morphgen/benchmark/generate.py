@@ -25,143 +25,24 @@ from morphgen.benchmark.regimes import (
     pattern_robots,
     structure,
 )
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.similarity import Features, cosine, features, is_near
-from morphgen.benchmark.split import COMPOSED, MAX_LINKS_KEY, Member, Regime, Split
-from morphgen.benchmark.tokens import MAX_LINKS, require_max_links
-from morphgen.checks import check
+from morphgen.encoding.similarity import cosine, is_near
+from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.fitting.token_shapes import token_shapes
-from morphgen.grammar.compose import compose, join
-from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import RandomChooser, RecordedChooser, TooManyPartsError, derive
-from morphgen.grammar.grammar_file import Grammar, grammar_names
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.request import parse_words
-from morphgen.grammar.sampling import sample_robot
-from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import report, show_progress
-
-
-@dataclass(frozen=True)
-class SampledRecipe:
-    """A robot sampled from a grammar: robot ``number`` of ``morphgen sample --seed``."""
-
-    grammar: Grammar
-    number: int
-    seed: int
-    name: str
-
-
-@dataclass(frozen=True)
-class ComposedRecipe:
-    """A robot given by the arguments of ``morphgen compose``."""
-
-    words: tuple[str, ...]
-    name: str = ""  # name of the robot; by default made of the names of its parts
-
-
-@dataclass(frozen=True)
-class DerivedRecipe:
-    """A robot given by its derivation."""
-
-    derivation: Derivation
-    name: str
-    category: str = COMPOSED
-
-
-Recipe = SampledRecipe | ComposedRecipe | DerivedRecipe
-
-
-class UnfitRobotError(BenchmarkError):
-    """A robot can be composed, but cannot be a member of a split."""
-
-    def __init__(self, message: str, reason: str) -> None:
-        """Create the error from its message and a reason that is the same for similar robots."""
-        super().__init__(message, reason)
-        self.reason = reason
-
-    def __str__(self) -> str:
-        """Return the message."""
-        return str(self.args[0])
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A robot that may become a member of a split."""
-
-    name: str
-    category: str
-    derivation: Derivation
-    hash: str  # hash of the robot, see `robot_hash`
-    features: Features | None = None
-    """Features for similarity measures; None if the factory does not compute them."""
-
-
-@dataclass(frozen=True)
-class RobotFactory:
-    """Make candidates from recipes; can be pickled and sent to a worker process."""
-
-    library: Library
-    with_features: bool = False  # compute the features of each robot
-    max_links: int = MAX_LINKS  # largest number of links of a robot
-
-    def __call__(self, recipe: Recipe) -> Candidate:
-        """Make a robot."""
-        if isinstance(recipe, SampledRecipe):
-            sample = sample_robot(
-                recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
-            )
-            return self._candidate(sample.robot, sample.derivation, recipe.grammar.name)
-        if isinstance(recipe, DerivedRecipe):
-            return self._composed(
-                recipe.derivation, recipe.name, recipe.category, str(recipe.derivation)
-            )
-        derivation, name = parse_words(recipe.words, self.library)
-        category = category_of(recipe.words, self.library)
-        return self._composed(derivation, recipe.name or name, category, " ".join(recipe.words))
-
-    def _composed(self, derivation: Derivation, name: str, category: str, source: str) -> Candidate:
-        """Make a robot that nothing has checked before; ``source`` names it in messages."""
-        # Joining parts is fast, and the search for contacts of a composed robot is not.
-        self._require_links(join(derivation, self.library, name))
-        robot = compose(derivation, self.library, name)
-        for finding in check(robot):
-            if finding.severity == "error":
-                text = f"{source}: {finding.code} at {finding.where}: {finding.why}"
-                raise UnfitRobotError(text, f"an error of morphgen check: {finding.code}")
-        return self._candidate(robot, derivation, category)
-
-    def _require_links(self, robot: Robot) -> None:
-        try:
-            require_max_links(len(robot.links), f"robot {robot.name!r}", self.max_links)
-        except BenchmarkError as error:
-            raise UnfitRobotError(str(error), f"more than {self.max_links} links") from error
-
-    def _candidate(self, robot: Robot, derivation: Derivation, category: str) -> Candidate:
-        # The text of a derivation has 12 digits per number. A split stores the text, so the robot
-        # must be the one that the text gives.
-        written = parse_derivation(str(derivation))
-        if written != derivation:
-            robot = compose(written, self.library, robot.name)
-        self._require_links(robot)
-        robot_features = None
-        if self.with_features:
-            shapes = token_shapes(robot, self.library.folders)
-            robot_features = features(robot, shapes, max_links=self.max_links)
-        return Candidate(robot.name, category, written, robot_hash(robot), robot_features)
-
-
-def category_of(words: Sequence[str], library: Library) -> str:
-    """Return the grammar that the arguments of ``compose`` begin with, else ``composed``."""
-    is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
-    return COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
-
-
-def numbered_name(prefix: str, number: int) -> str:
-    """Return the name of a sampled robot, such as ``arm3-000004``."""
-    return f"{prefix}-{number:06d}"
+from morphgen.splits.candidates import (
+    Candidate,
+    ComposedRecipe,
+    RobotFactory,
+    SampledRecipe,
+    members,
+    numbered_name,
+)
+from morphgen.splits.split import MAX_LINKS_KEY, Member, Regime, Split
 
 
 def stream_seed(seed: int, prefix: str) -> int:
@@ -170,24 +51,6 @@ def stream_seed(seed: int, prefix: str) -> int:
     It depends on the prefix, so robots do not change with the other robots that a split samples.
     """
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
-
-
-def members(
-    candidates: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
-) -> tuple[Member, ...]:
-    """Return a member for each robot and task; with several tasks the name ends in the task."""
-    return tuple(
-        Member(
-            robot.name if len(tasks) == 1 else f"{robot.name}-{task}",
-            robot.category,
-            str(robot.derivation),
-            task,
-            obstacles,
-            robot.hash,
-        )
-        for robot in candidates
-        for task in tasks
-    )
 
 
 MAX_DRAWS = 2000

@@ -21,20 +21,13 @@ import numpy as np
 from morphgen.benchmark.generate import (
     MAX_COMPOSED,
     MAX_DRAWS,
-    Candidate,
-    DerivedRecipe,
-    RobotFactory,
     RobotStream,
-    SampledRecipe,
     SplitRequest,
-    UnfitRobotError,
     assemble_drawn,
-    category_of,
     require_size,
 )
 from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_robots
-from morphgen.benchmark.similarity import is_near
-from morphgen.benchmark.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
+from morphgen.encoding.similarity import is_near
 from morphgen.errors import BenchmarkError, PartError, nearest
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.derivation import Derivation, parse_derivation
@@ -44,6 +37,15 @@ from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, PartKind,
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
+from morphgen.splits.candidates import (
+    Candidate,
+    DerivedRecipe,
+    RobotFactory,
+    SampledRecipe,
+    UnfitRobotError,
+    category_of,
+)
+from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 
 MANUFACTURER = "manufacturer"
 """_Key of conditions on the manufacturer of a part."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from morphgen.benchmark.regimes import NOTHING
-from morphgen.benchmark.split import SIDES, Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.splits.split import SIDES, Split
 
 NON_COMMERCIAL, NO_DERIVATIVES, UNKNOWN = "non-commercial", "no derivatives", "unknown"
 SHARE_ALIKE = "share-alike"

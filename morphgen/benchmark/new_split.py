@@ -15,11 +15,11 @@ from morphgen.benchmark.generate import (
     parse_bound,
 )
 from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.split import HOLD_OUT, REGIMES, Regime, Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.library import Library
 from morphgen.progress import part_of
+from morphgen.splits.split import HOLD_OUT, REGIMES, Regime, Split
 
 MAX_WORD = 60
 """Largest number of characters of what is held out in the name of a split."""

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
-from morphgen.benchmark.split import COMPOSED, Member, Regime, Split
 from morphgen.errors import BenchmarkError, CompositionError, nearest
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.request import SLOTS, parse_words
 from morphgen.model.findings import Finding
+from morphgen.splits.split import COMPOSED, Member, Regime, Split
 
 NOTHING = "none"
 """Name of the part for robots without an end-effector."""

@@ -29,8 +29,6 @@ import msgspec
 import yaml
 
 from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids, restricted
-from morphgen.benchmark.split import SIDES, Split
-from morphgen.benchmark.split_file import is_split_name
 from morphgen.benchmark.split_folder import (
     ROBOTS_FILE,
     is_archive,
@@ -42,6 +40,8 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
+from morphgen.splits.split import SIDES, Split
+from morphgen.splits.split_file import is_split_name
 
 RELEASE_FILE = "release.json"
 LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
@@ -65,13 +65,13 @@ class Release(Record, frozen=True):
     name: str
     """Name of the split."""
     id: str
-    """Id of the split, see ``morphgen.benchmark.split.split_id``."""
+    """Id of the split, see ``morphgen.splits.split.split_id``."""
     version: str
     """Version of the release, such as ``1.0.0``."""
     morphgen: str
     """Version of morphgen that made it."""
     evaluation: dict[str, Any]
-    """How submissions are evaluated, see ``morphgen.tasks.goals.eval_protocol``."""
+    """How submissions are evaluated, see ``morphgen.benchmark.eval_protocol``."""
     format: int = FORMAT
     date: str = ""
     """Date of publication, such as ``2027-01-31``; empty if it is not given."""

@@ -32,17 +32,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import SIDES, Member, Split, compose_member, sided_members, split_id
-from morphgen.benchmark.split_file import read_split, split_text
 from morphgen.benchmark.survey import robot_stats
-from morphgen.benchmark.tokens import (
+from morphgen.checks import check
+from morphgen.encoding.tokens import (
     LAYOUT_ARRAYS,
     TOKEN_SIZE,
     pad_tokens,
     require_max_links,
     tokens,
 )
-from morphgen.checks import check
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import records
@@ -71,6 +69,8 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import light_files, write_light
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
+from morphgen.splits.split import SIDES, Member, Split, compose_member, sided_members, split_id
+from morphgen.splits.split_file import read_split, split_text
 from morphgen.typing import Array
 
 SPLIT_FILE = "split.yaml"

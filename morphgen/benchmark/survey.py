@@ -17,9 +17,8 @@ from typing import TypeAlias
 import numpy as np
 from tabulate import tabulate
 
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.similarity import MEASURES, Features, features, most_alike
-from morphgen.benchmark.split import SIDES, Member, Side, Split
+from morphgen.encoding.robot_hash import robot_hash
+from morphgen.encoding.similarity import MEASURES, Features, features, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.rounding import round_number
@@ -30,6 +29,7 @@ from morphgen.grammar.values import RobotProperties
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
+from morphgen.splits.split import SIDES, Member, Side, Split
 from morphgen.typing import Array
 
 
@@ -59,7 +59,7 @@ class Fault:
 class SurveyedRobot:
     """A robot of a split, composed with the current library."""
 
-    robot_hash: str  # hash of the robot; see `morphgen.benchmark.robot_hash`
+    robot_hash: str  # hash of the robot; see `morphgen.encoding.robot_hash`
     stats: RobotStats
     shoulder_reach: float
     """Largest distance of the tool from the shoulder, the unit of ``Workspace`` [m]."""

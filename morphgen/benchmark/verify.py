@@ -21,9 +21,6 @@ from morphgen.benchmark.release import (
     opened_folder,
     read_release,
 )
-from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import SIDES, Member, Split, compose_member, sided_members, split_id
-from morphgen.benchmark.split_file import find_split, read_split_file
 from morphgen.benchmark.split_folder import (
     BUILD_FILE,
     ROBOTS_DIR,
@@ -56,12 +53,15 @@ from morphgen.benchmark.survey import (
     survey_split,
     train_similarity,
 )
-from morphgen.benchmark.tokens import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
+from morphgen.encoding.similarity import MEASURES
+from morphgen.encoding.tokens import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import file_sha256, folder_hashes
 from morphgen.grammar.library import Library
 from morphgen.processes import parallel_map
+from morphgen.splits.split import SIDES, Member, Split, compose_member, sided_members, split_id
+from morphgen.splits.split_file import find_split, read_split_file
 from morphgen.typing import Array
 
 FITTED_TOLERANCE = 1e-3

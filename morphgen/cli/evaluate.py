@@ -20,19 +20,19 @@ from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
 from morphgen.tasks.registry import DEFAULT_SIMULATOR
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.split import Side
+    from morphgen.benchmark.eval_protocol import EvalProtocol
     from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.runs.checkpoint import RunConfig
     from morphgen.rl.runs.robot_source import RobotSource
-    from morphgen.rl.scores.scores import Score
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol
+    from morphgen.rl.scores import Score
+    from morphgen.splits.split import Side
     from morphgen.tasks.task import TaskConfig
 
 
 def rules_of(words: Sequence[str]) -> EvalProtocol:
     """Return the rules of the release that ``--split`` names, else the default ones."""
+    from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
     from morphgen.benchmark.release import is_release, read_release
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
 
     folder = Path(words[0]) if len(words) == 1 else None
     if folder is None or not is_release(folder):
@@ -50,10 +50,14 @@ def plan_submission(
 
     Without ``--submission`` it does nothing. ``facts`` are arguments of ``make_submission``.
     """
+    from morphgen.benchmark.eval_protocol import EvalProtocol
+    from morphgen.benchmark.scores.submission import (
+        make_submission,
+        require_rules,
+        write_submission,
+    )
     from morphgen.formats.files import require_writable_file
     from morphgen.rl.runs.robot_source import split_of
-    from morphgen.rl.scores.submission import make_submission, require_rules, write_submission
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol
 
     if args.submission is None:
         return lambda scores: None
@@ -127,7 +131,7 @@ def plan_submission(
 )
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate and print the scores."""
-    from morphgen.rl.scores.scores import (
+    from morphgen.rl.scores import (
         require_table,
         score_table,
         scores_to_json,
@@ -185,6 +189,7 @@ def _prepare(sources: Sequence[RobotSource], config: EvalConfig) -> None:
 
 
 def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
+    from morphgen.benchmark.scores.submission import Training
     from morphgen.rl.evaluation import (
         eval_config_of,
         evaluate_checkpoints,
@@ -195,7 +200,6 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.runs.checkpoint import read_checkpoint, read_config
     from morphgen.rl.runs.robot_source import other_side
     from morphgen.rl.runs.training import checkpoint_files
-    from morphgen.rl.scores.submission import Training
     from morphgen.tasks.registry import require_device
 
     require_device(args.device)

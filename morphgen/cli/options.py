@@ -208,7 +208,7 @@ def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
     It is the value of ``--max-links``, else the benchmark's or that of the largest robot if it has
     more, such as a robot with two arms. All robots of a command share it.
     """
-    from morphgen.benchmark.tokens import default_max_links, require_max_links
+    from morphgen.encoding.tokens import default_max_links, require_max_links
 
     if args.max_links is None:
         return default_max_links(len(robot.links) for robot in robots)

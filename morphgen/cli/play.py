@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.rollouts import Episode
     from morphgen.rl.runs.robot_source import RobotSource
-    from morphgen.rl.scores.scores import Score
+    from morphgen.rl.scores import Score
 
 
 OBSTACLES = flag("--obstacles", "place the robot among obstacles")
@@ -248,7 +248,7 @@ def zeroshot(args: argparse.Namespace) -> None:
 
 
 def _table(scores: Mapping[str, Score], task: str) -> str:
-    from morphgen.rl.scores.scores import success_of
+    from morphgen.rl.scores import success_of
 
     columns = {
         "controller": list(scores),

@@ -18,7 +18,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.progress import part_of
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.similarity import Features
+    from morphgen.encoding.similarity import Features
     from morphgen.model.geometry import Shape
     from morphgen.model.robot import Robot
     from morphgen.typing import Array
@@ -48,7 +48,7 @@ LARGEST_MATRIX = 20
 )
 def similarity(args: argparse.Namespace) -> None:
     """Compare the robots, print the result and write the files."""
-    from morphgen.benchmark.similarity import get_measure, similarity_matrix
+    from morphgen.encoding.similarity import get_measure, similarity_matrix
     from morphgen.formats.files import require_writable_file, write_file
 
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
@@ -91,7 +91,7 @@ def similarity(args: argparse.Namespace) -> None:
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
     """Return the features of the robots and their names; equal names are replaced by labels."""
-    from morphgen.benchmark.similarity import features
+    from morphgen.encoding.similarity import features
     from morphgen.fitting.token_shapes import token_shapes
 
     pairs, folders = opt.read_robots(args), opt.library_of(args).folders
@@ -114,7 +114,7 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
     """Return the table of a measure with its title and statistics."""
     import numpy as np
 
-    from morphgen.benchmark.similarity import get_measure
+    from morphgen.encoding.similarity import get_measure
 
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
     table = _matrix_table if len(names) <= LARGEST_MATRIX else _nearest_table
@@ -135,7 +135,7 @@ def _matrix_table(names: Sequence[str], measure: str, values: Array) -> str:
 def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
     import numpy as np
 
-    from morphgen.benchmark.similarity import to_distances
+    from morphgen.encoding.similarity import to_distances
 
     distance = to_distances(values, measure)
     np.fill_diagonal(distance, np.inf)  # no robot is its own nearest
@@ -149,7 +149,7 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
 
 def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import Panel, heatmap_png
-    from morphgen.benchmark.similarity import get_measure
+    from morphgen.encoding.similarity import get_measure
 
     panels = []
     for name, values in matrices.items():
@@ -159,7 +159,7 @@ def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
 
 def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import MapPanel, map_png
-    from morphgen.benchmark.similarity import classical_mds, to_distances
+    from morphgen.encoding.similarity import classical_mds, to_distances
 
     panels = []
     for name, values in matrices.items():
@@ -168,7 +168,7 @@ def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
 
 
 def _title(measure: str) -> str:
-    from morphgen.benchmark.similarity import get_measure
+    from morphgen.encoding.similarity import get_measure
 
     return f"{measure}: {get_measure(measure).meaning}"
 
@@ -209,7 +209,7 @@ HEADERS = (
 )
 def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
-    from morphgen.benchmark.tokens import tokens, tokens_npz
+    from morphgen.encoding.tokens import tokens, tokens_npz
     from morphgen.fitting.token_shapes import token_shapes
     from morphgen.formats.files import require_writable_file, write_file
 
@@ -253,7 +253,7 @@ def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:
 
 def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
     """Return a table with a row per link, decoded from the tokens."""
-    from morphgen.benchmark.tokens import robot_from_tokens
+    from morphgen.encoding.tokens import robot_from_tokens
 
     decoded, shapes = robot_from_tokens(tokens, robot.name, max_links=max_links)
     home = dict(zip(decoded.independent_joints, decoded.home, strict=True))
@@ -300,13 +300,13 @@ def _numbers(values: Sequence[float], digits: int = 3) -> str:
 
 
 def _layout_text() -> str:
-    from morphgen.benchmark.tokens import LAYOUT
+    from morphgen.encoding.tokens import LAYOUT
 
     rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
     return opt.table(rows, ("field", "columns", "size", "content"), disable_numparse=True)
 
 
 def _layout_data() -> list[dict[str, object]]:
-    from morphgen.benchmark.tokens import LAYOUT
+    from morphgen.encoding.tokens import LAYOUT
 
     return [asdict(field) for field in LAYOUT]

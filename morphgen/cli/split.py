@@ -22,11 +22,11 @@ from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit
-    from morphgen.benchmark.similarity import NearThresholds
-    from morphgen.benchmark.split import Member, Split
     from morphgen.benchmark.survey import BaselineResults, PaperRow, RobotDifficulty
     from morphgen.benchmark.verify import Difference
+    from morphgen.encoding.similarity import NearThresholds
     from morphgen.model.findings import Finding
+    from morphgen.splits.split import Member, Split
     from morphgen.tasks.goals.split_goals import GoalResult, SplitGoals
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -79,7 +79,7 @@ def goals(args: argparse.Namespace) -> int:
 
 
 def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
-    from morphgen.benchmark.split_file import split_names
+    from morphgen.splits.split_file import split_names
     from morphgen.tasks.goals.split_goals import sample_robot_goals
     from morphgen.tasks.scenes.env_specs import load_robot
 
@@ -200,7 +200,7 @@ def audit(args: argparse.Namespace) -> int:
 
 
 def _near(text: str | None) -> NearThresholds:
-    from morphgen.benchmark.similarity import NEAR_THRESHOLDS, NearThresholds
+    from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds
 
     if text is None:
         return NEAR_THRESHOLDS
@@ -224,7 +224,7 @@ def _audit_goals(
     args: argparse.Namespace, result: Audit, split: Split, folder: Path | None
 ) -> tuple[Audit, SplitGoals | None]:
     """Add the findings about goal sets to an audit; return the goal sets, too."""
-    from morphgen.tasks.goals.goal_audit import audit_goals, goals_to_audit, with_goal_findings
+    from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 
     sample = partial(make_goals, args, split) if args.goals else None
     goals = goals_to_audit(folder, args.goal_seed, sample)
@@ -237,7 +237,7 @@ def _audit_goals(
 
 
 def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
-    from morphgen.benchmark.similarity import MEASURES
+    from morphgen.encoding.similarity import MEASURES
 
     nearest: dict[str, list[str]] = {}
     for neighbour in result.neighbours:
@@ -297,9 +297,9 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
-    from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import BuildSettings
-    from morphgen.tasks.goals.split_release import build_with_goals
+    from morphgen.benchmark.split_release import build_with_goals
+    from morphgen.splits.split_file import read_split
     from morphgen.tasks.scenes.env_specs import GoalConfig
 
     settings = BuildSettings(light=args.light, picture=args.picture)
@@ -416,7 +416,7 @@ def _results(study: Path | None, splits: Sequence[Split]) -> list[BaselineResult
     """Return the results of the baselines of a study on each split; none without a study."""
     if study is None:
         return [{} for _ in splits]
-    from morphgen.rl.scores.leaderboard import study_results
+    from morphgen.benchmark.scores.leaderboard import study_results
 
     return [study_results(study, split) for split in splits]
 
@@ -455,7 +455,7 @@ SHORT_DERIVATION = 60
 @command("list", "list the splits that come with morphgen", opt.JSON)
 def list_splits(args: argparse.Namespace) -> None:
     """Print a row per split."""
-    from morphgen.benchmark.split_file import read_split, split_names
+    from morphgen.splits.split_file import read_split, split_names
 
     splits = [read_split(name) for name in split_names()]
     data: list[dict[str, Any]] = [
@@ -497,8 +497,8 @@ def list_splits(args: argparse.Namespace) -> None:
 def show(args: argparse.Namespace) -> None:
     """Print a split."""
     from morphgen.benchmark.licences import licence_lines, licenced_parts
-    from morphgen.benchmark.split import split_id
-    from morphgen.benchmark.split_file import read_split
+    from morphgen.splits.split import split_id
+    from morphgen.splits.split_file import read_split
 
     split = read_split(args.split)
     try:
@@ -511,7 +511,7 @@ def show(args: argparse.Namespace) -> None:
 
 
 def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
-    from morphgen.benchmark.split import SIDES, split_id
+    from morphgen.splits.split import SIDES, split_id
 
     lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]
     if split.reference:
@@ -564,8 +564,8 @@ def _categories(members: Sequence[Member]) -> Counter[str]:
 def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
-    from morphgen.benchmark.split_file import read_split, split_names
     from morphgen.benchmark.survey import PAPER_TABLE, paper_row, statistics
+    from morphgen.splits.split_file import read_split, split_names
 
     library = opt.library_of(args)
     groups = _by_robots([read_split(name) for name in args.splits or split_names()])
@@ -607,7 +607,7 @@ def stats(args: argparse.Namespace) -> None:
 
 def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
     """Return splits with the same robots together, by what their names have in common."""
-    from morphgen.benchmark.split import SIDES
+    from morphgen.splits.split import SIDES
 
     groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
     for split in splits:

@@ -13,8 +13,8 @@ from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.split import Split
     from morphgen.grammar.library import Library
+    from morphgen.splits.split import Split
 
 
 def new_split(args: argparse.Namespace) -> None:
@@ -22,8 +22,8 @@ def new_split(args: argparse.Namespace) -> None:
     from morphgen.api.splits import NewSplit
     from morphgen.api.splits import split as choose
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
-    from morphgen.benchmark.split import split_id
-    from morphgen.benchmark.split_file import split_paths, write_new_splits
+    from morphgen.splits.split import split_id
+    from morphgen.splits.split_file import split_paths, write_new_splits
 
     try:
         sizes = tuple(int(text) for text in args.train.split(",")) if args.train else ()
@@ -78,7 +78,7 @@ def _summary(split: Split, path: Path) -> list[str]:
 def _hold_out_notes(split: Split, library: Library) -> list[str]:
     """Return what a user of ``--hold-out`` may not expect."""
     from morphgen.benchmark.hold_out import related_parts
-    from morphgen.benchmark.split import HOLD_OUT
+    from morphgen.splits.split import HOLD_OUT
 
     if split.regime != HOLD_OUT:
         return []

@@ -15,10 +15,10 @@ from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.split import Split
+    from morphgen.benchmark.eval_protocol import EvalProtocol
+    from morphgen.benchmark.scores.leaderboard import References
     from morphgen.benchmark.survey import BaselineResults
-    from morphgen.rl.scores.leaderboard import References
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol
+    from morphgen.splits.split import Split
 
 
 @command(
@@ -59,11 +59,11 @@ if TYPE_CHECKING:
 )
 def release(args: argparse.Namespace) -> None:
     """Make a release and print where it is."""
-    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
     from morphgen.benchmark.split_folder import BuildSettings
+    from morphgen.benchmark.split_release import ReleaseRequest, release_split
     from morphgen.formats.files import require_writable_folder
-    from morphgen.tasks.goals.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
-    from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
+    from morphgen.splits.split_file import read_split
 
     require_writable_folder(args.out)  # before the audit and the goals, which take minutes
     split, library = read_split(args.split), opt.library_of(args)
@@ -71,7 +71,7 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.rl.scores.leaderboard import collect_references, reference_files
+        from morphgen.benchmark.scores.leaderboard import collect_references, reference_files
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
@@ -112,8 +112,8 @@ def release(args: argparse.Namespace) -> None:
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
     """Return what the release lacks that its users may expect."""
+    from morphgen.benchmark.eval_protocol import tasks_of_split
     from morphgen.benchmark.release import SUBMISSIONS_DIR
-    from morphgen.tasks.goals.eval_protocol import tasks_of_split
 
     notes = []
     is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
@@ -151,9 +151,18 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 )
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
-    from morphgen.rl.scores.leaderboard import ranked, ranking_data, ranking_table, score_submission
-    from morphgen.rl.scores.submission import check_submission, read_submission, require_same_random
-    from morphgen.tasks.goals.eval_protocol import expected_robots
+    from morphgen.benchmark.eval_protocol import expected_robots
+    from morphgen.benchmark.scores.leaderboard import (
+        ranked,
+        ranking_data,
+        ranking_table,
+        score_submission,
+    )
+    from morphgen.benchmark.scores.submission import (
+        check_submission,
+        read_submission,
+        require_same_random,
+    )
 
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
@@ -203,7 +212,7 @@ def score(args: argparse.Namespace) -> None:
 
 def _shipped_split(name: str, where: Path) -> str:
     """Return the name of a split that comes with morphgen; a submission cannot name other files."""
-    from morphgen.benchmark.split_file import split_names
+    from morphgen.splits.split_file import split_names
 
     if name not in split_names():
         raise BenchmarkError(
@@ -217,12 +226,12 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
     from importlib.metadata import version
 
+    from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
     from morphgen.benchmark.release import is_release, opened_folder, read_release
-    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.scores.leaderboard import References, read_references
     from morphgen.benchmark.split_folder import SPLIT_FILE, is_archive
     from morphgen.benchmark.verify import require_unchanged
-    from morphgen.rl.scores.leaderboard import References, read_references
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
+    from morphgen.splits.split_file import read_split
 
     path = Path(name)
     if not path.is_dir() and not is_archive(path):

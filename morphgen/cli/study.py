@@ -17,8 +17,8 @@ from morphgen.rl.agents import AGENTS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 
 if TYPE_CHECKING:
+    from morphgen.benchmark.scores.study import Cell
     from morphgen.rl.runs.checkpoint import RunConfig
-    from morphgen.rl.scores.study import Cell
 
 
 PAPER = "paper"
@@ -69,8 +69,8 @@ PAPER = "paper"
 )
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
-    from morphgen.rl.scores.score_tables import TABLE, write_tables
-    from morphgen.rl.scores.study import require_cells
+    from morphgen.benchmark.scores.score_tables import TABLE, write_tables
+    from morphgen.benchmark.scores.study import require_cells
 
     execution_config(args)  # refuses invalid options before the work
     cells = _cells(args)
@@ -86,11 +86,11 @@ def study(args: argparse.Namespace) -> int:
 
 def _cells(args: argparse.Namespace) -> list[Cell]:
     """Return the cells of the study, baselines first."""
+    from morphgen.benchmark.eval_protocol import EvalProtocol
+    from morphgen.benchmark.scores.study import agent_cell, baseline_cells, matched_budget
     from morphgen.rl.config import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.runs.robot_source import other_side, tasks_of
-    from morphgen.rl.scores.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.tasks.goals.eval_protocol import EvalProtocol
     from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 
     episode_steps = max(config.max_episode_steps for config in default_configs())
@@ -124,8 +124,8 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
 
 def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) -> None:
     """Require that training and fine-tuning of a cell can begin, before any of them does."""
+    from morphgen.benchmark.scores.study import finetuning_run
     from morphgen.rl.runs.training import is_done, require_runnable, subruns_of
-    from morphgen.rl.scores.study import finetuning_run
     from morphgen.tasks.registry import require_device
 
     parts = subruns_of(cell.folder, config)
@@ -143,7 +143,7 @@ def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) 
 
 def _splits(word: str) -> tuple[str, ...]:
     """Return the split that a word names, or the splits of the benchmark."""
-    from morphgen.benchmark.split_file import split_names
+    from morphgen.splits.split_file import split_names
 
     return tuple(split_names()) if word == PAPER and not Path(word).exists() else (word,)
 
@@ -171,7 +171,7 @@ def _seeds(text: str) -> list[int]:
 
 def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
     """Run the cells and return how many failed."""
-    from morphgen.rl.scores.study import run_cells, run_cells_on_ray
+    from morphgen.benchmark.scores.study import run_cells, run_cells_on_ray
 
     failures = 0
     execution = execution_config(args)
@@ -226,8 +226,8 @@ MODES = ("deterministic", "stochastic", "all")
 )
 def score(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    from morphgen.rl.scores.episode_table import read_submissions
-    from morphgen.rl.scores.score_tables import NOTE, result_rows, result_tables, rows_data
+    from morphgen.benchmark.scores.episode_table import read_submissions
+    from morphgen.benchmark.scores.score_tables import NOTE, result_rows, result_tables, rows_data
 
     submissions = read_submissions(args.files)
     modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}

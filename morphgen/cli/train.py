@@ -202,9 +202,9 @@ def draw_robots(
         padded to: ``--max-links`` if it is given, else the largest of the benchmark's number, those
         of the splits of ``--held-out`` and the links of the largest robot.
     """
-    from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.tokens import default_max_links
+    from morphgen.encoding.tokens import default_max_links
     from morphgen.rl.runs.robot_source import draw
+    from morphgen.splits.split_file import read_split
 
     with training_progress():
         robots = draw(source, config, jobs=args.workers)
@@ -424,7 +424,7 @@ def _max_links(source: RobotSource) -> int:
     it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    from morphgen.benchmark.tokens import default_max_links
+    from morphgen.encoding.tokens import default_max_links
     from morphgen.rl.runs.robot_source import split_of
     from morphgen.tasks.scenes.env_specs import load_robot
 

@@ -12,12 +12,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.checks import check
 from morphgen.checks.conformance import ConformanceRow, conformance
 from morphgen.doctor import Entry, attempt, failure
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError, PartError
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.files import file_sha256
@@ -30,6 +28,8 @@ from morphgen.grammar.manifest import PART_KINDS, PackageSource
 from morphgen.grammar.request import parse_words
 from morphgen.model.robot import Robot
 from morphgen.rl.shipped_policies import POLICIES
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.goals.goal_sets import FOLDER, packaged_index
 from morphgen.tasks.registry import SIMULATORS
 

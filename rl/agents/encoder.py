@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from morphgen.benchmark.tokens import FREQUENCIES, POSITION
+from morphgen.encoding.tokens import FREQUENCIES, POSITION
 from morphgen.rl.observation_layout import Layout
 from morphgen.tasks.observation import Observation
 

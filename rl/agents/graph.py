@@ -20,8 +20,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from morphgen.benchmark.tokens import POSITION
-from morphgen.benchmark.tokens import TOOL_FLAG as TOOL
+from morphgen.encoding.tokens import POSITION
+from morphgen.encoding.tokens import TOOL_FLAG as TOOL
 from morphgen.errors import TaskError
 from morphgen.rl.agents import NetworkConfig, encoder
 from morphgen.rl.observation_layout import Layout

@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from morphgen.benchmark.tokens import MAX_LINKS
+from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import MALFORMED, MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic, writing

@@ -18,18 +18,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from morphgen.benchmark.generate import RobotFactory, SampledRecipe, numbered_name
-from morphgen.benchmark.generate import members as factory_members
-from morphgen.benchmark.robot_hash import digest, robot_hash
-from morphgen.benchmark.split import Member, Side, Split, compose_member, split_id
-from morphgen.benchmark.split_file import (
-    MemberRecord,
-    parse_split,
-    read_split,
-    split_names,
-    split_text,
-)
-from morphgen.benchmark.tokens import LARGEST_MAX_LINKS, require_max_links
+from morphgen.encoding.robot_hash import digest, robot_hash
+from morphgen.encoding.tokens import LARGEST_MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
@@ -40,6 +30,16 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.processes import parallel_map
 from morphgen.progress import own_progress, show_progress
+from morphgen.splits.candidates import RobotFactory, SampledRecipe, numbered_name
+from morphgen.splits.candidates import members as factory_members
+from morphgen.splits.split import Member, Side, Split, compose_member, split_id
+from morphgen.splits.split_file import (
+    MemberRecord,
+    parse_split,
+    read_split,
+    split_names,
+    split_text,
+)
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.task import EnvSpec, GoalSet

@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from morphgen.benchmark.tokens import require_max_links
+from morphgen.encoding.tokens import require_max_links
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import locked_folder, naming, write_atomic
@@ -51,7 +51,7 @@ from morphgen.rl.runs.robot_source import (
     specs_of,
     write_drawn,
 )
-from morphgen.rl.scores.scores import finite_or_none
+from morphgen.rl.scores import finite_or_none
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS, batch_device, require_device
 from morphgen.tasks.scenes.env_specs import GoalConfig

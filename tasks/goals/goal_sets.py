@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
-from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.files import write_cache_file
 from morphgen.formats.zip_files import read_npz

@@ -12,28 +12,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, Side, Split, require_side, sided_members
-from morphgen.benchmark.split_folder import (
-    README_FILE,
-    SUMS_FILE,
-    read_sums,
-    sums_text,
-    writing_split,
-)
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_bytes, read_json
-from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
+from morphgen.splits.split import Member, Side, Split, require_side, sided_members
 from morphgen.tasks.goals.goal_sets import goals_from_npz, set_npz
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import (
@@ -177,30 +168,6 @@ def _sample_member(
     return replace(result, side=side)
 
 
-def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
-    """Write the goal sets of a split into the folder where it is built; return their folder.
-
-    The checksums of the split are updated, and earlier sets replaced.
-    """
-    require_goal_sets(results)
-    folder = home / GOALS
-    files = dict(_files(results, config))
-    read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
-    with writing_split(home), locked_folder(home):
-        sums = read_sums(home / SUMS_FILE)
-        (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
-        for leftover in home.glob(f".{GOALS}.*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        with replacing_folder(folder) as partial:
-            for name, content in files.items():
-                (partial / name).parent.mkdir(exist_ok=True)
-                (partial / name).write_bytes(content)
-        sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
-        sums |= {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
-        write_atomic(home / SUMS_FILE, sums_text(sums))
-    return folder
-
-
 def require_goal_sets(results: Sequence[GoalResult]) -> None:
     """Require that every robot has a goal set."""
     failed = [result for result in results if result.goals is None]
@@ -278,7 +245,7 @@ def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:
     return GoalResult(**facts, robot_hash=record["body"], goals=goals)
 
 
-def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[str, bytes]]:
+def goal_files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[str, bytes]]:
     """Yield the files of goal sets: paths in their folder, and contents."""
     records = []
     for result in results:
@@ -294,7 +261,7 @@ def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[
     yield INDEX, f'{head_text},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
     documented = dict.fromkeys((*TASKS.builtin, *task_names))
     arrays = "".join(TASKS[name].goal_files_readme for name in documented)
-    yield README_FILE, _README.format(index=INDEX, tasks=arrays).encode()
+    yield "README.md", _README.format(index=INDEX, tasks=arrays).encode()
 
 
 def goal_record(result: GoalResult) -> dict[str, object]:

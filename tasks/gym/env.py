@@ -22,7 +22,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from morphgen.benchmark.tokens import FREQUENCIES, POSITION
+from morphgen.encoding.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError
 from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.similarity import tool_reach
+from morphgen.encoding.similarity import tool_reach
 from morphgen.errors import TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.kinematics import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.similarity import shoulder
+from morphgen.encoding.similarity import shoulder
 from morphgen.errors import TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose

@@ -12,7 +12,6 @@ from typing import Any, Literal
 import numpy as np
 
 from morphgen.arguments import truth, whole_number
-from morphgen.benchmark.split import Member, compose_member
 from morphgen.errors import TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library, LibraryFolders, default_library
@@ -20,6 +19,7 @@ from morphgen.grammar.robot_source import RobotLike, resolve_robot
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
+from morphgen.splits.split import Member, compose_member
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals.goal_sets import goal_set
 from morphgen.tasks.registry import TASKS

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 import torch
 
 from morphgen.arguments import whole_number
-from morphgen.benchmark.split import Side, Split
-from morphgen.benchmark.tokens import default_max_links
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.fitting.convex_pieces import as_convex
@@ -26,6 +25,7 @@ from morphgen.grammar.library import Library, LibraryFolders, default_library, l
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
 from morphgen.model.robot import Robot
 from morphgen.progress import own_progress, show_progress
+from morphgen.splits.split import Side, Split
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set

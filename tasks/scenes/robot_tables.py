@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.benchmark.tokens import MAX_LINKS, POSITION, pad_tokens, tokens
+from morphgen.encoding.tokens import MAX_LINKS, POSITION, pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import driving_joints, joint_limits

@@ -8,9 +8,6 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.similarity import MEASURES, NearThresholds, cosine, features, is_near
-from morphgen.benchmark.split import SIDES, compose_member
-from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.survey import (
     PAPER,
     STRUCTURAL,
@@ -26,6 +23,7 @@ from morphgen.benchmark.survey import (
     survey_difficulty,
     survey_split,
 )
+from morphgen.encoding.similarity import MEASURES, NearThresholds, cosine, features, is_near
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
@@ -34,6 +32,8 @@ from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.kinematics import reach
 from morphgen.progress import show_progress
+from morphgen.splits.split import SIDES, compose_member
+from morphgen.splits.split_file import split_names
 
 
 def finding_keys(example_split, **options):

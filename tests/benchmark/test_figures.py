@@ -15,7 +15,7 @@ from morphgen.benchmark.figures import (
     heatmap_png,
     map_png,
 )
-from morphgen.benchmark.similarity import classical_mds
+from morphgen.encoding.similarity import classical_mds
 
 
 def names(n):

@@ -15,9 +15,6 @@ from morphgen.benchmark import generate
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import (
     Bound,
-    ComposedRecipe,
-    RobotFactory,
-    SampledRecipe,
     composition,
     extrapolation,
     interpolation,
@@ -32,15 +29,17 @@ from morphgen.benchmark.regimes import (
     regime_findings,
     structure,
 )
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.similarity import cosine, features
-from morphgen.benchmark.split import Member, Split, compose_member
+from morphgen.encoding.robot_hash import robot_hash
+from morphgen.encoding.similarity import cosine, features
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
 from morphgen.model.findings import Finding
 from morphgen.progress import show_progress
+from morphgen.splits import candidates
+from morphgen.splits.candidates import ComposedRecipe, RobotFactory, SampledRecipe
+from morphgen.splits.split import Member, Split, compose_member
 
 
 def points(members):
@@ -277,7 +276,7 @@ def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
 
 def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
-    monkeypatch.setattr(generate, "check", lambda robot: findings)
+    monkeypatch.setattr(candidates, "check", lambda robot: findings)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
         RobotFactory(LIBRARY)(ComposedRecipe(("base=gantry", "ee=cube")))
 

@@ -9,7 +9,6 @@ from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.generate import RobotFactory
 from morphgen.benchmark.hold_out import (
     held_out_parts,
     hold_out,
@@ -20,11 +19,12 @@ from morphgen.benchmark.hold_out import (
     unique_names,
 )
 from morphgen.benchmark.regimes import parameters, pattern_robots
-from morphgen.benchmark.split import Member, compose_member, split_id
-from morphgen.benchmark.split_file import parse_split, split_text
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
+from morphgen.splits.candidates import RobotFactory
+from morphgen.splits.split import Member, compose_member, split_id
+from morphgen.splits.split_file import parse_split, split_text
 
 ARMS = ("arm3", "arm5", "arm_ed", "lwr")
 EES = ("cube", "cylinder", "plane", "sphere", "stick")

@@ -3,13 +3,7 @@
 import pytest
 
 from helpers.splits import combined
-from morphgen.benchmark.generate import (
-    ComposedRecipe,
-    RobotFactory,
-    SampledRecipe,
-    members,
-    stream_seed,
-)
+from morphgen.benchmark.generate import stream_seed
 from morphgen.benchmark.licences import (
     LICENCES,
     NO_DERIVATIVES,
@@ -22,13 +16,14 @@ from morphgen.benchmark.licences import (
     restricted,
 )
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.split import SIDES
-from morphgen.benchmark.split_file import find_split, read_split, split_names, split_text
 from morphgen.benchmark.survey import statistics
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import pin
+from morphgen.splits.candidates import ComposedRecipe, RobotFactory, SampledRecipe, members
+from morphgen.splits.split import SIDES
+from morphgen.splits.split_file import find_split, read_split, split_names, split_text
 
 LIBRARY = default_library()
 NAMES = [

@@ -14,16 +14,16 @@ import pytest
 
 from helpers.commands import tree
 from helpers.splits import LIBRARY, combined, member, split
-from morphgen.benchmark.split import compose_member
-from morphgen.benchmark.split_file import read_split
 from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split, load_split_folder
-from morphgen.benchmark.tokens import pad_tokens, tokens
+from morphgen.encoding.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import zip_files as npz_files
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
 from morphgen.progress import show_progress
+from morphgen.splits.split import compose_member
+from morphgen.splits.split_file import read_split
 
 LIGHT = BuildSettings(light=True)
 

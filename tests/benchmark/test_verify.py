@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_folder import BuildSettings, build_split
-from morphgen.benchmark.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
+from morphgen.encoding.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.progress import show_progress
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import split_text
 
 LIGHT = BuildSettings(light=True)
 

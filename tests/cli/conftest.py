@@ -7,9 +7,9 @@ import trimesh
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
-from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
 from morphgen.grammar.library import LIBRARY_VARIABLE
+from morphgen.splits.split_file import write_split
 
 
 @pytest.fixture(autouse=True)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from helpers.robots import arm
-from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
 from morphgen.cli.export import SAMPLES
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.fitting import replace_collision as sphere_robot
 from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.files import MANIFEST

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_folder import BuildSettings, build_split
+from morphgen.splits.split_file import split_text
 from morphgen.tasks import free_space
 from morphgen.tasks.registry import TASKS
 

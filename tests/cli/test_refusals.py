@@ -20,12 +20,12 @@ from helpers.robots import arm
 from helpers.runs import RUN, SMALL, small_split
 from helpers.splits import TRAIN, combined, member
 from morphgen import cli
-from morphgen.benchmark.split_file import split_text
 from morphgen.cli.command import whole_number
 from morphgen.cli.export import FORMATS, FileFormat
 from morphgen.errors import MorphgenError
 from morphgen.formats import bundle
 from morphgen.grammar import library
+from morphgen.splits.split_file import split_text
 
 ABBREVIATIONS = {
     "CUBES": "split new interpolation --grammar cubes --train 3",

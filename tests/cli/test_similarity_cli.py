@@ -11,8 +11,8 @@ import pytest
 import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
-from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
-from morphgen.benchmark.tokens import LAYOUT, robot_from_tokens, tokens
+from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
+from morphgen.encoding.tokens import LAYOUT, robot_from_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
 

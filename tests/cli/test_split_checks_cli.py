@@ -8,10 +8,10 @@ import pytest
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member, split
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import PAPER
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import split_names, split_text
 from morphgen.tasks.goals.split_goals import read_goals
 
 

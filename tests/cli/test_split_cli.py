@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from helpers.commands import tree
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import LIBRARY_VARIABLE
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import read_split, split_names
 
 INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")
 COMPOSITION = ("split", "new", "composition", "--from", "base=gantry ee={plane,cube}")

@@ -11,13 +11,13 @@ from msgspec.structs import replace as replaced
 
 from helpers.splits import combined
 from helpers.submissions import data
-from morphgen.benchmark.similarity import MEASURES
-from morphgen.benchmark.split import sided_members, split_id
-from morphgen.benchmark.split_file import read_split, split_text
+from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
+from morphgen.benchmark.scores.episode_table import EPISODES, append_submission, read_table
+from morphgen.benchmark.scores.submission import SplitName
+from morphgen.encoding.similarity import MEASURES
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
-from morphgen.rl.scores.submission import SplitName
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
+from morphgen.splits.split import sided_members, split_id
+from morphgen.splits.split_file import read_split, split_text
 
 STUDY = Path(__file__).parents[2] / "results" / "reach-30m"
 ARM3 = "interpolation/arm3/reach"

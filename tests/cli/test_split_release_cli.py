@@ -10,9 +10,9 @@ import pytest
 
 from helpers.splits import TRAIN, combined, member
 from helpers.submissions import data
-from morphgen.benchmark.split_file import read_split, split_text
+from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
 from morphgen.grammar.library import default_library
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
+from morphgen.splits.split_file import read_split, split_text
 
 RELEASE = ("split", "release", "--light", "--no-goals")
 

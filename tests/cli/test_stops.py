@@ -14,8 +14,8 @@ import pytest
 from helpers.commands import heed_ctrl_c, tree
 from helpers.runs import small_split
 from helpers.simulators import needs_pybullet
-from morphgen.benchmark.split_file import split_text
 from morphgen.formats import files
+from morphgen.splits.split_file import split_text
 
 WRITERS = {
     **{f"export {f}": ["export", "prims", "--format", f] for f in ("urdf", "mjcf", "sdf", "ros2")},

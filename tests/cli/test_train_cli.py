@@ -10,10 +10,10 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.runs import ROLLOUT, RUN, SMALL
+from morphgen.benchmark.scores.episode_table import read_table
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import specs_of
 from morphgen.rl.runs.training import METRICS, read_metrics
-from morphgen.rl.scores.episode_table import read_table
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
 

@@ -8,12 +8,12 @@ import pytest
 
 from helpers.runs import SMALL, small_split
 from helpers.splits import member, split
-from morphgen.benchmark.split import Member
-from morphgen.benchmark.split_file import write_split
 from morphgen.grammar.library import default_library
 from morphgen.rl.runs.checkpoint import read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import FILE, fresh_source, members, read_drawn
 from morphgen.rl.runs.training import read_metrics
+from morphgen.splits.split import Member
+from morphgen.splits.split_file import write_split
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess
 from morphgen.viewer.rollout import training_robots

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morphgen.benchmark import release, split, split_folder
-from morphgen.benchmark.robot_hash import digest, robot_hash
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.benchmark.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
+from morphgen.benchmark import release, split_folder
+from morphgen.benchmark.scores import submission
+from morphgen.encoding.robot_hash import digest, robot_hash
+from morphgen.encoding.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import bundle
 from morphgen.formats.bundle import CARD, write_bundle
@@ -31,8 +30,10 @@ from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
 from morphgen.rl.runs import checkpoint as runs
 from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.robot_source import split_source
-from morphgen.rl.scores import submission
 from morphgen.rl.shipped_policies import POLICIES
+from morphgen.splits import split
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import TASKS
@@ -42,7 +43,7 @@ from morphgen.viewer import episode
 RECORDED = json.loads(Path(__file__).with_name("reference.json").read_text(encoding="utf-8"))
 LIBRARY = default_library()
 TOKEN_STEP = 1e-4
-"""Resolution of the recorded tokens, as of ``morphgen.benchmark.tokens.TOLERANCE``."""
+"""Resolution of the recorded tokens, as of ``morphgen.encoding.tokens.TOLERANCE``."""
 SCORE_TOLERANCE = 1.0
 """Processors differ in the last bits, by which a tool may enter the radius of success a step later.
 A step of an episode counts 0.07 points."""

@@ -2,9 +2,9 @@
 
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.split import compose_member
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
+from morphgen.splits.split import compose_member
 
 LIBRARY = default_library()
 

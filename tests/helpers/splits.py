@@ -1,11 +1,11 @@
 """Small splits that tests write in code."""
 
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import COMPOSED, Member, Split
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
+from morphgen.splits.split import COMPOSED, Member, Split
 
 LIBRARY = default_library()
 

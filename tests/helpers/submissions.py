@@ -5,12 +5,12 @@ import copy
 import msgspec
 
 from helpers.runs import small_split
-from morphgen.benchmark.split import split_id
+from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
+from morphgen.benchmark.scores.submission import FORMAT, KIND, Submission
 from morphgen.errors import BenchmarkError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores.submission import FORMAT, KIND, Submission
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
+from morphgen.splits.split import split_id
 
 SPLIT = small_split()
 PROTOCOL = EvalProtocol(episodes=4)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from helpers.robots import arm
-from morphgen.benchmark.tokens import LAYOUT, tokens
+from morphgen.encoding.tokens import LAYOUT, tokens
 
 FIELDS = {field.name: field.columns for field in LAYOUT}
 

@@ -7,9 +7,7 @@ import pytest
 
 from helpers.grammars import shipped
 from helpers.splits import member, split
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, compose_member
-from morphgen.benchmark.split_file import read_split, split_names, write_split
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import GrammarError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robots
@@ -29,6 +27,8 @@ from morphgen.rl.runs.robot_source import (
     trained_on,
     write_drawn,
 )
+from morphgen.splits.split import Member, compose_member
+from morphgen.splits.split_file import read_split, split_names, write_split
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import GoalConfig
 

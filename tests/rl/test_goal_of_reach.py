@@ -11,7 +11,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.evaluation import eval_config_of, evaluate_baseline
 from morphgen.rl.runs.checkpoint import config_from
 from morphgen.rl.runs.robot_source import other_side
-from morphgen.rl.scores.scores import score_table, scores_to_json
+from morphgen.rl.scores import score_table, scores_to_json
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 

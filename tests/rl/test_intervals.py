@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from morphgen.rl.scores.scores import (
+from morphgen.rl.scores import (
     Interval,
     episode_interval,
     iqm_interval,

@@ -18,7 +18,7 @@ from helpers.observations import (
     observed,
     outputs,
 )
-from morphgen.benchmark.tokens import POSITION
+from morphgen.encoding.tokens import POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.agents import transformer
 from morphgen.rl.agents.encoder import Entities

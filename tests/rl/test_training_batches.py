@@ -19,7 +19,6 @@ from helpers.runs import (
     weights,
 )
 from helpers.splits import member, split
-from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.progress import show_progress
 from morphgen.rl.config import PolicyConfig
@@ -34,6 +33,7 @@ from morphgen.rl.runs.training import (
     train,
     use_batch,
 )
+from morphgen.splits.split_file import read_split, write_split
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS

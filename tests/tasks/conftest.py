@@ -25,12 +25,6 @@ def simulate(opened):
     return lambda *scenes, contacts=None: opened(BulletSimulation(scenes, contacts))
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    """Folder of stored goal sets, which the tests of a process share."""
-    return tmp_path_factory.mktemp("goals")
-
-
 @pytest.fixture(scope="module")
 def body():
     """The arm, with the pairs of its links that always touch."""

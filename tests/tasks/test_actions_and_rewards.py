@@ -10,7 +10,7 @@ import torch
 import morphgen
 from helpers.resets import reset_envs
 from helpers.scenes import robot
-from morphgen.benchmark.tokens import tokens
+from morphgen.encoding.tokens import tokens
 from morphgen.errors import BenchmarkError, RobotError, TaskError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.goal_sets import CONFIG, LIFTED, draw_goals, sample_goals
 from helpers.scenes import robot
-from morphgen.benchmark.similarity import shoulder, workspace
+from morphgen.encoding.similarity import shoulder, workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits

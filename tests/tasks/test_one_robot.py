@@ -11,7 +11,7 @@ import morphgen
 from helpers.robots import arm
 from helpers.scenes import robot
 from helpers.splits import member, split
-from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import CompositionError, FormatError, PartError, TaskError
 from morphgen.formats.fits import has_meshes
 from morphgen.formats.urdf.write import urdf_text

@@ -6,7 +6,7 @@ import pytest
 
 from helpers.pages import field, press
 from helpers.viser_client import PlainClient
-from morphgen.benchmark.split_file import read_split
+from morphgen.splits.split_file import read_split
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.figures import histogram_svg
 from morphgen.viewer.gallery import parse_range

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from helpers.pages import field, nodes, press
-from morphgen.benchmark.split_file import read_split
+from morphgen.splits.split_file import read_split
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.pages import field, nodes, pointer, press
 from helpers.viser_client import PlainClient
-from morphgen.benchmark.split_file import read_split
+from morphgen.splits.split_file import read_split
 from morphgen.viewer.scene.stage import camera_view, project_points
 
 

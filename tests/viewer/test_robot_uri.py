@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.robots import arm
-from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library

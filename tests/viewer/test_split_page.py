@@ -5,8 +5,8 @@ import re
 import pytest
 
 from helpers.pages import field, press
-from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
+from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import parse_address
 from morphgen.viewer.pages.gallery import choose_sides
 from morphgen.viewer.robot_rows import Row

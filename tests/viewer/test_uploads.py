@@ -15,7 +15,7 @@ from PIL import Image
 from helpers.robots import arm
 from helpers.uploads import URDF, archive
 from helpers.viser_client import PlainClient
-from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.model.mesh import mesh_parts

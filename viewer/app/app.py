@@ -13,13 +13,13 @@ from urllib.parse import parse_qsl
 
 import viser
 
-from morphgen.benchmark.split_file import split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
 from morphgen.viewer.app.frame import call

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import viser
 
-from morphgen.benchmark.split import SIDES
-from morphgen.benchmark.split_file import split_names
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.grammar_file import grammar_names
 from morphgen.grammar.robot_set import INDEX
+from morphgen.splits.split import SIDES
+from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session

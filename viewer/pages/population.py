@@ -11,8 +11,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import SIDES
 from morphgen.errors import BenchmarkError
+from morphgen.splits.split import SIDES
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session

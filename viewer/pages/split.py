@@ -9,8 +9,8 @@ from html import escape
 import viser
 
 from morphgen.benchmark.audit import Audit
-from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
-from morphgen.benchmark.split import SIDES, Member, Split, split_id
+from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
+from morphgen.splits.split import SIDES, Member, Split, split_id
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session

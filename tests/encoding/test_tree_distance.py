@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.similarity import (
+from morphgen.encoding.similarity import (
     FIXED,
     change_costs,
     edit_distance,

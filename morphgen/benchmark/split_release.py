@@ -6,6 +6,7 @@ See ``morphgen.benchmark.release`` for the files. The same inputs give the same 
 from __future__ import annotations
 
 import hashlib
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.audit import Audit, audit_survey
+from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.benchmark.licences import licence_ids, licenced_parts, require_allowed
 from morphgen.benchmark.release import (
     CROISSANT_FILE,
@@ -28,7 +30,6 @@ from morphgen.benchmark.release import (
     licences_text,
     release_text,
 )
-from morphgen.benchmark.split import Split, split_id
 from morphgen.benchmark.split_folder import (
     BUNDLED,
     README_FILE,
@@ -39,6 +40,7 @@ from morphgen.benchmark.split_folder import (
     read_sums,
     split_folder_path,
     sums_text,
+    writing_split,
 )
 from morphgen.benchmark.survey import (
     DIGITS,
@@ -50,18 +52,24 @@ from morphgen.benchmark.survey import (
     survey_split,
 )
 from morphgen.errors import BenchmarkError
-from morphgen.formats.files import file_sha256, write_atomic, writing
+from morphgen.formats.files import (
+    file_sha256,
+    locked_folder,
+    replacing_folder,
+    write_atomic,
+    writing,
+)
 from morphgen.formats.records import read_record
 from morphgen.formats.zip_files import write_zip
 from morphgen.grammar.library import Library
-from morphgen.tasks.goals.eval_protocol import EvalProtocol
+from morphgen.splits.split import Split, split_id
 from morphgen.tasks.goals.split_goals import (
     GOALS,
     GoalResult,
+    goal_files,
     has_goals,
     require_goal_sets,
     sample_split_goals,
-    write_goals,
 )
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -88,6 +96,33 @@ def build_with_goals(
     if goals:
         write_goals(report.folder, goals, config or GoalConfig())
     return report
+
+
+def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
+    """Write the goal sets of a split into the folder where it is built; return their folder.
+
+    The checksums of the split are updated, and earlier sets replaced.
+    """
+    require_goal_sets(results)
+    folder = home / GOALS
+    files = dict(goal_files(results, config))
+    read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
+    with writing_split(home), locked_folder(home):
+        sums = read_sums(home / SUMS_FILE)
+        (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
+        for leftover in home.glob(f".{GOALS}.*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        with replacing_folder(folder) as partial:
+            for name, content in files.items():
+                (partial / name).parent.mkdir(exist_ok=True)
+                (partial / name).write_bytes(content)
+        sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
+        sums |= {
+            f"{GOALS}/{name}": hashlib.sha256(content).hexdigest()
+            for name, content in files.items()
+        }
+        write_atomic(home / SUMS_FILE, sums_text(sums))
+    return folder
 
 
 @dataclass(frozen=True)

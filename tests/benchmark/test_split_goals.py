@@ -15,15 +15,16 @@ import pytest
 from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark import split_release
 from morphgen.benchmark.split_folder import BuildSettings, build_split, load_split_folder
+from morphgen.benchmark.split_release import write_goals
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks import free_space
 from morphgen.tasks.goals import goal_sets as packaged_sets
-from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import (
     FOLDER,
     INDEX,
@@ -40,7 +41,6 @@ from morphgen.tasks.goals.split_goals import (
     read_goals,
     read_split_goals,
     sample_robot_goals,
-    write_goals,
 )
 from morphgen.tasks.goals.split_goals import sample_split_goals as make
 from morphgen.tasks.push.config import PushConfig
@@ -267,7 +267,7 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(split_goals, "sums_text", interrupted)
+        patched.setattr(split_release, "sums_text", interrupted)
         with pytest.raises(KeyboardInterrupt):
             write_goals(home, member_sets, RECIPE)
     with pytest.raises(BenchmarkError, match="is not finished"):

@@ -1,7 +1,8 @@
 """A submission: the outcome of every episode of one policy on a split, as JSON.
 
-Scores are not part of it: ``morphgen.rl.scores.leaderboard`` computes them from the episodes. Lists
-of a robot have an entry per episode, in the order of the evaluation, which the seed determines.
+Scores are not part of it: ``morphgen.benchmark.scores.leaderboard`` computes them from the
+episodes. Lists of a robot have an entry per episode, in the order of the evaluation, which the seed
+determines.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from morphgen.benchmark.split import Split, split_id
+from morphgen.benchmark.eval_protocol import EvalProtocol, ExpectedRobot
 from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_file
 from morphgen.formats.records import Record, dotted_values, read_record
-from morphgen.rl.scores.scores import Count, Name, RobotOutcomes, Score
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, ExpectedRobot
+from morphgen.rl.scores import Count, Name, RobotOutcomes, Score
+from morphgen.splits.split import Split, split_id
 from morphgen.tasks.registry import TASKS
 
 FORMAT = 1
@@ -36,7 +37,7 @@ class SplitName(Record, frozen=True):
     """The split that a submission is for."""
 
     name: Name
-    id: Name  # id of the split, see `morphgen.benchmark.split.split_id`
+    id: Name  # id of the split, see `morphgen.splits.split.split_id`
 
 
 class Training(Record, frozen=True):
@@ -58,7 +59,7 @@ class Submission(Record, frozen=True):
     training_seed: Seed | None  # seed of the training; None for a baseline
     morphgen: Name  # version of morphgen that ran the episodes
     split: SplitName
-    evaluation: dict[str, Any]  # rules of the evaluation, see `morphgen.tasks.goals.eval_protocol`
+    evaluation: dict[str, Any]  # rules of the evaluation, see `morphgen.benchmark.eval_protocol`
     robots: tuple[RobotOutcomes, ...]
     training: Training | None = None  # how the policy was trained, if it is known
     config: dict[str, Any] | None = None

@@ -10,8 +10,7 @@ import trimesh
 from helpers.faulty_robots import with_joint, with_link
 from helpers.robots import arm
 from helpers.splits import member
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, Split, compose_member, compose_side, split_id
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, GrammarError, PartError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
@@ -19,6 +18,7 @@ from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape
 from morphgen.model.robot import Frame, Inertial, Mimic
 from morphgen.model.tree import rename
+from morphgen.splits.split import Member, Split, compose_member, compose_side, split_id
 
 LIBRARY = default_library()
 

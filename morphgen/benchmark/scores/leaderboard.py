@@ -18,15 +18,23 @@ import msgspec
 import numpy as np
 from tabulate import tabulate
 
+from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
-from morphgen.benchmark.split import SIDES, Side, Split, split_id
+from morphgen.benchmark.scores.episode_table import EPISODES, name_of, read_submissions, read_table
+from morphgen.benchmark.scores.submission import (
+    Submission,
+    check_submission,
+    read_submission,
+    require_comparable,
+    require_same_random,
+    submission_text,
+)
 from morphgen.benchmark.survey import BaselineResult, BaselineResults
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.library import Library
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.scores.episode_table import EPISODES, name_of, read_submissions, read_table
-from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
-from morphgen.rl.scores.scores import (
+from morphgen.rl.scores import SIDES as SIDE_NAMES
+from morphgen.rl.scores import (
     Interval,
     RandomScores,
     RobotOutcomes,
@@ -36,15 +44,7 @@ from morphgen.rl.scores.scores import (
     score_decimals,
     success_interval,
 )
-from morphgen.rl.scores.submission import (
-    Submission,
-    check_submission,
-    read_submission,
-    require_comparable,
-    require_same_random,
-    submission_text,
-)
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, expected_robots
+from morphgen.splits.split import SIDES, Side, Split, split_id
 from morphgen.tasks.registry import TASKS
 
 Source = Literal["submission", "reference"]

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.commands import tree
-from morphgen.benchmark.split import Member, Split, split_id
-from morphgen.benchmark.split_file import (
+from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.splits.split import Member, Split, split_id
+from morphgen.splits.split_file import (
     find_split,
     parse_split,
     read_split,
@@ -20,7 +21,6 @@ from morphgen.benchmark.split_file import (
     split_text,
     write_split,
 )
-from morphgen.errors import BenchmarkError, MorphgenError
 
 DERIVATION = "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size=0.1, thickness=0.01)]]"
 

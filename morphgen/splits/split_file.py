@@ -15,12 +15,12 @@ import msgspec
 import yaml
 from msgspec import Meta
 
-from morphgen.benchmark.robot_hash import HASH_LENGTH
-from morphgen.benchmark.split import FORMAT, SIDES, Member, Regime, Split, split_id
+from morphgen.encoding.robot_hash import HASH_LENGTH
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.formats.data_files import parse_yaml, read_text
 from morphgen.formats.files import write_atomic, writing
 from morphgen.formats.records import Record, read_record
+from morphgen.splits.split import FORMAT, SIDES, Member, Regime, Split, split_id
 
 MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
 """Keys of a robot, in order."""
@@ -195,7 +195,7 @@ def is_split_name(name: str) -> bool:
 
 
 def _shipped() -> Path:
-    return Path(str(files("morphgen.benchmark"))) / "splits"
+    return Path(str(files("morphgen.splits")))
 
 
 def _block(key: str, value: Mapping[str, object]) -> str:

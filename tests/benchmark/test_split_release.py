@@ -13,6 +13,7 @@ from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark import release as release_module
 from morphgen.benchmark import verify as release_checks
+from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.benchmark.release import (
     CROISSANT_FILE,
     DIFFICULTY_FILE,
@@ -21,7 +22,6 @@ from morphgen.benchmark.release import (
     opened_folder,
     read_release,
 )
-from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_folder import (
     SUMS_FILE,
     BuildSettings,
@@ -29,13 +29,13 @@ from morphgen.benchmark.split_folder import (
     read_sums,
     sums_text,
 )
+from morphgen.benchmark.split_release import ReleaseRequest, release_split
 from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
 from morphgen.grammar.library import default_library
-from morphgen.tasks.goals.eval_protocol import EvalProtocol
-from morphgen.tasks.goals.split_release import ReleaseRequest, release_split
+from morphgen.splits.split import split_id
 
 LIBRARY = default_library()
 LIGHT = ReleaseRequest(

@@ -16,15 +16,19 @@ from typing import Any
 import numpy as np
 from tabulate import tabulate
 
-from morphgen.benchmark.split import SIDES, Side
-from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.scores.episode_table import name_of
+from morphgen.benchmark.scores.study import Cell, stored_results
+from morphgen.benchmark.scores.submission import (
+    Submission,
+    require_comparable,
+    require_same_random,
+)
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import write_file
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.runs.training import read_metrics, subruns_of
-from morphgen.rl.scores.episode_table import name_of
-from morphgen.rl.scores.scores import SIDES as SIDE_NAMES
-from morphgen.rl.scores.scores import (
+from morphgen.rl.scores import SIDES as SIDE_NAMES
+from morphgen.rl.scores import (
     UNSTABLE,
     Interval,
     RobotOutcomes,
@@ -35,12 +39,8 @@ from morphgen.rl.scores.scores import (
     stratified_mean_interval,
     success_interval,
 )
-from morphgen.rl.scores.study import Cell, stored_results
-from morphgen.rl.scores.submission import (
-    Submission,
-    require_comparable,
-    require_same_random,
-)
+from morphgen.splits.split import SIDES, Side
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.typing import Array
 
 TABLE, DATA, CURVES = "table.md", "results.json", "curves.png"

@@ -15,7 +15,15 @@ from typing import Any
 import msgspec
 from filelock import FileLock, Timeout
 
-from morphgen.benchmark.split import Side, Split, split_id
+from morphgen.benchmark.eval_protocol import rules_data
+from morphgen.benchmark.scores.episode_table import (
+    EPISODES,
+    append_submission,
+    mode_of,
+    name_of,
+    read_table,
+)
+from morphgen.benchmark.scores.submission import Submission, Training, make_submission
 from morphgen.errors import MorphgenError, TaskError
 from morphgen.formats.files import LOCK
 from morphgen.processes import ray_cluster, require_ray
@@ -33,16 +41,8 @@ from morphgen.rl.runs.checkpoint import (
 )
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, split_of, tasks_of
 from morphgen.rl.runs.training import ExecutionConfig, ShowMetrics, Subrun, finetuning_config, train
-from morphgen.rl.scores.episode_table import (
-    EPISODES,
-    append_submission,
-    mode_of,
-    name_of,
-    read_table,
-)
-from morphgen.rl.scores.scores import Score
-from morphgen.rl.scores.submission import Submission, Training, make_submission
-from morphgen.tasks.goals.eval_protocol import rules_data
+from morphgen.rl.scores import Score
+from morphgen.splits.split import Side, Split, split_id
 from morphgen.tasks.registry import evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig
 

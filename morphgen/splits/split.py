@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Literal
 
-from morphgen.benchmark.robot_hash import digest, robot_hash
-from morphgen.benchmark.tokens import LARGEST_MAX_LINKS, MAX_LINKS
+from morphgen.encoding.robot_hash import digest, robot_hash
+from morphgen.encoding.tokens import LARGEST_MAX_LINKS, MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
@@ -50,7 +50,7 @@ class Member:
     obstacles: bool
     """The scene has obstacles."""
     robot_hash: str
-    """Hash of the composed robot, see ``morphgen.benchmark.robot_hash``; ``body`` in files."""
+    """Hash of the composed robot, see ``morphgen.encoding.robot_hash``; ``body`` in files."""
 
     def as_dict(self) -> dict[str, object]:
         """Return the member under the keys of the file, for JSON."""

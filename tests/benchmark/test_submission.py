@@ -7,14 +7,14 @@ import pytest
 
 from helpers.runs import small_source, small_split
 from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, TEST, VERSION, changed, data, submission
-from morphgen.benchmark.split import split_id
-from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.rl.scores.submission import (
+from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
+from morphgen.benchmark.scores.submission import (
     check_submission,
     read_submission,
     submission_text,
 )
-from morphgen.tasks.goals.eval_protocol import EvalProtocol, protocol_from
+from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.splits.split import split_id
 
 
 def check(values):

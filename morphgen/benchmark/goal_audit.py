@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.audit import Audit
-from morphgen.benchmark.robot_hash import robot_hash
-from morphgen.benchmark.split import Member, Side, Split, sided_members
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import parallel_map
+from morphgen.splits.split import Member, Side, Split, sided_members
 from morphgen.tasks.goals.goal_sets import arrays_of
 from morphgen.tasks.goals.split_goals import (
     GoalResult,

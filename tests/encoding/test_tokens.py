@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from helpers.robots import arm
 from helpers.tokens import arm_tokens, field_of, shapes_of
-from morphgen.benchmark.tokens import (
+from morphgen.encoding.tokens import (
     LAYOUT,
     MAX_LINKS,
     TOKEN_SIZE,

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, bootstrap, trim_mean
 from tabulate import tabulate
 
-from morphgen.benchmark.split import Side
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.formats.records import FiniteNumber, Record
+from morphgen.splits.split import Side
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 

@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 from helpers.submissions import BASELINE, SPLIT, data
-from morphgen.benchmark.split import split_id
-from morphgen.benchmark.split_file import read_split
-from morphgen.errors import BenchmarkError
-from morphgen.rl.scores import episode_table
-from morphgen.rl.scores.episode_table import (
+from morphgen.benchmark.scores import episode_table
+from morphgen.benchmark.scores.episode_table import (
     COLUMNS,
     EPISODES,
     append_submission,
@@ -21,8 +18,11 @@ from morphgen.rl.scores.episode_table import (
     read_submissions,
     read_table,
 )
-from morphgen.rl.scores.score_tables import result_rows, result_tables
-from morphgen.rl.scores.submission import submission_from
+from morphgen.benchmark.scores.score_tables import result_rows, result_tables
+from morphgen.benchmark.scores.submission import submission_from
+from morphgen.errors import BenchmarkError
+from morphgen.splits.split import split_id
+from morphgen.splits.split_file import read_split
 
 TRAINING = {"simulator": "warp", "transitions": 30_000_000}
 

@@ -8,8 +8,8 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.audit import audit
+from morphgen.benchmark.goal_audit import NEAR, audit_goals, with_goal_findings
 from morphgen.model.geometry import Pose
-from morphgen.tasks.goals.goal_audit import NEAR, audit_goals, with_goal_findings
 from morphgen.tasks.goals.split_goals import SplitGoals, sample_split_goals
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig

@@ -19,12 +19,10 @@ from helpers.submissions import (
     data,
     submission,
 )
-from morphgen.benchmark.survey import BaselineResult
-from morphgen.errors import BenchmarkError
-from morphgen.grammar.library import default_library
-from morphgen.rl.scores import leaderboard
-from morphgen.rl.scores.episode_table import EPISODES, append_submission
-from morphgen.rl.scores.leaderboard import (
+from morphgen.benchmark.eval_protocol import EvalProtocol
+from morphgen.benchmark.scores import leaderboard
+from morphgen.benchmark.scores.episode_table import EPISODES, append_submission
+from morphgen.benchmark.scores.leaderboard import (
     References,
     Row,
     SideScore,
@@ -38,9 +36,11 @@ from morphgen.rl.scores.leaderboard import (
     score_submission,
     study_results,
 )
-from morphgen.rl.scores.scores import Interval, stratified_mean_interval, success_interval
-from morphgen.rl.scores.submission import require_same_random
-from morphgen.tasks.goals.eval_protocol import EvalProtocol
+from morphgen.benchmark.scores.submission import require_same_random
+from morphgen.benchmark.survey import BaselineResult
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.library import default_library
+from morphgen.rl.scores import Interval, stratified_mean_interval, success_interval
 
 LIBRARY = default_library()
 

@@ -16,17 +16,10 @@ from PIL import Image
 import morphgen
 from helpers.commands import tree
 from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
-from morphgen.errors import TaskError
-from morphgen.formats.files import LOCK
-from morphgen.rl.inference import MODES
-from morphgen.rl.runs.checkpoint import CHECKPOINT
-from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
-from morphgen.rl.runs.training import METRICS, subruns_of
-from morphgen.rl.scores import study
-from morphgen.rl.scores.episode_table import EPISODES, append_submission, read_table
-from morphgen.rl.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables
-from morphgen.rl.scores.scores import UNSTABLE, iqm_interval, relative_scores
-from morphgen.rl.scores.study import (
+from morphgen.benchmark.scores import study
+from morphgen.benchmark.scores.episode_table import EPISODES, append_submission, read_table
+from morphgen.benchmark.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables
+from morphgen.benchmark.scores.study import (
     agent_cell,
     baseline_cells,
     matched_budget,
@@ -35,6 +28,13 @@ from morphgen.rl.scores.study import (
     run_cells_on_ray,
     stored_results,
 )
+from morphgen.errors import TaskError
+from morphgen.formats.files import LOCK
+from morphgen.rl.inference import MODES
+from morphgen.rl.runs.checkpoint import CHECKPOINT
+from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
+from morphgen.rl.runs.training import METRICS, subruns_of
+from morphgen.rl.scores import UNSTABLE, iqm_interval, relative_scores
 
 pytestmark = pytest.mark.slow
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from morphgen.benchmark.split import SIDES, Member, Side, Split
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.kinematics import reach
 from morphgen.processes import parallel_map
+from morphgen.splits.split import SIDES, Member, Side, Split
 from morphgen.tasks.goals.goal_sets import goal_set_key
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import (

@@ -22,10 +22,7 @@ from typing import Any
 import msgspec
 from filelock import FileLock
 
-from morphgen.errors import BenchmarkError
-from morphgen.formats.data_files import parse_json, read_bytes
-from morphgen.formats.files import LOCK, write_atomic
-from morphgen.rl.scores.submission import (
+from morphgen.benchmark.scores.submission import (
     LISTS,
     MAX_EPISODES,
     Submission,
@@ -35,6 +32,9 @@ from morphgen.rl.scores.submission import (
     require_full_lists,
     submission_from,
 )
+from morphgen.errors import BenchmarkError
+from morphgen.formats.data_files import parse_json, read_bytes
+from morphgen.formats.files import LOCK, write_atomic
 
 EPISODES = "episodes.csv.gz"  # name of the table in the folder of a study
 RUN = ("split", "method", "mode", "training_seed", "finetuned")

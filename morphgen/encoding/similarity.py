@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.benchmark.tokens import MAX_LINKS, POSITION, tokens
+from morphgen.encoding.tokens import MAX_LINKS, POSITION, tokens
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import bounding_box

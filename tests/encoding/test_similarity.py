@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.similarity import (
+from morphgen.encoding.similarity import (
     MEASURES,
     classical_mds,
     cosine,
@@ -24,7 +24,7 @@ from morphgen.benchmark.similarity import (
     workspace,
     workspace_overlap,
 )
-from morphgen.benchmark.tokens import pad_tokens, tokens
+from morphgen.encoding.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Mesh, Pose, Shape

@@ -1,0 +1,1 @@
+"""Scores on splits: episodes, studies, tables, submissions and leaderboards."""

@@ -1,0 +1,1 @@
+"""Splits: robots and tasks to train and to test on, their files, and those that are shipped."""

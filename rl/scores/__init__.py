@@ -1,1 +1,0 @@
-"""Scores of policies: evaluations, studies, tables and submissions."""
