@@ -32,16 +32,18 @@ from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
-from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    frame_pose,
+    movable_positions,
+    random_configurations,
+)
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
     TOOL,
     Frame,
-    Inertial,
     Joint,
-    Link,
     Mimic,
     Robot,
 )
@@ -418,15 +420,11 @@ def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, l
     coupling, _ = robot.mimic_map
     samples = q[: len(reading.forces)]  # forces and inertia are read in the first ones only
     forces = np.array([gravity_load(robot, configuration) for configuration in samples])
-    bounded = _with_bounds(robot)
     M = np.array([mass_matrix(robot, configuration) for configuration in samples])
-    added = np.array([mass_matrix(bounded, configuration) for configuration in samples]) - M
-    # No entry of a positive semidefinite matrix exceeds the geometric mean of its diagonal ones.
-    bounds = np.sqrt(np.maximum(np.einsum("nii->ni", added), 0.0))
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", M), MIN_INERTIA))
     force_errors = np.abs(reading.forces[:, order] - forces)
     read_M = coupling.T @ reading.inertia[:, order][:, :, order] @ coupling
-    differences = np.abs(read_M - M) - bounds[:, :, None] * bounds[:, None, :]
+    differences = np.abs(read_M - M) - _added_inertia(robot, samples)
     inertia_errors = np.maximum(differences, 0.0) / (scale[:, :, None] * scale[:, None, :])
     gravity_error, inertia_error = float(force_errors.max()), float(inertia_errors.max())
     faults = []
@@ -445,27 +443,18 @@ def _dynamics(robot: Robot, reading: Reading, q: Array) -> tuple[float, float, l
     return gravity_error, inertia_error, faults
 
 
-def _with_bounds(robot: Robot) -> Robot:
-    """Return a robot with the masses that MuJoCo may add to links without mass, and to frames.
+def _added_inertia(robot: Robot, q: Array) -> float:
+    """Return the most that MuJoCo adds to joint-space inertia for links without mass, and frames.
 
-    They are the whole inertia of a joint that carries nothing else. A body without ``<inertial>``
-    of an MJCF has its centre at the position of the body in its parent (MuJoCo 4.0), the URDF's at
-    its origin: there is a mass for each.
+    Each may get ``BOUND_MASS`` and ``BOUND_INERTIA``, at most two poses of the tree from an axis.
     """
-    least = Inertial(
-        BOUND_MASS, inertia=(BOUND_INERTIA, 0.0, 0.0, BOUND_INERTIA, 0.0, BOUND_INERTIA)
-    )
-    places = [(frame.link, frame.T_link_frame) for frame in robot.frames]
-    for i, link in enumerate(robot.links):
-        if link.inertial is None or link.inertial.mass == 0:
-            at = robot.joints[i - 1].T_parent_joint.position if i else (0.0, 0.0, 0.0)
-            places += [(link.name, Pose()), (link.name, Pose(at))]
-    bodies = [Link(f"bound {i}", least) for i in range(len(places))]
-    joints = [
-        Joint(f"to {body.name}", "fixed", link, body.name, T)
-        for body, (link, T) in zip(bodies, places, strict=True)
-    ]
-    return replace(robot, links=(*robot.links, *bodies), joints=(*robot.joints, *joints), frames=())
+    T_root_link = forward_kinematics(robot, q)
+    lengths = [np.linalg.norm(frame.T_link_frame.position) for frame in robot.frames]
+    size = np.linalg.norm(T_root_link[..., :3, 3], axis=-1).max() + max(lengths, default=0.0)
+    gains = np.maximum(np.abs(robot.mimic_map[0]).sum(axis=0), 1.0).max(initial=1.0)
+    count = len(robot.links) + len(robot.frames)
+    inertia = BOUND_INERTIA + BOUND_MASS * max(1.0, 4 * size**2)
+    return float(gains**2 * count * inertia)
 
 
 def _refused(
