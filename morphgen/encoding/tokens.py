@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.arguments import whole_number
-from morphgen.errors import BenchmarkError, nearest
+from morphgen.errors import BenchmarkError, RobotError, nearest
 from morphgen.formats.rounding import as_written
 from morphgen.model import rotation
 from morphgen.model.geometry import (
@@ -22,13 +22,11 @@ from morphgen.model.geometry import (
     Cylinder,
     Geometry,
     Pose,
-    Primitive,
     Shape,
     Sphere,
 )
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Frame, Joint, JointKind, Link, Robot
-from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
 TOKEN_SIZE = 48
@@ -164,14 +162,7 @@ def encode_position(x: Array) -> Array:
 def decode_position(numbers: Array) -> float:
     """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2]."""
     # The lowest frequency is the only one that is unique over [-2, 2].
-    x = math.atan2(numbers[0], numbers[len(FREQUENCIES)]) / (math.pi / 2)
-    error = np.abs(encode_position(np.array(x)) - numbers)
-    if error.max() > TOLERANCE:
-        worst = int(error.argmax())
-        raise ValueError(
-            f"number {worst} is {numbers[worst]:g}, but the first frequency says x = {x:g}"
-        )
-    return x
+    return math.atan2(numbers[0], numbers[len(FREQUENCIES)]) / (math.pi / 2)
 
 
 def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
@@ -193,62 +184,13 @@ def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
     return (*_one_hot(kind, SHAPES), *sizes)
 
 
-def decode_primitive(numbers: Array) -> Primitive | None:
-    """Decode the 6 numbers of ``geometry``; None if they are zeros."""
-    if not numbers.any():
-        return None
-    kind = SHAPES[_hot_index(numbers[:3], SHAPES)]
-    x, y, z = sizes = numbers[3:].tolist()
-    _require_sizes(sizes)
-    if kind == "box":
-        return Box((x, y, z))
-    equal = sizes if kind == "sphere" else sizes[:2]
-    if max(equal) - min(equal) > TOLERANCE * max(equal):
-        raise ValueError(f"a {kind} has {len(equal)} times its radius, not {_format(equal)}")
-    return Sphere(x) if kind == "sphere" else Cylinder(x, z)
-
-
 def encode_pose(pose: Pose) -> tuple[float, ...]:
     """Encode a pose as its position [m] and its quaternion (w, x, y, z) with w >= 0."""
     return (*pose.position, *rotation.normalize(pose.quaternion))
 
 
-def decode_pose(numbers: Array) -> Pose:
-    """Decode the 7 numbers of a pose."""
-    x, y, z, w, a, b, c = numbers.tolist()
-    norm = math.hypot(w, a, b, c)
-    if abs(norm - 1) > TOLERANCE:
-        raise ValueError(f"the quaternion {_format((w, a, b, c))} is of length {norm:g}, not 1")
-    return Pose((x, y, z), rotation.normalize((w, a, b, c)))
-
-
-def decode_axis(numbers: Array) -> Vec3:
-    """Decode the 3 numbers of ``joint axis``."""
-    x, y, z = numbers.tolist()
-    length = math.hypot(x, y, z)
-    if abs(length - 1) > TOLERANCE:
-        raise ValueError(f"the axis {_format((x, y, z))} is of length {length:g}, not 1")
-    return (x, y, z)
-
-
-def decode_flag(numbers: Array) -> bool:
-    """Decode the 4 numbers of ``end-effector``."""
-    flag = numbers[0] > 0.5
-    if np.abs(numbers - flag).max() > TOLERANCE:
-        raise ValueError(f"{_format(numbers.tolist())} is neither four times 0 nor four times 1")
-    return bool(flag)
-
-
 def _one_hot(name: str, names: Sequence[str]) -> tuple[float, ...]:
     return tuple(float(name == other) for other in names)
-
-
-def _hot_index(numbers: Array, names: Sequence[str]) -> int:
-    """Return the index that a one-hot code selects."""
-    hot = int(numbers.argmax())
-    if np.abs(numbers - np.eye(len(names))[hot]).max() > TOLERANCE:
-        raise ValueError(f"{_format(numbers.tolist())} is not one-hot over [{', '.join(names)}]")
-    return hot
 
 
 def _require_sizes(sizes: Sequence[float]) -> None:
@@ -258,9 +200,6 @@ def _require_sizes(sizes: Sequence[float]) -> None:
 
 def _format(numbers: Sequence[float]) -> str:
     return f"[{', '.join(f'{number:g}' for number in numbers)}]"
-
-
-T = TypeVar("T")
 
 
 def tokens(
@@ -361,31 +300,55 @@ def robot_from_tokens(
         raise BenchmarkError(f"{what}: shape {table.shape}; expected (n_links, {TOKEN_SIZE})")
     require_max_links(len(table), what, max_links)
     require_finite(table, what, [str(i) for i in range(len(table))])
-    link_tokens = [_Token(what, i, numbers) for i, numbers in enumerate(table)]
-    for token in link_tokens:
-        _require_index(token, max_links - 1)
-    parents = [_read_parent(token, max_links - 1) for token in link_tokens]
-    shapes = {}
-    for token in link_tokens:
-        if primitive := token.decode(GEOMETRY, decode_primitive):
-            pose = token.decode(SHAPE_POSE, decode_pose)
-            shapes[f"link{token.index}"] = Shape(primitive, pose)
-        else:
-            token.require_zeros(SHAPE_POSE, why="the link has no geometry")
-    tools = [token for token in link_tokens if token.decode(TOOL_FLAG, decode_flag)]
-    if len(tools) > 1:
-        raise tools[1].error(TOOL_FLAG, f"link {tools[0].index} is flagged, too; only one can")
-    _require_base(link_tokens[0])
-    joints = [_read_joint(token, parents[token.index]) for token in link_tokens[1:]]
-    names = [f"link{token.index}" for token in link_tokens]
+    wrong = np.abs(table[:, INDEX.start] * (max_links - 1) - np.arange(len(table))) > TOLERANCE
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise BenchmarkError(
+            f"{what}: link {i}: {INDEX.name}: {table[i, INDEX.start]:g}, not {i}/{max_links - 1}: "
+            f"made with another max_links than {max_links}, padded, or out of order"
+        )
+    shapes: dict[str, Shape] = {}
+    joints: list[Joint] = []
+    for i, row in enumerate(table):
+        try:
+            if row[GEOMETRY.columns].any():
+                shapes[f"link{i}"] = _read_shape(row)
+            if i:
+                joints.append(_read_joint(row, i, max_links))
+        except (ValueError, RobotError) as error:
+            raise BenchmarkError(f"{what}: link {i}: {error}") from error
+    names = [f"link{i}" for i in range(len(table))]
+    tool = np.flatnonzero(table[:, TOOL_FLAG.start] > 0.5)[:1].tolist()
+    positions = table[1:, POSITION.columns]
     robot = Robot(
         name,
         tuple(Link(n, collisions=(shapes[n],) if n in shapes else ()) for n in names),
-        tuple(joint for joint, _ in joints),
-        tuple(Frame(TOOL, names[token.index]) for token in tools),
-        tuple(q for joint, q in joints if joint.is_movable),
+        tuple(joints),
+        tuple(Frame(TOOL, names[i]) for i in tool),
+        tuple(
+            decode_position(code)
+            for joint, code in zip(joints, positions, strict=True)
+            if joint.is_movable
+        ),
     )
+    _require_same(robot, shapes, table, what, max_links)
     return robot, shapes
+
+
+def _require_same(
+    robot: Robot, shapes: Mapping[str, Shape], table: Array, what: str, max_links: int
+) -> None:
+    """Require that a decoded robot has the tokens it was decoded from: nothing in them is lost."""
+    expected = tokens(robot, shapes, max_links=max_links)
+    wrong = np.argwhere(np.abs(expected - table) > TOLERANCE)
+    if len(wrong):
+        row, column = wrong[0].tolist()
+        field = next(field for field in LAYOUT if column < field.columns.stop)
+        raise BenchmarkError(
+            f"{what}: link {row}: {field.name}: number {column - field.start} of "
+            f"{_format(table[row, field.columns].tolist())} is invalid; expected "
+            f"{expected[row, column]:g}"
+        )
 
 
 def _write_joint(row: Array, joint: Joint | None) -> None:
@@ -398,68 +361,33 @@ def _write_joint(row: Array, joint: Joint | None) -> None:
         row[AXIS.columns] = joint.unit_axis
 
 
-@dataclass(frozen=True, eq=False)
-class _Token:
-    """The token of one link, with what its error messages name."""
-
-    what: str  # name of the tokens, for messages
-    index: int  # row of the token, and index of its link
-    numbers: Array  # the numbers of the token, shape (48,)
-
-    def decode(self, field: Field, decode: Callable[[Array], T]) -> T:
-        """Decode a field."""
-        try:
-            return decode(self.numbers[field.columns])
-        except ValueError as error:
-            raise self.error(field, str(error)) from error
-
-    def error(self, field: Field, why: str) -> BenchmarkError:
-        return BenchmarkError(f"{self.what}: link {self.index}: {field.name}: {why}")
-
-    def require_zeros(self, *fields: Field, why: str) -> None:
-        """Require that fields are zero; ``why`` gives the reason in the error."""
-        for field in fields:
-            if np.abs(self.numbers[field.columns]).max() > TOLERANCE:
-                raise self.error(field, f"it is not zero, but {why}")
+def _read_shape(row: Array) -> Shape:
+    """Decode the geometry of a link and its pose."""
+    kind, sizes = row[GEOMETRY.columns][:3], row[GEOMETRY.columns][3:].tolist()
+    _require_sizes(sizes)
+    x, y, z = sizes
+    primitive = (Sphere(x), Cylinder(x, z), Box((x, y, z)))[int(kind.argmax())]
+    return Shape(primitive, _read_pose(row[SHAPE_POSE.columns]))
 
 
-def _require_index(token: _Token, scale: int) -> None:
-    index = float(token.numbers[INDEX.start])
-    if abs(index * scale - token.index) > TOLERANCE:
-        raise token.error(
-            INDEX,
-            f"{index:g}, not {token.index}/{scale}: made with another max_links than {scale + 1}, "
-            "padded, or out of order",
+def _read_pose(numbers: Array) -> Pose:
+    x, y, z, *quaternion = numbers.tolist()
+    return Pose((x, y, z), rotation.normalize(quaternion))
+
+
+def _read_joint(row: Array, i: int, max_links: int) -> Joint:
+    """Decode the joint that attaches a link to one that precedes it."""
+    value = float(row[PARENT.start])
+    parent = round(value * (max_links - 1))
+    if not 0 <= parent < i:
+        raise ValueError(
+            f"{PARENT.name}: {value:g} makes no tree; expected k/{max_links - 1}, k < {i}"
         )
-
-
-def _read_parent(token: _Token, scale: int) -> int:
-    """Decode the index of a link's parent, which precedes the link."""
-    value = float(token.numbers[PARENT.start])
-    parent = round(value * scale)
-    first, last = (0, token.index - 1) if token.index else (-1, -1)
-    if abs(value * scale - parent) > TOLERANCE or not first <= parent <= last:
-        valid = f"k/{scale}, k = {first} ... {last}" if first < last else f"{first}/{scale}"
-        raise token.error(PARENT, f"{value:g} makes no tree; expected {valid}")
-    return parent
-
-
-def _require_base(token: _Token) -> None:
-    joint, _ = _read_joint(token, -1)
-    if joint.is_movable:
-        raise token.error(KIND, f"{joint.kind}, but the base is fixed")
-    if not np.allclose(joint.T_parent_joint.matrix, np.eye(4), rtol=0, atol=TOLERANCE):
-        raise token.error(ORIGIN, "the base has no parent; expected [0, 0, 0, 1, 0, 0, 0]")
-
-
-def _read_joint(token: _Token, parent: int) -> tuple[Joint, float]:
-    """Decode the joint that attaches a link, and its position."""
-    kind = token.decode(KIND, lambda numbers: KINDS[_hot_index(numbers, KINDS)])
-    name, child = f"joint{token.index}", f"link{token.index}"
-    origin = token.decode(ORIGIN, decode_pose)
+    kind = KINDS[int(row[KIND.columns].argmax())]
+    ends = f"joint{i}", kind, f"link{parent}", f"link{i}", _read_pose(row[ORIGIN.columns])
     if kind == "fixed":
-        token.require_zeros(AXIS, POSITION, why="the joint is fixed")
-        return Joint(name, kind, f"link{parent}", child, origin), 0.0
-    axis = token.decode(AXIS, decode_axis)
-    q = token.decode(POSITION, decode_position)
-    return Joint(name, kind, f"link{parent}", child, origin, axis, (-1.0, 1.0)), q
+        return Joint(*ends)
+    x, y, z = row[AXIS.columns].tolist()
+    joint = Joint(*ends, (x, y, z), (-1.0, 1.0))
+    _ = joint.unit_axis  # an axis of zeros is an error here, where the link is known
+    return joint

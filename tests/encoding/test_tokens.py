@@ -318,20 +318,25 @@ def spoilt(row, column, value):
         (np.zeros((24, 48)), "has 24 links, more than max_links 23"),
         (spoilt(2, 0, 0.5), "link 2: link index: 0.5, not 2/22: made with another max_links"),
         (pad_tokens(arm_tokens(), 8)[0], "link 6: link index: 0, not 6/22: "),
-        (spoilt(0, 1, 0.0), "link 0: parent index: 0 makes no tree; expected -1/22"),
-        (spoilt(3, 1, 3 / 22), "link 3: parent index: 0.136364 makes no tree; expected k/22, k ="),
-        (spoilt(3, 3, 0.0), "link 3: end-effector: [1, 0, 1, 1] is neither four times 0 nor"),
-        (spoilt(5, slice(2, 6), 1.0), "link 5: end-effector: link 3 is flagged, too"),
-        (spoilt(0, 6, 1.0), "geometry: [1, 0, 1] is not one-hot over [sphere, cylinder, box]"),
-        (spoilt(0, 9, -0.1), "link 0: geometry: sizes [-0.1, 0.1, 0.04] are not all positive"),
-        (spoilt(1, 9, 0.03), "link 1: geometry: a cylinder has 2 times its radius, not [0.03,"),
-        (spoilt(0, slice(6, 12), 0.0), "link 0: geometry pose: it is not zero, but the link has"),
-        (spoilt(1, 15, 0.9), "link 1: geometry pose: the quaternion [0.9, 0, 0, 0] is of length"),
-        (spoilt(0, 22, 0.1), "link 0: joint origin: the base has no parent"),
-        (spoilt(0, slice(29, 32), (0, 1, 0)), "link 0: joint axis: the axis [0, 0, 0] is of"),
-        (spoilt(1, slice(29, 32), 0.0), "link 1: joint type: [0, 0, 0] is not one-hot over"),
-        (spoilt(1, slice(29, 32), (0, 0, 1)), "link 1: joint axis: it is not zero, but the joint"),
-        (spoilt(1, 35, 0.0), "link 1: joint position: number 3 is 0, but the first frequency says"),
+        (
+            spoilt(0, 1, 0.0),
+            "link 0: parent index: number 0 of [0] is invalid; expected -0.04",
+        ),
+        (spoilt(3, 1, 3 / 22), "link 3: parent index: 0.136364 makes no tree; expected k/22, k <"),
+        (spoilt(3, 3, 0.0), "end-effector: number 1 of [1, 0, 1, 1] is invalid; expected 1"),
+        (spoilt(5, slice(2, 6), 1.0), "link 5: end-effector: number 0 of [1, 1, 1, 1] is"),
+        (spoilt(0, 6, 1.0), "link 0: geometry: number 2 of [1, 0, 1, 0.1, 0.1, 0.04] is invalid"),
+        (spoilt(0, 9, -0.1), "link 0: sizes [-0.1, 0.1, 0.04] are not all positive"),
+        (spoilt(1, 9, 0.03), "link 1: geometry: number 4 of [0, 1, 0, 0.03, 0.02, 0.24] is"),
+        (spoilt(0, slice(6, 12), 0.0), "link 0: geometry pose: number 3 of [0, 0, 0, 1, 0, 0, 0]"),
+        (spoilt(1, 15, 0.9), "link 1: geometry pose: number 3 of [0, 0, 0.15, 0.9, 0, 0, 0] is"),
+        (spoilt(1, slice(15, 19), 0.0), "link 1: invalid rotation quaternion"),
+        (spoilt(0, 22, 0.1), "link 0: joint origin: number 0 of [0.1, 0, 0, 1, 0, 0, 0] is"),
+        (spoilt(0, slice(29, 32), (0, 1, 0)), "link 0: joint type: number 1 of [0, 1, 0] is"),
+        (spoilt(1, slice(19, 22), 0.0), "link 1: joint 'joint1': its axis"),
+        (spoilt(1, slice(29, 32), 0.0), "link 1: joint type: number 0 of [0, 0, 0] is invalid"),
+        (spoilt(1, slice(29, 32), (0, 0, 1)), "link 1: joint axis: number 1 of [0, 1, 0] is"),
+        (spoilt(1, 35, 0.0), "link 1: joint position: number 3 of [0.309017, 0.587785, 0.951057, "),
     ],
 )
 def test_invalid_tokens_are_errors_that_name_link_and_field(token_array, message):
@@ -347,5 +352,5 @@ def test_tokens_of_another_max_links_and_of_a_movable_base_are_errors():
         robot_from_tokens(token_array, "x")
     token_array = arm_tokens()
     token_array[0, 19:] = token_array[1, 19:]
-    with pytest.raises(BenchmarkError, match="link 0: joint type: revolute, but the base is fixed"):
+    with pytest.raises(BenchmarkError, match=r"link 0: joint axis: number 1 of .* expected 0"):
         robot_from_tokens(token_array, "x")
