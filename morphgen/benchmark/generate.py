@@ -7,23 +7,20 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from morphgen.benchmark.regimes import (
     HULLS,
     NOTHING,
-    ON_HULL,
+    RuledRobot,
     combination,
-    hull_distance,
-    parameters,
     parts,
     pattern_robots,
-    structure,
+    regime_violations,
 )
 from morphgen.encoding.similarity import cosine, is_near
 from morphgen.encoding.tokens import MAX_LINKS, require_max_links
@@ -42,7 +39,7 @@ from morphgen.splits.candidates import (
     members,
     numbered_name,
 )
-from morphgen.splits.split import MAX_LINKS_KEY, Member, Regime, Split
+from morphgen.splits.split import COMPOSED, MAX_LINKS_KEY, Member, Regime, Split
 
 
 def stream_seed(seed: int, prefix: str) -> int:
@@ -125,17 +122,14 @@ class RobotStream:
             return None
 
 
-class _Rules(Protocol):
-    """The rules of a regime for test robots that are drawn from grammars."""
-
-    def reject_derivation(self, derivation: Derivation) -> str:
-        """Return why a derivation cannot be a test robot's; empty if it can."""
-
-    def reject_robot(self, robot: Candidate) -> str:
-        """Return why a composed robot cannot be a test robot; empty if it can."""
-
-    def advice(self) -> str:
-        """Return what to change if a search finds too few robots."""
+Reject = Callable[[Candidate, Sequence[Candidate]], str]
+"""Function that returns why a composed robot cannot be a test robot beside train robots."""
+_REASONS = {
+    "structure-unseen": "a structure that no train robot has",
+    "hull": "parameters on the other side of the hull of the train robots",
+    "structure-seen": "the structure of a train robot",
+}
+"""Reasons for rejecting a robot by the code of the audit's finding."""
 
 
 def _drawn_splits(
@@ -143,20 +137,37 @@ def _drawn_splits(
     regime: Regime,
     summary: str,
     streams: tuple[Sequence[RobotStream], Sequence[RobotStream]],
-    rules_of: Callable[[Sequence[Candidate]], _Rules],
     factory: RobotFactory,
     provenance: Mapping[str, object],
+    reject: Reject,
+    advice: Callable[[], str],
     jobs: int,
 ) -> tuple[Split, ...]:
     """Return splits of robots that are taken from streams of train and test robots in turn.
 
-    rules_of: Makes the rules of the test robots from the train robots.
+    advice: Returns what to change if a search finds too few robots.
     """
     train_streams, test_streams = streams
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]
     train = list(parallel_map(factory, recipes, jobs))
-    test = _find_test_robots(request, train, test_streams, rules_of(train), factory)
+    # Sizes between the smallest and the largest split cannot violate what both obey.
+    sides = [train[:size] for size in {request.train[0]: 0, request.train[-1]: 0}]
+    library = factory.library
+    parsed = [[RuledRobot.of(each, library) for each in side] for side in sides]
+
+    def violated(derivation: Derivation) -> str:
+        """Return the reason of the first finding that an audit would have; empty if none."""
+        test = RuledRobot("", COMPOSED, "", derivation, library)
+        found = (regime_violations(regime, provenance, test, side) for side in parsed)
+        return next((_REASONS[code] for code, _, _ in itertools.chain(*found)), "")
+
+    def refused(robot: Candidate) -> str:
+        # A robot has another derivation if the conditions of its grammar reject the first one.
+        reasons = (reject(robot, side) for side in sides)
+        return violated(robot.derivation) or next(filter(None, reasons), "")
+
+    test = _find_test_robots(request, train, test_streams, factory, violated, refused, advice)
     seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
     return assemble_drawn(request, regime, summary, train, test, {**provenance, "seeds": seeds})
 
@@ -165,8 +176,10 @@ def _find_test_robots(
     request: SplitRequest,
     train: Sequence[Candidate],
     streams: Sequence[RobotStream],
-    rules: _Rules,
     factory: RobotFactory,
+    violated: Callable[[Derivation], str],
+    refused: Callable[[Candidate], str],
+    advice: Callable[[], str],
 ) -> list[Candidate]:
     """Take test robots from the streams in turn, number by number."""
     name_by_hash = {robot.hash: robot.name for robot in train}
@@ -179,16 +192,13 @@ def _find_test_robots(
         if rejected.total() == MAX_DRAWS or num_composed == MAX_COMPOSED:
             break
         derivation = stream.derivation(number, factory.library)
-        if reason := rules.reject_derivation(derivation) if derivation else "no end":
+        if reason := violated(derivation) if derivation else "no end":
             rejected[reason] += 1
             continue
         with show_progress(None):  # one robot is one step, whatever its fits report
             robot = factory(stream.recipe(number))
-        # The robot comes from a later draw if the conditions of the grammar reject the first one.
-        reason = rules.reject_derivation(robot.derivation)
-        if not reason and robot.hash in name_by_hash:
-            reason = f"the body of {name_by_hash[robot.hash]}"
-        if reason := reason or rules.reject_robot(robot):
+        twin = name_by_hash.get(robot.hash)
+        if reason := f"the body of {twin}" if twin else refused(robot):
             rejected[reason] += 1
             num_composed += 1
             continue
@@ -199,7 +209,7 @@ def _find_test_robots(
     raise BenchmarkError(
         f"{', '.join(stream.grammar.name for stream in streams)}: {len(found)} of {request.test} "
         f"test robots found in {rejected.total() + len(found)} draws; {count} had {reason}; "
-        f"{rules.advice()}"
+        f"{advice()}"
     )
 
 
@@ -263,63 +273,22 @@ def interpolation(
     train = RobotStream.of(grammar, grammar.name, request)
     test = RobotStream.of(grammar, f"{grammar.name}-test", request)
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
+    advice = {
+        "inside": "ask for more train robots, or for --hull any",
+        "outside": "ask for fewer train robots, or for --hull any",
+        "any": "ask for fewer test robots, or more train robots",
+    }
     return _drawn_splits(
         request,
         "interpolation",
         f"{{n}} robots of {grammar.name}; test: {request.test} {where[hull]}",
         ([train], [test]),
-        lambda robots: _InterpolationRules(robots, request.train[0], hull, library),
         RobotFactory(library, with_features=True, max_links=request.max_links),
         {"grammar": {grammar.name: grammar.digest}, "hull": hull},
+        _near_reason,
+        lambda: advice[hull],
         jobs,
     )
-
-
-class _InterpolationRules:
-    """A test robot has a trained structure, is on a side of the hull, and nearly no train robot."""
-
-    def __init__(
-        self, train: Sequence[Candidate], smallest: int, hull: str, library: Library
-    ) -> None:
-        self._train, self._hull, self._library = train, hull, library
-        self._structures = {structure(robot.derivation, library) for robot in train[:smallest]}
-        self._points: dict[str, list[list[float]]] = {}
-        # A point inside the smallest hull is inside all; one outside the largest is outside all.
-        for robot in train[:smallest] if hull == "inside" else train:
-            points = self._points.setdefault(structure(robot.derivation, library), [])
-            points.append(self._point(robot.derivation))
-
-    def reject_derivation(self, derivation: Derivation) -> str:
-        """Return why the structure or the parameters do not fit; empty if they do."""
-        kind = structure(derivation, self._library)
-        if kind not in self._structures:
-            return "a structure that no train robot has"
-        if self._hull == "any":
-            return ""
-        is_inside = hull_distance(self._point(derivation), self._points[kind]) <= ON_HULL
-        if is_inside == (self._hull == "inside"):
-            return ""
-        return f"parameters {'inside' if is_inside else 'outside'} the hull of the train robots"
-
-    def reject_robot(self, robot: Candidate) -> str:
-        """Return which train robot is nearly the same; empty if none is."""
-        return _near_reason(robot, self._train)
-
-    def _point(self, derivation: Derivation) -> list[float]:
-        return list(parameters(derivation, self._library).values())
-
-    def advice(self) -> str:
-        """Return what to change if a search finds too few robots."""
-        if self._hull == "any":
-            return "ask for fewer test robots, or more train robots"
-        spans = [np.ptp(np.array(points), axis=0) for points in self._points.values()]
-        varied = max(int((span > 0).sum()) for span in spans)
-        size = min(len(points) for points in self._points.values())
-        other = "more" if self._hull == "inside" else "fewer"
-        return (
-            f"{varied} parameters vary, and the smallest hull is that of {size} robots: ask for "
-            f"{other} train robots, or for --hull any"
-        )
 
 
 def _near_reason(robot: Candidate, others: Iterable[Candidate]) -> str:
@@ -440,18 +409,38 @@ def hold_out(
     rng = np.random.default_rng(seed)
     max_held = 0  # most test candidates of an attempt, for the message
     for _ in range(NUM_ATTEMPTS):
-        pool = _TrainPool(candidates)
-        order = [int(i) for i in rng.permutation(len(candidates))]
-        for fresh in (True, False):
-            for i in order:
-                if len(pool.held) < n and pool.is_fresh(i) == fresh:
-                    pool.hold(i, min_train)
-        if len(pool.held) == n:
-            test = [candidates[i] for i in pool.held]
-            train = [candidates[i] for i in order if i in pool.remaining]
-            return test, _covering_first(train, pool.needed)
-        max_held = max(max_held, len(pool.held))
+        order = [candidates[i] for i in rng.permutation(len(candidates))]
+        test, train = _hold_out_in_order(order, n, min_train)
+        if len(test) == n:
+            return test, _covering_first(train, {item for each in test for item in each.covers})
+        max_held = max(max_held, len(test))
     raise BenchmarkError(_why_not(candidates, n, min_train, max_held))
+
+
+def _hold_out_in_order(
+    order: Sequence[HoldOutCandidate], n: int, min_train: int
+) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
+    """Hold out each candidate in turn whose parts the rest still covers, new combinations first."""
+    is_mixed = len({candidate.task for candidate in order}) > 1
+    test: list[HoldOutCandidate] = []
+    train = list(order)
+    needed: set[str] = set()
+    for fresh in (True, False):
+        for each in order:
+            is_fresh = each.combination not in {held.combination for held in test}
+            if len(test) == n or is_fresh != fresh or each in test:
+                continue
+            rest = [
+                other
+                for other in train
+                if other.combination != each.combination
+                and not (is_mixed and each.task == other.task and each.outermost in other.parts)
+            ]
+            covered = {item for other in rest for item in other.covers}
+            if len(rest) >= min_train and needed | each.covers <= covered:
+                test.append(each)
+                train, needed = rest, needed | each.covers
+    return test, train
 
 
 def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutCandidate]) -> int:
@@ -462,47 +451,6 @@ def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutC
         needed -= candidates[n].covers
         n += 1
     return n
-
-
-class _TrainPool:
-    """The candidates that remain for training while others are held out, by their index."""
-
-    def __init__(self, candidates: Sequence[HoldOutCandidate]) -> None:
-        self._candidates = candidates
-        self._mixed = len({candidate.task for candidate in candidates}) > 1
-        self._same_combination: dict[str, list[int]] = defaultdict(list)
-        self._pairs: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for i, candidate in enumerate(candidates):
-            self._same_combination[candidate.combination].append(i)
-            for part in candidate.parts:
-                self._pairs[part, candidate.task].append(i)
-        self.remaining = set(range(len(candidates)))
-        self._covered = Counter(item for candidate in candidates for item in candidate.covers)
-        self.held: list[int] = []
-        self.needed: set[str] = set()  # parts and tasks of the candidates that are held out
-
-    def is_fresh(self, i: int) -> bool:
-        """Test that no candidate of the same combination is held out."""
-        return all(
-            self._candidates[i].combination != self._candidates[j].combination for j in self.held
-        )
-
-    def hold(self, i: int, min_train: int) -> None:
-        """Hold a candidate out, if the rest still covers all that is needed and is large enough."""
-        candidate = self._candidates[i]
-        excluded = set(self._same_combination[candidate.combination])
-        if self._mixed:
-            excluded.update(self._pairs[candidate.outermost, candidate.task])
-        excluded &= self.remaining
-        lost = Counter(item for j in excluded for item in self._candidates[j].covers)
-        needed = self.needed | candidate.covers
-        is_covered = all(self._covered[item] > lost[item] for item in needed)
-        if i in self.held or not is_covered or len(self.remaining) - len(excluded) < min_train:
-            return
-        self.held.append(i)
-        self.needed = needed
-        self.remaining -= excluded
-        self._covered -= lost
 
 
 def _covering_first(
@@ -590,61 +538,43 @@ def extrapolation(
         ", ".join(grammar.name for grammar in grammars)
         for grammars in (train_grammars, test_grammars)
     )
+    misses: list[tuple[float, str, str]] = []
+
+    def reject(robot: Candidate, train: Sequence[Candidate]) -> str:
+        if similarity is None or robot.features is None:
+            return ""
+        own = robot.features
+        cosines = [(cosine(own, each.features), each.name) for each in train if each.features]
+        value, nearest = max(cosines, key=lambda pair: pair[0])
+        if similarity.holds(value):
+            return ""
+        misses.append((value, robot.name, nearest))
+        return f"a cosine to the nearest train robot that is not {similarity}"
+
+    def advice() -> str:
+        if similarity is None or not misses:
+            return "choose other categories, or fewer test robots"
+        value, name, nearest = min(misses) if similarity.is_upper else max(misses)
+        return (
+            f"the nearest to the bound was {name}, with {value:.3f} to {nearest}: choose another "
+            "bound, or other categories"
+        )
+
     return _drawn_splits(
         request,
         "extrapolation",
         f"{{n}} robots of {sources}; test: {request.test} of {targets}",
         (train_streams, test_streams),
-        lambda robots: _ExtrapolationRules(robots, request.train[0], similarity, library),
         RobotFactory(library, with_features=similarity is not None, max_links=request.max_links),
         {
             "train_categories": {grammar.name: grammar.digest for grammar in train_grammars},
             "test_categories": {grammar.name: grammar.digest for grammar in test_grammars},
             **({"similarity": str(similarity)} if similarity else {}),
         },
+        reject,
+        advice,
         jobs,
     )
-
-
-class _ExtrapolationRules:
-    """A test robot has no trained structure, and a cosine to the nearest train robot in a bound."""
-
-    def __init__(
-        self, train: Sequence[Candidate], smallest: int, bound: Bound | None, library: Library
-    ) -> None:
-        self._library, self._bound = library, bound
-        self._names = {structure(each.derivation, library): each.name for each in reversed(train)}
-        # The largest cosine grows with the set.
-        self._train = train[:smallest] if bound and not bound.is_upper else train
-        self._nearest: list[tuple[float, str, str]] = []
-
-    def reject_derivation(self, derivation: Derivation) -> str:
-        """Return the train robot of the same structure; empty if there is none."""
-        twin = self._names.get(structure(derivation, self._library))
-        return f"the structure of train robot {twin}" if twin else ""
-
-    def reject_robot(self, robot: Candidate) -> str:
-        """Return that the robot violates the bound; empty if it does not."""
-        if self._bound is None or robot.features is None:
-            return ""
-        cosines = [
-            cosine(robot.features, other.features) for other in self._train if other.features
-        ]
-        nearest = int(np.argmax(cosines))
-        if self._bound.holds(cosines[nearest]):
-            return ""
-        self._nearest.append((cosines[nearest], robot.name, self._train[nearest].name))
-        return f"a cosine to the nearest train robot that is not {self._bound}"
-
-    def advice(self) -> str:
-        """Return what to change if a search finds too few robots."""
-        if self._bound is None or not self._nearest:
-            return "choose other categories, or fewer test robots"
-        best = min(self._nearest) if self._bound.is_upper else max(self._nearest)
-        return (
-            f"the nearest to the bound was {best[1]}, with {best[0]:.3f} to {best[2]}: choose "
-            "another bound, or other categories"
-        )
 
 
 def _require_apart(train: Sequence[Grammar], test: Sequence[Grammar]) -> None:

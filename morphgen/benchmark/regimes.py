@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -23,6 +23,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.request import SLOTS, parse_words
 from morphgen.model.findings import Finding
+from morphgen.splits.candidates import Candidate
 from morphgen.splits.split import COMPOSED, Member, Regime, Split
 
 NOTHING = "none"
@@ -195,66 +196,93 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     - Hold-out: see ``morphgen.benchmark.hold_out``, which tests all robots of a split.
     - All regimes: a train robot has its task.
     """
-    train = [_Parsed(member, library) for member in split.train]
-    rule = _RULES[split.regime]
-    findings: list[Finding] = []
-    for member in split.test:
-        test = _Parsed(member, library)
-        findings += [*_task_findings(test, train), *rule(split, test, train)]
-    return tuple(findings)
+    sides = (
+        [RuledRobot.of(member, library) for member in side] for side in (split.train, split.test)
+    )
+    train, test = sides
+    return tuple(
+        Finding(code, "error", f"test robot {robot.name}", why, fix)
+        for robot in test
+        for code, why, fix in (
+            *_task_violations(robot, train),
+            *regime_violations(split.regime, split.provenance, robot, train),
+        )
+    )
 
 
 @dataclass(frozen=True)
-class _Parsed:
-    """A member with its parsed derivation."""
+class RuledRobot:
+    """What the rules of the regimes see of a robot."""
 
-    member: Member
+    name: str
+    category: str
+    task: str
+    derivation: Derivation
     library: Library
 
-    @cached_property
-    def derivation(self) -> Derivation:
-        where = f"derivation of {self.member.name!r}"
-        return parse_derivation(self.member.derivation, where)
+    @classmethod
+    def of(cls, robot: Member | Candidate, library: Library) -> RuledRobot:
+        """Return that of a member, or of a candidate, which has no task yet."""
+        if isinstance(robot, Candidate):
+            return cls(robot.name, robot.category, "", robot.derivation, library)
+        derivation = parse_derivation(robot.derivation, f"derivation of {robot.name!r}")
+        return cls(robot.name, robot.category, robot.task, derivation, library)
 
     @cached_property
     def structure(self) -> str:
+        """See ``structure``."""
         return structure(self.derivation, self.library)
 
     @cached_property
     def combination(self) -> str:
+        """See ``combination``."""
         return combination(self.derivation)
 
     @cached_property
     def parts(self) -> frozenset[str]:
+        """See ``parts``."""
         return parts(self.derivation)
 
     @cached_property
     def parameters(self) -> list[float]:
+        """Values of ``parameters``."""
         return list(parameters(self.derivation, self.library).values())
 
-    def finding(self, code: str, why: str, fix: str) -> Finding:
-        return Finding(code, "error", f"test robot {self.member.name}", why, fix)
+
+Violation = tuple[str, str, str]
+"""Code, reason and fix of what a test robot violates."""
+Provenance = Mapping[str, object]
 
 
-Rule = Callable[[Split, _Parsed, Sequence[_Parsed]], Iterator[Finding]]
+def regime_violations(
+    regime: Regime, provenance: Provenance, test: RuledRobot, train: Sequence[RuledRobot]
+) -> Iterator[Violation]:
+    """Yield how a test robot violates the rule of a regime; see ``regime_findings``.
+
+    Generators draw another robot where an audit would have a finding.
+    """
+    if regime == "interpolation":
+        return _interpolation(str(provenance.get("hull", "any")), test, train)
+    if regime == "composition":
+        return _composition(test, train)
+    return _extrapolation(test, train) if regime == "extrapolation" else iter(())
 
 
-def _interpolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
+def _interpolation(hull: str, test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
     same_structure = [robot for robot in train if robot.structure == test.structure]
     if not same_structure:
-        yield test.finding(
+        yield (
             "structure-unseen",
             f"no train robot has its structure, {test.structure}",
             "draw test robots from the grammar of train robots",
         )
         return
-    hull = str(split.provenance.get("hull", "any"))
     if hull not in HULLS[:2]:
         return
     distance = hull_distance(test.parameters, [robot.parameters for robot in same_structure])
     if (distance <= ON_HULL) != (hull == "inside"):
         is_where = "inside" if distance <= ON_HULL else f"outside, by {distance:.3g} ranges,"
-        yield test.finding(
+        yield (
             "hull",
             f"its parameters lie {is_where} of the convex hull of the {len(same_structure)} train "
             f"robots of its structure; the split says {hull}",
@@ -262,66 +290,50 @@ def _interpolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Ite
         )
 
 
-def _composition(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    trained_parts = frozenset[str]().union(*(robot.parts for robot in train))
-    unseen = sorted(test.parts - trained_parts)
+def _composition(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+    unseen = sorted(test.parts.difference(*(robot.parts for robot in train)))
     if unseen:
-        yield test.finding(
+        yield (
             "part-unseen",
             f"no train robot has {', '.join(map(repr, unseen))}",
             "train on a robot that has it, or test another",
         )
-    same_combination = [
-        robot.member.name for robot in train if robot.combination == test.combination
-    ]
-    if same_combination:
-        yield test.finding(
+    twin = next((robot.name for robot in train if robot.combination == test.combination), None)
+    if twin:
+        yield (
             "combination-seen",
-            f"train robot {same_combination[0]} is the same combination, {test.combination}",
+            f"train robot {twin} is the same combination, {test.combination}",
             "leave the combination out of train",
         )
-    if len({robot.member.task for robot in train}) > 1 and not unseen:
-        task = test.member.task
-        parts_at_task = frozenset[str]().union(*(r.parts for r in train if r.member.task == task))
-        if test.parts <= parts_at_task:
-            yield test.finding(
+    if len({robot.task for robot in train}) > 1 and not unseen:
+        task = test.task
+        if not test.parts.difference(*(robot.parts for robot in train if robot.task == task)):
+            yield (
                 "pair-seen",
                 f"every part of it is in a train robot that learns to {task}",
                 f"train robots with one of its parts at other tasks than {task} only",
             )
 
 
-def _extrapolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    category = test.member.category
-    if category != COMPOSED and category in {robot.member.category for robot in train}:
-        yield test.finding(
+def _extrapolation(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+    if test.category != COMPOSED and test.category in {robot.category for robot in train}:
+        yield (
             "category-seen",
-            f"category {category!r} is in train",
+            f"category {test.category!r} is in train",
             "test a category that is not trained",
         )
-    same_structure = [robot.member.name for robot in train if robot.structure == test.structure]
-    if same_structure:
-        yield test.finding(
+    twin = next((robot.name for robot in train if robot.structure == test.structure), None)
+    if twin:
+        yield (
             "structure-seen",
-            f"train robot {same_structure[0]} has the same structure, {test.structure}",
+            f"train robot {twin} has the same structure, {test.structure}",
             "test a structure that is not trained",
         )
 
 
-def _task_findings(test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    trained_tasks = {robot.member.task for robot in train}
-    if test.member.task not in trained_tasks:
-        yield test.finding(
-            "task-unseen", f"no train robot learns to {test.member.task}", "train some robot at it"
-        )
-
-
-_RULES: Mapping[Regime, Rule] = {
-    "interpolation": _interpolation,
-    "composition": _composition,
-    "extrapolation": _extrapolation,
-    "hold-out": lambda split, test, train: iter(()),
-}
+def _task_violations(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+    if test.task not in {robot.task for robot in train}:
+        yield "task-unseen", f"no train robot learns to {test.task}", "train some robot at it"
 
 
 def _values(node: Derivation, library: Library) -> dict[str, float]:

@@ -134,9 +134,8 @@ def test_an_empty_hull_is_an_error(monkeypatch):
     with pytest.raises(BenchmarkError) as caught:
         interpolation(order(3), shipped("arm3"), LIBRARY, hull="inside")
     assert str(caught.value) == (
-        "arm3: 0 of 1 test robots found in 100 draws; 100 had parameters outside the hull of "
-        "the train robots; 3 parameters vary, and the smallest hull is that of 3 robots: ask for "
-        "more train robots, or for --hull any"
+        "arm3: 0 of 1 test robots found in 100 draws; 100 had parameters on the other side of the "
+        "hull of the train robots; ask for more train robots, or for --hull any"
     )
     with pytest.raises(BenchmarkError, match="--hull insid: unknown; did you mean 'inside'"):
         interpolation(order(3), shipped("arm3"), LIBRARY, hull="insid")
@@ -173,7 +172,7 @@ def test_extrapolation_never_tests_trained_structures():
     assert trained.isdisjoint(structure(d, LIBRARY) for d in derivations(split.test))
     assert names(split.test) != ["mine-000000", "mine-000001", "mine-000002"]
     same = replace(shipped("nlink"), name="mine")
-    with pytest.raises(BenchmarkError, match=r"2000 draws; .* had the structure of train robot"):
+    with pytest.raises(BenchmarkError, match=r"2000 draws; .* had the structure of a train robot"):
         extrapolation(order(40), grammars("nlink"), [same], LIBRARY)
 
 
