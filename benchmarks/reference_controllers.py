@@ -34,7 +34,7 @@ from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Zero
-from morphgen.rl.rollouts import run_episodes
+from morphgen.rl.inference import run_episodes
 from morphgen.splits.split import SIDES, Member
 from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.batch import TaskBatch

@@ -14,11 +14,10 @@ import numpy as np
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress
-from morphgen.rl.baselines import BASELINES, ZERO, baselines_for
+from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import differences
-from morphgen.rl.inference import Mode, Policy, PolicyController
-from morphgen.rl.rollouts import Controller, Episode, run_episodes
+from morphgen.rl.inference import Episode, Mode, Policy, PolicyController, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files

@@ -19,9 +19,8 @@ from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines import BASELINES, Controller
 from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
-from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import FILE, members, read_drawn
 from morphgen.rl.shipped_policies import is_named, policies_for

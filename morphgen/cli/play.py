@@ -23,7 +23,7 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 
 if TYPE_CHECKING:
     from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.rollouts import Episode
+    from morphgen.rl.inference import Episode
     from morphgen.rl.runs.robot_source import RobotSource
     from morphgen.rl.scores import Score
 

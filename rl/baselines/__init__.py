@@ -8,12 +8,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from morphgen.tasks.registry import Registry
 
 if TYPE_CHECKING:
-    from morphgen.rl.rollouts import Controller
+    import torch
+
+    from morphgen.tasks.batch import TaskBatch
+
+
+class Controller(Protocol):
+    """Source of actions for a batch: a baseline, or a policy (``inference.PolicyController``)."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions of all environments, shape (n, L)."""
 
 
 @dataclass(frozen=True)

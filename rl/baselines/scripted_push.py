@@ -1,21 +1,429 @@
-"""The baseline ``scripted`` of push: follow a planned path behind the block, push, and steer."""
+"""The baseline ``scripted`` of push: follow a planned path behind the block, push, and steer.
+
+A robot pushes its block along y, across a line. A *pre-contact* is a configuration with the tool
+behind the block, from which the robot touches the block if it moves along y. It is found by moving
+the block until both collide.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from morphgen.model.kinematics_torch import frame_positions, pose_ik_step
-from morphgen.rl.baselines.path_planner import PathFollower, fractions_towards
-from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
+from morphgen.model.dynamics import actuation
+from morphgen.model.kinematics import MAX_STEP, frame_jacobian, solve_position_ik, unwrap_joints
+from morphgen.model.kinematics_torch import frame_pose, frame_positions, pose_ik_step
+from morphgen.rl.baselines.path_planner import (
+    Path,
+    PathCost,
+    PathFollower,
+    PathPlanner,
+    Tree,
+    fractions_towards,
+)
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.push.starts import PushStartSet, sample_tools_in_box
+from morphgen.tasks.scenes.robot_tables import RobotTables
+from morphgen.tasks.sim.base import CONTROL_PERIOD, GRAVITY, Scene
 from morphgen.tasks.task import EnvSpec
+from morphgen.typing import Array
+
+SPEED = 0.006  # largest motion of the tool in a control step while it pushes [m]: 0.3 m/s
+
+# Lengths below are in edges of the block, costs in control steps; both were tuned on the robots of
+# the shipped splits.
+_DISTANCES = (0.1, 0.4, 0.8, 1.3)
+"""Distances of the tool behind the block's hindmost point that are tried."""
+_NEAREST, _QUICKEST = 24, 36
+"""Starts of inverse kinematics per distance: those nearest in space, and nearest in joint space."""
+_MIN_HEIGHT, _MAX_HEIGHT = 0.2, 0.45
+"""Heights of the tool: pushed above its middle, a block with a friction of 1 tips over."""
+_CANDIDATES = 24  # pre-contacts, the cheapest first, to which straight paths are tried
+_SIMULATED, _OVERHANG_EVERY = 12, 3
+"""Number of points at which a push is tested; the overhang is tested at every third of them."""
+_TOLERANCE = 0.02  # distance from a point that counts as reached
+_NEARER, _FARTHER = 0.3, 0.4
+"""In a simulated push, the robot must touch a block that is nearer by the one distance, and not
+touch one that is farther by the other."""
+_LIFT = 1.4  # height of the waypoint above a pre-contact, from which the tool comes down
+_RETREAT_STEP, _RETREAT_STEPS = 0.15, 8
+"""Motion of the tool in a step away from the block, and the largest number of such steps."""
+_RETREAT_DIRECTIONS = (
+    (0.0, -1.0, 0.0),
+    (0.0, -0.7, 0.7),
+    (0.0, 0.0, 1.0),
+    (1.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+)
+_UNFINISHED_COST, _NARROW_COST = 400.0, 120.0
+"""Cost of a push that does not move the block, and of a contact of width zero."""
+_OVERHANG_COST, _MAX_OVERHANG = 3000.0, 0.1
+"""Cost per edge of overhang, and the overhang at which the cost is capped."""
+_COMPLIANCE_COST = 3000.0  # cost per metre of the tool's deflection by the block's friction
+_ACCELERATION_STEPS = 25  # time until arm and block have the speed of the push [control steps]
+_EXPENSIVE, _TREE_ITERATIONS = 350.0, 1500
+"""Cost of a plan above which a tree of reachable configurations is grown to find a cheaper one, and
+the number of random configurations of that tree."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned push: the path behind the block, and the pose of the tool during the push."""
+
+    path: tuple[Array, ...]  # waypoints, each (dof,); at the last one the tool is behind the block
+    rotation: torch.Tensor  # rotation of the tool at the last waypoint, shape (3, 3)
+    height: float  # height of the tool at the last waypoint [m]
+    offset: float
+    """x of the tool minus x of the block with which the tool pushes the block's middle [m]."""
+    gap: float  # motion of the tool along y until it touches the block [m]
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Pre-contacts that can begin a push, a row each."""
+
+    q: Array  # configurations, shape (n, dof)
+    position: Array  # positions of the tool, shape (n, 3) [m]
+    rotation: Array  # rotations of the tool, shape (n, 3, 3)
+    offset: Array  # `Plan.offset`, shape (n,)
+    gap: Array  # `Plan.gap`, shape (n,)
+    cost: Array  # cost of the push [control steps], shape (n,)
+    steps: Array  # duration of the push [control steps], shape (n,)
+
+    def take(self, rows: NDArray[np.intp]) -> Self:
+        """Return some of the rows."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+class ToolKinematics:
+    """Kinematics of the tool of one robot of a batch, in NumPy arrays."""
+
+    def __init__(self, tables: RobotTables, robot: int) -> None:
+        self._tables, self._robot = tables, robot
+        self._dof = tables.robots[robot].dof
+
+    def poses(self, q: Array) -> tuple[Array, Array]:
+        """Return positions (n, 3) and rotations (n, 3, 3) of the tool at q (n, dof)."""
+        T = frame_pose(self._tables.tool_chain, *self._rows(q)).double().cpu().numpy()
+        return T[:, :3, 3], T[:, :3, :3]
+
+    def move_towards(self, q: Array, position: Array, rotation: Array, iterations: int) -> Array:
+        """Return q (n, dof) after iterations of ``pose_ik_step`` to poses (n, 3), (n, 3, 3)."""
+        robots, rows = self._rows(q)
+        goals = torch.from_numpy(position).to(rows)
+        rotations = torch.from_numpy(rotation).to(rows)
+        limits = self._tables.lower[robots], self._tables.upper[robots]
+        for _ in range(iterations):
+            target = pose_ik_step(self._tables.tool_chain, robots, rows, goals, rotations, limits)
+            rows = rows + (target - rows).clamp(-MAX_STEP, MAX_STEP)
+        return rows[:, : self._dof].double().cpu().numpy()
+
+    def _rows(self, q: Array) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return robot indices (n,) and configurations padded to the batch's joints, (n, J)."""
+        device = self._tables.device
+        rows = torch.zeros(len(q), self._tables.max_joints, device=device)
+        rows[:, : self._dof] = torch.from_numpy(q).to(rows)
+        return torch.full((len(q),), self._robot, device=device), rows
+
+
+class PushPlanner:
+    """Plans pushes of one robot and its block."""
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        scene: Scene,
+        tables: RobotTables,
+        robot: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Collect free configurations with a low tool in the region of the push."""
+        starts, self._robot = spec.goals, spec.robot
+        if not isinstance(starts, PushStartSet):
+            raise ValueError(f"{self._robot.name} does not push")
+        self._tool = ToolKinematics(tables, robot)
+        self._edge, self._line, self._ground = starts.block.size[0], starts.line, starts.ground
+        self._friction = starts.block.friction * starts.block.mass * GRAVITY
+        self._stiffness = np.array([gain.stiffness for gain in actuation(self._robot)])
+        self._idle = ~tables.moves_tool[robot, : self._robot.dof].cpu().numpy()
+        self._space = FreeSpace(scene)
+        step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
+        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
+        edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)
+        low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
+        high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
+        self._bank, self._bank_tools = sample_tools_in_box(self._space, low, high, rng)
+
+    def free(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether configurations (n, dof) are free of collisions without the block, (n,)."""
+        return self._space.free(q)
+
+    def plan(
+        self, q: Array, block: Array, attempt: int = 0, steps_left: float = np.inf
+    ) -> Plan | None:
+        """Return the cheapest plan to push a block (7,) from a configuration (dof,).
+
+        It is None if there is no plan, or too little time to push the block across the line.
+        """
+        if steps_left < (self._line - block[1]) / SPEED:
+            return None
+        start = self._retreat(q, block)
+        plans = [self._plan_straight(start, self._candidates_near(q, block), block, steps_left)]
+        if plans[0] is None or plans[0][0] > _EXPENSIVE:
+            # Self-collisions may divide free space: look for pre-contacts near configurations that
+            # can be reached.
+            no_goals = np.zeros((0, len(q)))
+            _, tree = self._planner.plan_rrt(
+                start, no_goals, block=block, attempt=attempt, iterations=_TREE_ITERATIONS
+            )
+            candidates = self._candidates_on(tree, block)
+            plans.append(self._plan_straight(start, candidates, block, steps_left, tree))
+        valid_plans = [plan for plan in plans if plan is not None]
+        if not valid_plans:
+            return None
+        _, path, candidates = min(valid_plans, key=lambda plan: plan[0])
+        i = path.goal
+        return Plan(
+            path=path.waypoints if start is q else (start, *path.waypoints),
+            rotation=torch.from_numpy(candidates.rotation[i]).float(),
+            height=float(candidates.position[i, 2]),
+            offset=float(candidates.offset[i]),
+            gap=float(candidates.gap[i]),
+        )
+
+    def _plan_straight(
+        self,
+        start: Array,
+        candidates: _Candidates,
+        block: Array,
+        steps_left: float,
+        tree: Tree | None = None,
+    ) -> tuple[float, Path, _Candidates] | None:
+        """Return cost, path and candidates of the cheapest free path; None without one."""
+        cost = PathCost(candidates.cost, steps_left - candidates.steps)
+        if tree is None:
+            order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")
+            candidates = candidates.take(order[:_CANDIDATES])
+            cost = PathCost(candidates.cost, steps_left - candidates.steps)
+        path = self._planner.plan_straight(
+            start, candidates.q, vias=self._lift(candidates), cost=cost, block=block, tree=tree
+        )
+        if path is None:
+            return None
+        value = float(cost.of(self._planner.length(start, path), path.goal))
+        return value, path, candidates
+
+    def _candidates_near(self, q: Array, block: Array) -> _Candidates:
+        """Return candidates from inverse kinematics that starts at random free configurations."""
+        bank = unwrap_joints(self._robot, q, self._bank)
+        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
+        starts, goals = self._behind(bank, self._bank_tools, block, quickest)
+        starts[::2, self._idle] = q[self._idle]
+        starts[1::2, self._idle] = np.array(self._robot.home)[self._idle]
+        free = self._solve(starts, goals, block)
+        return self._evaluate(unwrap_joints(self._robot, q, free), block)
+
+    def _candidates_on(self, tree: Tree, block: Array) -> _Candidates:
+        """Return candidates from inverse kinematics that starts at the nodes of a tree."""
+        nodes = np.array(tree.nodes)
+        tools, _ = self._tool.poses(nodes)
+        starts, goals = self._behind(nodes, tools, block, np.zeros(0, dtype=np.intp))
+        return self._evaluate(self._solve(starts, goals, block), block)
+
+    def _behind(
+        self, q: Array, tools: Array, block: Array, also: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        """Return starts of inverse kinematics (n, dof) and goals behind the block (n, 3).
+
+        Starts are those of k configurations q whose tools (k, 3) are near, and the rows ``also``.
+        """
+        edge, yaw = self._edge, 2 * np.arctan2(block[6], block[3])
+        hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
+        starts, goals = [], []
+        for distance in _DISTANCES:
+            xy = np.array([block[0], hindmost - distance * edge])
+            apart = np.linalg.norm(tools[:, :2] - xy, axis=1)
+            apart += np.maximum(tools[:, 2] - self._ground - edge, 0)
+            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], also])
+            height = np.clip(tools[near, 2] - self._ground, _MIN_HEIGHT * edge, _MAX_HEIGHT * edge)
+            goals.append(np.column_stack([np.tile(xy, (len(near), 1)), self._ground + height]))
+            starts.append(q[near])
+        return np.concatenate(starts), np.concatenate(goals)
+
+    def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
+        """Return the collision-free solutions (k, dof) for goals of the tool (n, 3), k <= n."""
+        q, error = solve_position_ik(self._robot, starts, goals)
+        solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
+        q = q[solved & (np.abs(error[:, 2]) < self._edge / 2)]
+        return q[self._space.free(q, np.tile(block, (len(q), 1)))]
+
+    def _evaluate(self, q: Array, block: Array) -> _Candidates:
+        """Return those configurations behind the block (n, dof) that can begin a push."""
+        contacts = find_contacts(self._space, q, block, self._edge)
+        position, rotation = self._tool.poses(contacts.q)
+        offset = position[:, 0] - block[0] - contacts.offset
+        finished, over = self._simulate(contacts, position, rotation, offset, block)
+        cost = _UNFINISHED_COST * (1 - finished) + _NARROW_COST * (1 - contacts.width)
+        cost += _OVERHANG_COST * np.minimum(over, _MAX_OVERHANG) + contacts.gap / SPEED
+        cost += _COMPLIANCE_COST * self._compliance(contacts.q)
+        steps = (contacts.gap + self._line - block[1]) / SPEED + _ACCELERATION_STEPS
+        candidates = _Candidates(contacts.q, position, rotation, offset, contacts.gap, cost, steps)
+        return candidates.take(np.flatnonzero(finished > 0))
+
+    def _simulate(
+        self, contacts: PreContact, position: Array, rotation: Array, offset: Array, block: Array
+    ) -> tuple[Array, Array]:
+        """Simulate pushes without dynamics; return their successful fractions and overhangs, (n,).
+
+        At each point the arm must be free of collisions, and stay in contact: it must touch a block
+        slightly nearer than the pushed one, and not touch one slightly farther.
+        """
+        edge, q = self._edge, contacts.q
+        length = contacts.gap + self._line - block[1] + 0.1 * edge
+        good, fraction = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
+        over = contacts.overhang.copy()
+        for i in range(1, _SIMULATED + 1):
+            ahead = length * i / _SIMULATED
+            goal = position.copy()
+            goal[:, 0] = block[0] + offset
+            goal[:, 1] += ahead
+            q = self._tool.move_towards(q, goal, rotation, 4)
+            error = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
+            good &= (error < _TOLERANCE * edge + 0.002) & self._space.free(q)
+            moved = np.maximum(ahead - contacts.gap, 0)[:, None]
+            shifts = moved + np.array([-_NEARER, _FARTHER]) * edge
+            nearer, farther = touches(self._space, q, block, np.zeros(1), shifts).T
+            good &= (nearer & ~farther) | (ahead < contacts.gap)
+            fraction[good] = i / _SIMULATED
+            if i % _OVERHANG_EVERY == 0:
+                rows = np.flatnonzero(good)
+                blocks = np.tile(block, (len(rows), 1))
+                blocks[:, 1] += moved[rows, 0] + _FARTHER * edge
+                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], blocks, edge))
+        begun = fraction * length > contacts.gap + 0.1 * edge
+        return np.where(begun, fraction, 0.0), over
+
+    def _compliance(self, q: Array) -> Array:
+        """Return the deflection of the tools along y by the block's friction, shape (n,) [m]."""
+        _, J = frame_jacobian(self._robot, q)
+        return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
+
+    def _lift(self, candidates: _Candidates) -> Array:
+        """Return configurations (n, dof) with the tool above the candidates, if possible."""
+        goal, q = candidates.position.copy(), candidates.q
+        for _ in range(5):
+            goal[:, 2] += _LIFT * self._edge / 5
+            q = self._tool.move_towards(q, goal, candidates.rotation, 3)
+        return q
+
+    def _retreat(self, q: Array, block: Array) -> Array:
+        """Return q if it is free of the block, else a free one near it, else q."""
+        if self._space.free(q[None], block[None])[0]:
+            return q
+        position, rotation = self._tool.poses(q[None])
+        for direction in _RETREAT_DIRECTIONS:
+            goal, retreated = position.copy(), q[None]
+            for _ in range(_RETREAT_STEPS):
+                goal += _RETREAT_STEP * self._edge * np.array(direction)
+                retreated = self._tool.move_towards(retreated, goal, rotation, 3)
+                if self._space.free(retreated, block[None])[0]:
+                    return np.asarray(retreated[0])
+        return q
+
+
+# Lengths of the next constants are in edges of the block.
+SHIFTS = np.arange(0.05, 2.0, 0.1)
+"""Distances that the block is moved towards the robot to find their contact."""
+BISECTIONS = 5  # bisections of the interval between two of these shifts
+OFFSETS = np.linspace(-1.0, 1.0, 9)
+"""Offsets of the block along x at which the width of the contact is tested."""
+BELOW, ABOVE = -0.5, 0.15
+"""Shifts of the block along z: a block lowered by half an edge is touched only below its middle; a
+raised one also slightly above it."""
+PRESSED = 0.1  # distance that the block is pressed against the robot when the width is tested
+
+
+@dataclass(frozen=True, eq=False)
+class PreContact:
+    """Configurations behind the block that touch it if they move along y; one per row."""
+
+    q: Array  # configurations, shape (n, dof) [rad or m]
+    gap: Array  # motion along y until the robot touches the block, shape (n,) [m]
+    offset: Array
+    """Offset of the block along x for which the contact is on its middle, shape (n,) [m]."""
+    width: Array  # fraction of `OFFSETS` at which the block is touched, shape (n,)
+    overhang: Array
+    """Overhang over the block as the function ``overhang`` returns it, shape (n,) [edges]."""
+
+
+def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
+    """Return those configurations (n, dof), free of the block (7,), that touch it along y."""
+    gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
+    touching = np.isfinite(gap)
+    q, gap = q[touching], gap[touching]
+    pressed = (gap + PRESSED * edge)[:, None]
+    touched = touches(space, q, block, OFFSETS * edge, -pressed)
+    count = np.maximum(touched.sum(axis=1), 1)
+    offset = (touched * OFFSETS).sum(axis=1) / count * edge
+    blocks = np.tile(block, (len(q), 1))
+    blocks[:, 0] += offset
+    return PreContact(q, gap, offset, count / len(OFFSETS), overhang(space, q, blocks, edge))
+
+
+def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
+    """Return the overhang of a robot over the block that it touches if it moves along y.
+
+    It is the lead along y with which the robot touches the block (n, 7) above its middle before it
+    touches it below, shape (n,), 0 to 1 edges. With overhang, a push presses the block to the
+    ground or tips it over. The configurations (n, dof) are free of the block.
+    """
+    below, above = (
+        np.minimum(_gaps(space, q, blocks, edge, dz * edge), SHIFTS[-1] * edge)
+        for dz in (BELOW, ABOVE)
+    )
+    return np.asarray(np.clip((below - above) / edge, 0.0, 1.0))
+
+
+def touches(
+    space: FreeSpace, q: Array, block: Array, dx: Array, dy: Array, dz: float = 0.0
+) -> NDArray[np.bool_]:
+    """Return whether configurations (n, dof) touch the shifted block, (7,) or (n, 7), shape (n, k).
+
+    ``dx`` and ``dy`` are shifts that broadcast to (n, k), ``dz`` is one for all [m].
+    """
+    n, k = len(q), max(dx.shape[-1], dy.shape[-1])
+    blocks = np.broadcast_to(block.reshape(-1, 1, 7), (n, k, 7)).copy()
+    blocks[..., 0] += dx
+    blocks[..., 1] += dy
+    blocks[..., 2] += dz
+    free = space.free(np.repeat(q, k, axis=0), blocks.reshape(-1, 7))
+    return ~free.reshape(n, k)
+
+
+def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, dz: float) -> Array:
+    """Return how far blocks (n, 7), shifted by ``dz``, are along y from the robot; inf if never."""
+    shifts, zero = SHIFTS * edge, np.zeros(1)
+    touched = touches(space, q, blocks, zero, -shifts, dz)
+    first = touched.argmax(axis=1)
+    gaps = np.where(touched.any(axis=1), shifts[first], np.inf)
+    rows = np.isfinite(gaps)
+    q, blocks, high = q[rows], blocks[rows], gaps[rows]
+    low = np.where(first[rows] > 0, shifts[first[rows] - 1], 0.0)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        hit = touches(space, q, blocks, zero, -middle[:, None], dz)[:, 0]
+        low, high = np.where(hit, low, middle), np.where(hit, middle, high)
+    gaps[rows] = high
+    return gaps
+
 
 MAX_PLANS = 8  # maximum number of plans per episode
 GAIN = 0.2

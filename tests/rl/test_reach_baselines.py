@@ -13,7 +13,7 @@ from morphgen.rl.baselines import baselines_for
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.path_planner import PathFollower
 from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
-from morphgen.rl.rollouts import run_episodes
+from morphgen.rl.inference import run_episodes
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch
 

@@ -10,8 +10,7 @@ from helpers.goal_sets import draw_spec
 from helpers.learners import learner
 from helpers.scenes import robot
 from morphgen.rl.baselines.simple import Zero
-from morphgen.rl.inference import make_env_and_controller, play, read_controller
-from morphgen.rl.rollouts import run_episodes
+from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch

@@ -13,14 +13,16 @@ from helpers.simulators import PYBULLET
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import Link
-from morphgen.rl.baselines.push_planner import (
+from morphgen.rl.baselines.scripted_push import (
+    MAX_PLANS,
+    RISE,
     SPEED,
     PushPlanner,
+    ScriptedPush,
     ToolKinematics,
     find_contacts,
     overhang,
 )
-from morphgen.rl.baselines.scripted_push import MAX_PLANS, RISE, ScriptedPush
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig

@@ -15,7 +15,7 @@ from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
-from morphgen.rl.rollouts import STEPS_UNREAD, run_episodes
+from morphgen.rl.inference import STEPS_UNREAD, run_episodes
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace

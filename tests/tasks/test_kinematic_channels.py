@@ -13,9 +13,9 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, frame_jacobian
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.rl.config import PolicyConfig
+from morphgen.rl.inference import run_episodes
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
-from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.kinematic_channels import (
     COLUMN_SCALE,
     IK_SHARE,
