@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.model.kinematics import forward_kinematics, link_jacobians
-from morphgen.model.robot import Robot
+from morphgen.model.robot import Inertial, Robot
 from morphgen.typing import Array
 
 GRAVITY = 9.81  # gravity along -z [m/s^2]
@@ -67,18 +68,10 @@ def movable_mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1. The matrix is
     symmetric, shape (n_movable, n_movable).
     """
-    T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
-    J_root_link = link_jacobians(robot, T_root_link)
     M = np.zeros((len(robot.movable_joints),) * 2)
-    for i, link in enumerate(robot.links):
-        if link.inertial is None or link.inertial.mass == 0:
-            continue
-        R = T_root_link[i, :3, :3]
-        com = T_root_link[i, :3, 3] + R @ np.array(link.inertial.com)
-        angular = J_root_link[i, 3:]
-        linear = J_root_link[i, :3] + np.cross(angular, com, axis=0)
-        M += link.inertial.mass * linear.T @ linear
-        M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
+    for inertial, R, linear, angular in _motions_of_masses(robot, q):
+        M += inertial.mass * linear.T @ linear
+        M += angular.T @ (R @ inertial.matrix @ R.T) @ angular
     return M
 
 
@@ -88,15 +81,23 @@ def gravity_load(robot: Robot, q: ArrayLike) -> Array:
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.3. Every movable
     joint has a force, mimic joints their own, shape (n_movable,) [N m or N].
     """
+    forces = np.zeros(len(robot.movable_joints))
+    for inertial, _, linear, _ in _motions_of_masses(robot, q):
+        forces += inertial.mass * GRAVITY * linear[2]
+    return forces
+
+
+def _motions_of_masses(
+    robot: Robot, q: ArrayLike
+) -> Iterator[tuple[Inertial, Array, Array, Array]]:
+    """Yield links with mass: rotation, and Jacobians (3, n_movable) of the centre and rotation."""
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
     J_root_link = link_jacobians(robot, T_root_link)
-    forces = np.zeros(len(robot.movable_joints))
     for T, J, link in zip(T_root_link, J_root_link, robot.links, strict=True):
-        if link.inertial is not None:
+        if link.inertial is not None and link.inertial.mass != 0:
             com = T[:3, 3] + T[:3, :3] @ np.array(link.inertial.com)
-            rise = (J[:3] + np.cross(J[3:], com, axis=0))[2]
-            forces += link.inertial.mass * GRAVITY * rise
-    return forces
+            linear = J[:3] + np.cross(J[3:], com, axis=0)
+            yield link.inertial, T[:3, :3], linear, J[3:]
 
 
 def armature(robot: Robot) -> Array:

@@ -194,30 +194,31 @@ def compile_tree(
     if max_links is not None and max_links < most:
         raise ValueError(f"max_links is {max_links}; expected at least {most}")
     links = max_links or most
-    levels_of = [_levels(robot) for robot in robots]
-    levels, column, start = [], np.zeros((len(robots), links), dtype=np.int64), 1
-    level_column = np.zeros_like(column)  # column of each link within its level
-    for depth in range(1, max(map(len, levels_of))):
-        members = [rows[depth] if depth < len(rows) else [] for rows in levels_of]
-        width = max(map(len, members))
-        link, parent = np.zeros((2, len(robots), width), dtype=np.int64)
-        for r, robot in enumerate(robots):
-            for w, i in enumerate(members[r]):
-                link[r, w], parent[r, w] = i, level_column[r, robot.parents[i]]
-                level_column[r, i], column[r, i] = w, start + w
-        levels.append((torch.from_numpy(link).to(device), torch.from_numpy(parent).to(device)))
-        start += width
-    movable = np.zeros((len(robots), links), dtype=np.bool_)
-    for row, robot in zip(movable, robots, strict=True):
-        row[[k + 1 for k in robot.movable_joints]] = True
-    counts = np.array([len(robot.links) for robot in robots])
+    size = len(robots), links
+    parents, depth, place, column = np.zeros((4, *size), dtype=np.int64)
+    is_link, movable = np.zeros((2, *size), dtype=np.bool_)
+    for r, robot in enumerate(robots):
+        is_link[r, : len(robot.links)] = True
+        movable[r, [k + 1 for k in robot.movable_joints]] = True
+        for i, parent in enumerate(robot.parents[1:], 1):
+            parents[r, i], depth[r, i] = parent, depth[r, parent] + 1
+    levels, start = [], 1
+    for level in range(1, depth.max() + 1):
+        row, links_at = np.nonzero(depth == level)
+        places = (depth == level).cumsum(axis=1)[row, links_at] - 1
+        place[row, links_at], column[row, links_at] = places, start + places
+        link, above = np.zeros((2, len(robots), places.max() + 1), dtype=np.int64)
+        link[row, places] = links_at
+        above[row, places] = place[row, parents[row, links_at]]
+        levels.append((torch.from_numpy(link).to(device), torch.from_numpy(above).to(device)))
+        start += link.shape[1]
     rows = [
         [(None, np.eye(4)), *((k, joint.T_parent_joint.matrix) for k, joint in joints)]
         for joints in (enumerate(robot.joints) for robot in robots)
     ]
     return KinematicTree(
         joints=_joint_tensors(robots, rows, links, dtype, device, pad_front=False),
-        is_link=torch.from_numpy(np.arange(links) < counts[:, None]).to(device),
+        is_link=torch.from_numpy(is_link).to(device),
         is_movable=torch.from_numpy(movable).to(device),
         levels=tuple(levels),
         column=torch.from_numpy(column).to(device),
@@ -383,17 +384,6 @@ def _joint_tensors(
         torch.from_numpy(values).to(device, dtype) for values in (T, axis, gain, offset)
     )
     return JointTensors(T_all, axes, torch.from_numpy(prismatic).to(device), gains, offsets)
-
-
-def _levels(robot: Robot) -> list[list[int]]:
-    """Return the indices of the links at each depth of the tree, the root's level first."""
-    depths = [0]
-    for parent in robot.parents[1:]:
-        depths.append(depths[parent] + 1)
-    levels: list[list[int]] = [[] for _ in range(max(depths) + 1)]
-    for i, depth in enumerate(depths):
-        levels[depth].append(i)
-    return levels
 
 
 def _select(poses: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
