@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -216,18 +217,18 @@ def _stepped(
     find_causes: Callable[[Array], tuple[str, ...]],
 ) -> HoldRow:
     """Add the steps of all independent joints to the row of a robot that holds its home."""
-    steps = []
+    steps: list[_Step] = []
     for target in step_targets(robot):
         step = _step(robot, simulation, target)
         if step is None:
             return replace(row, passed=False, message="a step diverged")
         steps.append(step)
-    settling_time = max((step.settling_time for step in steps), default=0.0)
+    slowest = max((step.settling_time for step in steps), default=0.0)
     row = replace(
         row,
         step_error=max((step.error for step in steps), default=0.0),
         follower_error=max((step.follower_error for step in steps), default=0.0),
-        settling_time=settling_time if settling_time < math.inf else None,
+        settling_time=slowest if slowest < math.inf else None,
     )
     failed = sorted((s for s in steps if s.severity > 1), key=lambda s: s.severity, reverse=True)
     if not failed:
@@ -262,56 +263,46 @@ def step_targets(robot: Robot) -> Array:
     return np.array(targets).reshape(-1, robot.dof)
 
 
-@dataclass(frozen=True)
-class _Step:
+class _Step(NamedTuple):
     """Result of one step."""
 
     target: Array
     error: float
     follower_error: float
     settling_time: float
-    severity: float
-    """Error of the worst joint, relative to the accepted one."""
-    fault: str
-    """Description of the largest error."""
+    severity: float  # error of the worst joint, relative to the accepted one
+    fault: str  # description of the largest error
 
 
 def _step(robot: Robot, simulation: SimulatedRobot, target: Array) -> _Step | None:
     """Move to a target; return None if the simulation diverges."""
-    joints = [robot.joints[k] for k in robot.movable_joints]
-    independent = [i for i, joint in enumerate(joints) if joint.is_independent]
-    sizes = np.array([STEP[joint.kind] for joint in joints])
+    joints, independent = [robot.joints[k] for k in robot.movable_joints], robot.independent_rows
     moved = int(np.argmax(np.abs(target - robot.home)))
-    size = abs(float(target[moved] - robot.home[moved]))
-    band = BAND * sizes
+    stepped, size = joints[independent[moved]], abs(float(target[moved] - robot.home[moved]))
+    accepted = np.array([MAX_FOLLOWER_ERROR[joint.kind] for joint in joints])
+    band = BAND * np.array([STEP[joints[i].kind] for i in independent])
+    band[moved] = BAND * size
     lag, settled_at = np.zeros(len(joints)), math.inf
-    band[independent[moved]] = BAND * size
     for i, q in enumerate(islice(simulation.run(target), round(STEP_S / simulation.period))):
         if not np.isfinite(q).all():
             return None
         time = (i + 1) * simulation.period
         lag = np.maximum(lag, np.abs(q - movable_positions(robot, q[independent])))
         errors = np.abs(q[independent] - target)
-        settled_at = min(settled_at, time) if (errors <= band[independent]).all() else math.inf
+        settled_at = min(settled_at, time) if (errors <= band).all() else math.inf
         if time - settled_at >= SETTLED_S:
             break
-    severities = lag / np.array([MAX_FOLLOWER_ERROR[joint.kind] for joint in joints])
-    distances = lag.copy()
+    severities, distances = lag / accepted, lag.copy()
     if settled_at == math.inf:
-        severities[independent] = errors / band[independent]
-        distances[independent] = errors
+        severities[independent], distances[independent] = errors / band, errors
     worst = int(severities.argmax())
     where = "its target" if worst in independent else "its leader"
-    stepped, joint = joints[independent[moved]], joints[worst]
-    return _Step(
-        target,
-        float(errors.max()),
-        float(lag.max()),
-        settled_at,
-        float(severities[worst]),
-        f"{joint.name} is {distances[worst]:.2g} {_unit(joint)} from {where} when {stepped.name} "
-        f"steps by {size:.2g} {_unit(stepped)}",
+    fault = (
+        f"{joints[worst].name} is {distances[worst]:.2g} {_unit(joints[worst])} from {where} when "
+        f"{stepped.name} steps by {size:.2g} {_unit(stepped)}"
     )
+    error, follower_error = float(errors.max()), float(lag.max())
+    return _Step(target, error, follower_error, settled_at, float(severities[worst]), fault)
 
 
 def _causes(robot: Robot, contact_margin: float | None, q: Array) -> tuple[str, ...]:
@@ -337,9 +328,11 @@ def overloads(robot: Robot, q: ArrayLike) -> tuple[str, ...]:
     causes = []
     for joint, load in zip((robot.joints[k] for k in robot.movable_joints), loads, strict=True):
         if joint.effort and abs(load) > joint.effort:
-            needed = f"{abs(load):.3g} {'N' if joint.kind == 'prismatic' else 'N m'}"
-            effort = f"its effort is {joint.effort:.3g}"
-            causes.append(f"{joint.name} needs {needed} to carry the weight, {effort}")
+            unit = "N" if joint.kind == "prismatic" else "N m"
+            causes.append(
+                f"{joint.name} needs {abs(load):.3g} {unit} to carry the weight, its effort is "
+                f"{joint.effort:.3g}"
+            )
     return tuple(causes)
 
 
