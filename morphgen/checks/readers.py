@@ -27,7 +27,8 @@ from morphgen.formats.quiet import quiet
 from morphgen.formats.usd import convert_urdf, prim_name
 from morphgen.model.dynamics import GRAVITY
 from morphgen.model.geometry import Pose
-from morphgen.model.robot import Mimic
+from morphgen.model.kinematics import joint_motions
+from morphgen.model.robot import Joint, JointKind, Mimic
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -502,19 +503,12 @@ def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int)
 
 def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
     """Return the motion of a joint in its frame, shape (n, 4, 4)."""
-    motion = np.tile(np.eye(4), (n, 1, 1))
-    token, positions = prim.GetAttribute("physics:axis").Get(), q.get(prim_name(prim))
-    if token is None or positions is None:  # a fixed joint has no axis
-        return motion
-    axis = "XYZ".index(token)
-    if prim.GetTypeName() == "PhysicsPrismaticJoint":
-        motion[:, axis, 3] = positions
-        return motion
-    a, b = (axis + 1) % 3, (axis + 2) % 3
-    motion[:, a, a] = motion[:, b, b] = np.cos(positions)
-    motion[:, b, a] = np.sin(positions)
-    motion[:, a, b] = -motion[:, b, a]
-    return motion
+    axis, positions = prim.GetAttribute("physics:axis").Get(), q.get(prim_name(prim))
+    if axis is None or positions is None:  # a fixed joint has no axis
+        return np.tile(np.eye(4), (n, 1, 1))
+    kind: JointKind = "prismatic" if prim.GetTypeName() == "PhysicsPrismaticJoint" else "revolute"
+    x, y, z = np.eye(3)["XYZ".index(axis)].tolist()
+    return joint_motions([Joint("", kind, "", "", axis=(x, y, z))], positions[:, None])[:, 0]
 
 
 def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401

@@ -89,7 +89,7 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     """Return ``T_root_link``, the pose of every link in the root frame, (..., n_links, 4, 4)."""
     positions = movable_positions(robot, q)
-    motions = _joint_motions([robot.joints[k] for k in robot.movable_joints], positions)
+    motions = joint_motions([robot.joints[k] for k in robot.movable_joints], positions)
     T_root_link = np.empty((*positions.shape[:-1], len(robot.links), 4, 4))
     T_root_link[..., 0, :, :] = np.eye(4)
     column = {k: i for i, k in enumerate(robot.movable_joints)}
@@ -147,7 +147,7 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
             np.zeros((*positions.shape[:-1], 6, robot.dof)),
         )
     slides, axes = _slides_and_axes(chain)
-    T_joints = np.array(fixed) @ _joint_motions(chain, positions[..., rows])
+    T_joints = np.array(fixed) @ joint_motions(chain, positions[..., rows])
     for i in range(1, len(chain)):
         T_joints[..., i, :, :] = T_joints[..., i - 1, :, :] @ T_joints[..., i, :, :]
     T_root_frame = T_joints[..., -1, :, :] @ T_last_frame
@@ -279,7 +279,7 @@ def _slides_and_axes(joints: Sequence[Joint]) -> tuple[NDArray[np.bool_], Array]
     return slides, np.array([joint.unit_axis for joint in joints]).reshape(-1, 3)
 
 
-def _joint_motions(joints: Sequence[Joint], positions: Array) -> Array:
+def joint_motions(joints: Sequence[Joint], positions: Array) -> Array:
     """Return transforms (..., k, 4, 4) of k movable joints at positions (..., k) [rad or m]."""
     slides, axes = _slides_and_axes(joints)
     T = np.zeros((*positions.shape, 4, 4))

@@ -16,7 +16,7 @@ from morphgen.checks.self_collision import (
     survey_collisions,
 )
 from morphgen.errors import RobotError
-from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Joint, Link, Robot
 
@@ -212,30 +212,6 @@ def test_a_configuration_is_perturbed_where_epa_fails(monkeypatch, tmp_path, cap
     assert len(given_up) == 2
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
-
-
-def test_two_cylinders_on_which_epa_fails():
-    """Two elbow shapes of YuMi that overlap by 0.02 mm; EPA of MuJoCo 4.0 fails on them."""
-    shapes = (
-        Shape(
-            Cylinder(0.034199, 0.161572),
-            Pose(
-                (0.31944882411177733, 0.09567079536944428, 0.7688523586586223),
-                (-0.2757582120712299, 0.7316501280197765, 0.40646021705745716, 0.4726897403091473),
-            ),
-        ),
-        Shape(
-            Cylinder(0.043299, 0.108354),
-            Pose(
-                (0.45498025657258256, 0.15469648333251212, 0.730485789367942),
-                (0.4797187306749713, 0.6355797011935347, 0.15535838236271107, 0.584612825637595),
-            ),
-        ),
-    )
-    robot = slides(0.0, 0.0)
-    links = [replace(a, collisions=(b,)) for a, b in zip(robot.links[1:], shapes, strict=True)]
-    (found,) = penetrations(replace(robot, links=(robot.root, *links)), [[0.0, 0.0]])
-    assert found == {}
 
 
 def test_repeated_epa_failure_is_an_error(monkeypatch):
