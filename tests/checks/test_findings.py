@@ -1,9 +1,11 @@
 """Every fault has a finding; a valid robot has none."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import pytest
+import yaml
 
 from helpers.faulty_robots import (
     MESHES,
@@ -51,6 +53,11 @@ def test_each_fault_has_its_finding_and_all_are_sorted(code):
     )
     assert findings == check(ROBOTS[code]())
     assert all(f.why and f.fix and "\n" not in f.why + f.fix for f in findings)
+
+
+def test_every_row_of_the_table_has_a_robot_with_its_fault():
+    rows = yaml.safe_load((Path(rules.__file__).parent / "findings.yaml").read_text())
+    assert {row.split("/")[0] for row in rows} == {*ROBOTS, *MESHES}
 
 
 def test_a_tool_is_required_only_on_request():
