@@ -24,9 +24,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from morphgen.benchmark.scores.episode_table import EPISODES, name_of, read_table
-from morphgen.benchmark.scores.score_tables import ResultRow, result_rows
-from morphgen.benchmark.scores.submission import Submission
+from morphgen.benchmark.scores.results import ResultRow, result_rows
+from morphgen.benchmark.scores.submission import EPISODES, Submission, name_of, read_table
 from morphgen.rl.scores import Interval, relative_scores, success_interval
 from morphgen.splits.split import SIDES
 

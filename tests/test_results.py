@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from morphgen.benchmark.scores.episode_table import EPISODES, read_table
+from morphgen.benchmark.scores.submission import EPISODES, read_table
 from morphgen.cli import main
 from morphgen.splits.split import sided_members
 from morphgen.splits.split_file import read_split, split_names

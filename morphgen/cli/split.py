@@ -416,7 +416,7 @@ def _results(study: Path | None, splits: Sequence[Split]) -> list[BaselineResult
     """Return the results of the baselines of a study on each split; none without a study."""
     if study is None:
         return [{} for _ in splits]
-    from morphgen.benchmark.scores.leaderboard import study_results
+    from morphgen.benchmark.scores.results import study_results
 
     return [study_results(study, split) for split in splits]
 

@@ -16,7 +16,7 @@ from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.eval_protocol import EvalProtocol
-    from morphgen.benchmark.scores.leaderboard import References
+    from morphgen.benchmark.scores.results import References
     from morphgen.benchmark.survey import BaselineResults
     from morphgen.splits.split import Split
 
@@ -71,7 +71,7 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.benchmark.scores.leaderboard import collect_references, reference_files
+        from morphgen.benchmark.scores.results import collect_references, reference_files
 
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
@@ -152,7 +152,7 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
     from morphgen.benchmark.eval_protocol import expected_robots
-    from morphgen.benchmark.scores.leaderboard import (
+    from morphgen.benchmark.scores.results import (
         ranked,
         ranking_data,
         ranking_table,
@@ -228,7 +228,7 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
 
     from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
     from morphgen.benchmark.release import is_release, opened_folder, read_release
-    from morphgen.benchmark.scores.leaderboard import References, read_references
+    from morphgen.benchmark.scores.results import References, read_references
     from morphgen.benchmark.split_folder import SPLIT_FILE, is_archive
     from morphgen.benchmark.verify import require_unchanged
     from morphgen.splits.split_file import read_split

@@ -69,8 +69,7 @@ PAPER = "paper"
 )
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
-    from morphgen.benchmark.scores.score_tables import TABLE, write_tables
-    from morphgen.benchmark.scores.study import require_cells
+    from morphgen.benchmark.scores.study import TABLE, require_cells, write_tables
 
     execution_config(args)  # refuses invalid options before the work
     cells = _cells(args)
@@ -226,8 +225,8 @@ MODES = ("deterministic", "stochastic", "all")
 )
 def score(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    from morphgen.benchmark.scores.episode_table import read_submissions
-    from morphgen.benchmark.scores.score_tables import NOTE, result_rows, result_tables, rows_data
+    from morphgen.benchmark.scores.results import NOTE, result_rows, result_tables, rows_data
+    from morphgen.benchmark.scores.submission import read_submissions
 
     submissions = read_submissions(args.files)
     modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}

@@ -20,9 +20,8 @@ from helpers.submissions import (
     submission,
 )
 from morphgen.benchmark.eval_protocol import EvalProtocol
-from morphgen.benchmark.scores import leaderboard
-from morphgen.benchmark.scores.episode_table import EPISODES, append_submission
-from morphgen.benchmark.scores.leaderboard import (
+from morphgen.benchmark.scores import results as results_module
+from morphgen.benchmark.scores.results import (
     References,
     Row,
     SideScore,
@@ -36,7 +35,7 @@ from morphgen.benchmark.scores.leaderboard import (
     score_submission,
     study_results,
 )
-from morphgen.benchmark.scores.submission import require_same_random
+from morphgen.benchmark.scores.submission import EPISODES, append_submission, require_same_random
 from morphgen.benchmark.survey import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
@@ -47,7 +46,7 @@ LIBRARY = default_library()
 
 @pytest.fixture
 def this_version(monkeypatch):
-    monkeypatch.setattr(leaderboard, "version", lambda name: VERSION)
+    monkeypatch.setattr(results_module, "version", lambda name: VERSION)
 
 
 def test_scores_are_computed_from_the_episodes():

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from helpers.submissions import BASELINE, SPLIT, data
-from morphgen.benchmark.scores import episode_table
-from morphgen.benchmark.scores.episode_table import (
+from morphgen.benchmark.scores import submission as submission_module
+from morphgen.benchmark.scores.results import result_rows, result_tables
+from morphgen.benchmark.scores.submission import (
     COLUMNS,
     EPISODES,
     append_submission,
     mode_of,
     read_submissions,
     read_table,
+    submission_from,
 )
-from morphgen.benchmark.scores.score_tables import result_rows, result_tables
-from morphgen.benchmark.scores.submission import submission_from
 from morphgen.errors import BenchmarkError
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split
@@ -261,10 +261,10 @@ def test_damaged_tables_are_refused(tmp_path, content, why):
 
 def test_a_table_of_too_many_bytes_is_refused(table, monkeypatch):
     size = len(gzip.decompress(table.read_bytes()))
-    monkeypatch.setattr(episode_table, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(submission_module, "MAX_BYTES", size - 1)
     with pytest.raises(BenchmarkError, match=f"more than {size - 1} bytes without compression"):
         read_table(table)
-    monkeypatch.setattr(episode_table, "MAX_BYTES", size)
+    monkeypatch.setattr(submission_module, "MAX_BYTES", size)
     assert len(read_table(table)) == 3
 
 

@@ -17,9 +17,11 @@ import morphgen
 from helpers.commands import tree
 from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.benchmark.scores import study
-from morphgen.benchmark.scores.episode_table import EPISODES, append_submission, read_table
-from morphgen.benchmark.scores.score_tables import CURVES, DATA, TABLE, result_rows, write_tables
+from morphgen.benchmark.scores.results import result_rows
 from morphgen.benchmark.scores.study import (
+    CURVES,
+    DATA,
+    TABLE,
     agent_cell,
     baseline_cells,
     matched_budget,
@@ -27,7 +29,9 @@ from morphgen.benchmark.scores.study import (
     run_cells,
     run_cells_on_ray,
     stored_results,
+    write_tables,
 )
+from morphgen.benchmark.scores.submission import EPISODES, append_submission, read_table
 from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
 from morphgen.rl.inference import MODES

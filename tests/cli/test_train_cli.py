@@ -10,7 +10,7 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.runs import ROLLOUT, RUN, SMALL
-from morphgen.benchmark.scores.episode_table import read_table
+from morphgen.benchmark.scores.submission import read_table
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import specs_of
 from morphgen.rl.runs.training import METRICS, read_metrics

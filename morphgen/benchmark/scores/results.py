@@ -1,6 +1,8 @@
-"""Scores of submissions, computed from the episodes: their ranking, and reference scores.
+"""Results of submissions, computed from the episodes: rankings, reference scores, tables of seeds.
 
-Reference scores are those of submissions in a release, and of the baselines of a study.
+Reference scores are those of submissions in a release, and of the baselines of a study. In tables,
+scores of several seeds of a method stand in one row: interquartile means with a bootstrap over the
+seeds, success rates with Wilson intervals, and paired differences to a reference controller.
 """
 
 from __future__ import annotations
@@ -8,8 +10,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -20,11 +22,14 @@ from tabulate import tabulate
 
 from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
-from morphgen.benchmark.scores.episode_table import EPISODES, name_of, read_submissions, read_table
 from morphgen.benchmark.scores.submission import (
+    EPISODES,
     Submission,
     check_submission,
+    name_of,
     read_submission,
+    read_submissions,
+    read_table,
     require_comparable,
     require_same_random,
     submission_text,
@@ -32,6 +37,7 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.benchmark.survey import BaselineResult, BaselineResults
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.library import Library
+from morphgen.rl.agents import AGENTS
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores import (
@@ -40,12 +46,16 @@ from morphgen.rl.scores import (
     RobotOutcomes,
     episode_interval,
     finite_or_none,
+    iqm_interval,
     relative_scores,
     score_decimals,
+    stratified_mean_interval,
     success_interval,
 )
 from morphgen.splits.split import SIDES, Side, Split, split_id
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
 
 Source = Literal["submission", "reference"]
 
@@ -313,3 +323,214 @@ def study_results(folder: Path, split: Split) -> BaselineResults:
                 f"that of {split.name}; name a study of these robots"
             )
     return _baseline_results(list(own.values()), None)
+
+
+NOTE = "MT: train robots, ZS: test robots; intervals: 95%"
+
+
+REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
+"""Controller without learning that a policy has to beat, by task."""
+
+
+@dataclass(frozen=True)
+class SideResult:
+    """Result of a method on the robots of one side that do one task, over all of its seeds."""
+
+    robots: int
+    episodes: int  # number of episodes of all robots and seeds
+    mean: float  # mean score over seeds and robots
+    iqm: Interval  # interquartile mean of the scores of seeds and robots; no interval for one seed
+    success: Interval  # success rate of all episodes with its Wilson interval
+    difference: Interval | None
+    """Score minus that of the reference in the same episodes, with a bootstrap over the episodes
+    of each robot; None without a reference."""
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """Results of a method in one mode at one task of a split."""
+
+    split: str
+    task: str
+    method: str
+    mode: str  # `deterministic`, `stochastic`, or empty for a controller that does not learn
+    finetuned: int  # transitions of fine-tuning on the test robots
+    transitions: int | None
+    """Transitions of the training; None if it is not known or there was none."""
+    simulator: str  # simulator of the training; empty like `transitions`
+    seeds: tuple[int, ...]  # seeds of the training
+    sides: Mapping[Side, SideResult]
+
+
+def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
+    """Return a row for every split, task, method, mode, training and amount of fine-tuning."""
+    by_split: dict[str, dict[str, Submission]] = {}
+    for where, each in submissions.items():
+        by_split.setdefault(each.split.name, {})[where] = each
+    rows: list[ResultRow] = []
+    for split, own in by_split.items():
+        require_comparable(own)
+        _require_shipped_robots(split, own)
+        require_same_random(list(own.items()))
+        groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
+        for where, each in own.items():
+            group = groups.setdefault(_key(each), {})
+            earlier, other = group.setdefault(each.training_seed, (where, each))
+            if each.robots != other.robots:  # several studies may have the same run of a baseline
+                raise BenchmarkError(
+                    f"{where}: the same run, seed and mode as {earlier} with other episodes; name "
+                    "one of the two files"
+                )
+        for task in dict.fromkeys(robot.task for each in own.values() for robot in each.robots):
+            baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
+            _, reference = baseline.get(None, ("", None))
+            for key, group in groups.items():
+                sides = dict(_side_results([run for _, run in group.values()], task, reference))
+                seeds = tuple(sorted(seed for seed in group if seed is not None))
+                if sides:
+                    rows.append(ResultRow(split, task, *key, seeds, sides))
+    return rows
+
+
+_Key = tuple[str, str, int, int | None, str]
+"""Fields of a ``ResultRow`` from ``method`` to ``simulator``, which its seeds have in common."""
+
+
+def _key(submission: Submission) -> _Key:
+    training = submission.training
+    return (
+        submission.method,
+        submission.mode,
+        submission.finetuned,
+        training.transitions if training else None,
+        training.simulator if training else "",
+    )
+
+
+def _require_shipped_robots(split: str, submissions: Mapping[str, Submission]) -> None:
+    """Require the robots of a split of morphgen as it is, if it has this name."""
+    if split not in split_names():
+        return
+    shipped = read_split(split)
+    bodies = {(s, m.name): m.robot_hash for s in SIDES for m in shipped.side(s)}
+    for where, each in submissions.items():
+        for robot in each.robots:
+            expected = bodies.get((robot.side, robot.robot))
+            if robot.body != expected:
+                raise BenchmarkError(
+                    f"{where}: {robot.side} robot {robot.robot}: body {robot.body}; expected "
+                    f"{expected or 'a robot of ' + split}"
+                )
+
+
+def _side_results(
+    runs: Sequence[Submission], task: str, reference: Submission | None
+) -> Iterator[tuple[Side, SideResult]]:
+    for side in SIDES:
+        tables = [_outcomes(run, side, task) for run in runs]
+        names = set(tables[0]).intersection(*tables[1:])
+        if not names:
+            continue
+        if any(len(table) > len(names) for table in tables):
+            raise BenchmarkError(
+                f"{runs[0].split.name}: {runs[0].method}: its seeds have other {side} robots; "
+                "expected the same robots in all"
+            )
+        robots = [name for name in tables[0] if name in names]
+        scores = np.array(
+            [[relative_scores(table[name]).mean() for name in robots] for table in tables]
+        )
+        # Policies of single robots are independent samples on the robots that they learned.
+        together = not any(_learned_alone(run, side) for run in runs)
+        successes = [table[name].success for table in tables for name in robots]
+        episodes = [len(each) for each in successes]
+        yield (
+            side,
+            SideResult(
+                len(robots),
+                sum(episodes),
+                float(scores.mean()),
+                iqm_interval(scores, together=together),
+                success_interval([np.mean(each) for each in successes], episodes),
+                _difference(tables, robots, _outcomes(reference, side, task) if reference else {}),
+            ),
+        )
+
+
+def _learned_alone(run: Submission, side: Side) -> bool:
+    """Return whether a run has a policy for each robot of a side, as its study says."""
+    if run.config is None or run.config["source"]["side"] != side:
+        return False
+    agent = run.config["policy"]["agent"]
+    return agent in AGENTS and AGENTS[agent].per_robot
+
+
+def _outcomes(run: Submission, side: Side, task: str) -> dict[str, RobotOutcomes]:
+    return {each.robot: each for each in run.robots if (each.side, each.task) == (side, task)}
+
+
+def _difference(
+    tables: Sequence[Mapping[str, RobotOutcomes]],
+    robots: Sequence[str],
+    reference: Mapping[str, RobotOutcomes],
+) -> Interval | None:
+    """Return the mean difference to the reference; None if it lacks a robot or is the method."""
+    if not reference.keys() >= set(robots) or tables[0] == reference:
+        return None
+    strata: list[Array] = []
+    for name in robots:
+        own = relative_scores(reference[name])
+        for table in tables:
+            if len(table[name].score) % len(own):
+                raise BenchmarkError(
+                    f"robot {name}: {len(table[name].score)} episodes; expected a multiple of the "
+                    f"{len(own)} of the reference"
+                )
+        # Policies of single robots have the episodes of each policy one after another.
+        seeds = [
+            relative_scores(table[name]).reshape(-1, len(own)).mean(axis=0) for table in tables
+        ]
+        strata.append(np.mean(seeds, axis=0) - own)
+    return stratified_mean_interval(strata)
+
+
+def rows_data(rows: Sequence[ResultRow]) -> list[Any]:
+    """Return rows as JSON values, with null for ends of intervals that are not known."""
+    return [finite_or_none(asdict(row)) for row in rows]
+
+
+def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
+    """Return a table for every split and task, under its name."""
+    parts = []
+    for split, task in dict.fromkeys((row.split, row.task) for row in rows):
+        own = [row for row in rows if (row.split, row.task) == (split, task)]
+        reference = f"minus {REFERENCES[task]}" if task in REFERENCES else ""
+        headers = ["method", "seeds", "trained", "fine-tuned"]
+        for side in SIDES:
+            name = SIDE_NAMES[side]
+            headers += [f"{name} mean", f"{name} IQM", f"{name} success", reference]
+        decimals = score_decimals(side.mean for row in own for side in row.sides.values())
+        lines = [_line(row, decimals) for row in own]
+        title = split if split.endswith(f"/{task}") else f"{split}: {task}"
+        table = tabulate(lines, headers, tablefmt=style, disable_numparse=True)
+        parts.append(f"{'## ' * (style == 'github')}{title}\n\n{table}\n")
+    return "\n".join(parts)
+
+
+def _line(row: ResultRow, decimals: int) -> list[str]:
+    trained = "-" if row.transitions is None else f"{row.transitions:,} {row.simulator}"
+    name = f"{row.method} ({row.mode})" if row.mode == "stochastic" else row.method
+    tuned = f"{row.finetuned:,}" if row.finetuned else "-"
+    line = [name, str(len(row.seeds) or "-"), trained, tuned]
+    for side in SIDES:
+        result = row.sides.get(side)
+        if result is None:
+            line += ["-"] * 4
+            continue
+        line += [
+            f"{result.mean:.{decimals}f}",
+            result.iqm.as_text(f".{decimals}f"),
+            result.success.as_percent(),
+            "-" if result.difference is None else result.difference.as_text(f"+.{decimals}f"),
+        ]
+    return line
