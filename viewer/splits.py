@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +14,29 @@ import viser
 from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.survey import (
     Fault,
-    MeasuredRobot,
-    SplitSurvey,
     SurveyedRobot,
-    measure_robot,
+    compare_members,
+    different_members,
     summarize_survey,
+    survey_robot,
 )
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import MEASURES
-from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.progress import report
-from morphgen.splits.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Side, Split
+from morphgen.splits.split import (
+    COMPOSED,
+    HOLD_OUT,
+    REGIMES,
+    Member,
+    Regime,
+    Side,
+    Split,
+    sided_members,
+)
 from morphgen.splits.split_file import require_split_name, write_split
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
@@ -122,56 +132,30 @@ def study_split(
             f"{len(members)} robots are too many to compare all pairs (at most {MAX_ROBOTS}); "
             "use morphgen split audit and morphgen split stats"
         )
-    futures = {
-        text: workers.submit(measure_derivation, text, folders, split.max_links)
-        for text in dict.fromkeys(member.derivation for member in members)
-    }
-    measured = {}
-    for i, (text, future) in enumerate(futures.items(), 1):
-        measured[text] = workers.result(future)
+    measure = partial(survey_robot, Library(folders), split.max_links)
+    futures = [workers.submit(measure, member) for member in different_members(split)]
+    robots = []
+    for i, future in enumerate(futures, 1):
+        robots.append(workers.result(future))
         report(i, len(futures))
-    return workers.result(workers.submit(conclude_study, split, measured, folders))
-
-
-def measure_derivation(
-    derivation: str, folders: tuple[Path, ...], max_links: int
-) -> MeasuredRobot | Fault:
-    """Compose and measure a robot. Runs in a worker."""
-    try:
-        robot = compose(parse_derivation(derivation), Library(folders), "robot")
-        return measure_robot(robot, folders, max_links)
-    except MorphgenError as error:
-        return Fault("body-broken", str(error))
+    return workers.result(workers.submit(conclude_study, split, robots, folders))
 
 
 def conclude_study(
-    split: Split, measured: Mapping[str, MeasuredRobot | Fault], folders: tuple[Path, ...]
+    split: Split, robots: Sequence[SurveyedRobot | Fault], folders: tuple[Path, ...]
 ) -> SplitStudy:
     """Compare measured robots, audit the split and compute its statistics. Runs in a worker."""
-    members = [(side, member) for side in SIDES for member in split.side(side)]
-    results = [measured[member.derivation] for _, member in members]
-    sound = [i for i, result in enumerate(results) if isinstance(result, MeasuredRobot)]
-    features = [result.features for result in results if isinstance(result, MeasuredRobot)]
-    matrices = {}
-    # Pairs with a robot that cannot be composed stay NaN, as the survey wants them.
-    similarity = np.full((len(members), len(members), len(MEASURES)), np.nan)
-    for k, (name, measure) in enumerate(MEASURES.items()):
-        matrix = np.zeros((len(sound), len(sound)))
-        for i, a in enumerate(features):
-            for j, b in enumerate(features[: i + 1]):
-                matrix[i, j] = matrix[j, i] = measure.function(a, b)
-        matrices[name] = matrix
-        similarity[np.ix_(sound, sound, [k])] = matrix[..., None]
-    robots: list[SurveyedRobot | Fault] = [
-        result.surveyed if isinstance(result, MeasuredRobot) else result for result in results
-    ]
-    n = len(split.train)
-    survey = SplitSurvey(split, tuple(robots[:n]), tuple(robots[n:]), similarity[:n, n:])
+    survey = compare_members(split, robots, "all")
+    sound = [i for i, each in enumerate(survey.robots) if isinstance(each, SurveyedRobot)]
+    members = sided_members(split)
     return SplitStudy(
         audit_survey(survey, Library(folders)),
         summarize_survey(survey) if len(sound) == len(members) else {},
         tuple(members[i] for i in sound),
-        matrices,
+        {
+            name: survey.similarity[np.ix_(sound, sound, [k])][..., 0]
+            for k, name in enumerate(MEASURES)
+        },
     )
 
 

@@ -172,7 +172,12 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
 def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
     """Return which pairs have nearly one reach, shape (n_train, n_test)."""
     train, test = (
-        np.array([np.nan if isinstance(each, Fault) else each.shoulder_reach for each in robots])
+        np.array(
+            [
+                np.nan if isinstance(each, Fault) else each.features.workspace.reach
+                for each in robots
+            ]
+        )
         for robots in (survey.train, survey.test)
     )
     return is_same_reach(train[:, None], test[None, :], near)
@@ -223,14 +228,14 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
 
 
 def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
-    for j, member in enumerate(survey.split.test):
-        for name, train, value in nearest_train(survey.split.train, survey.similarity[:, j]):
+    n = len(survey.split.train)
+    for j, member in enumerate(survey.split.test, n):
+        for name, train, value in nearest_train(survey.split.train, survey.similarity[:n, j]):
             yield Neighbour(member.name, name, train, value)
 
 
 def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
-    robots = (*survey.train, *survey.test)
-    for (side, member), robot in zip(sided_members(survey.split), robots, strict=True):
+    for (side, member), robot in zip(sided_members(survey.split), survey.robots, strict=True):
         yield side, member, robot
 
 

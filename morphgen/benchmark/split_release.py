@@ -166,7 +166,7 @@ def release_split(
     parts = licenced_parts(split, library)
     require_allowed(split, parts, request.allowed_licences)
     release = _release(split, request, {})
-    survey = survey_split(split, library, within_train=True, jobs=jobs)
+    survey = survey_split(split, library, pairs="train", jobs=jobs)
     audited = audit_survey(survey, library)
     require_passed(audited)
     rows = survey_difficulty(survey, results)

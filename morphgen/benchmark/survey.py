@@ -10,11 +10,11 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from tabulate import tabulate
 
 from morphgen.encoding.robot_hash import robot_hash
@@ -29,7 +29,7 @@ from morphgen.grammar.values import RobotProperties
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
-from morphgen.splits.split import SIDES, Member, Side, Split
+from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
 from morphgen.typing import Array
 
 
@@ -61,16 +61,12 @@ class SurveyedRobot:
 
     robot_hash: str  # hash of the robot; see `morphgen.encoding.robot_hash`
     stats: RobotStats
-    shoulder_reach: float
-    """Largest distance of the tool from the shoulder, the unit of ``Workspace`` [m]."""
+    features: Features = field(compare=False, repr=False)
+    """What the similarity measures compare."""
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredRobot:
-    """A composed robot with the features that the similarity measures compare."""
-
-    surveyed: SurveyedRobot
-    features: Features
+Pairs = Literal["sides", "train", "all"]
+"""Pairs of robots that are compared: test with train, train robots with each other too, or all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +74,25 @@ class SplitSurvey:
     """Results for all robots of a split."""
 
     split: Split
-    train: tuple[SurveyedRobot | Fault, ...]
-    test: tuple[SurveyedRobot | Fault, ...]
+    robots: tuple[SurveyedRobot | Fault, ...]  # train robots first
     similarity: Array
-    """Similarity of train and test robots by each of ``MEASURES``, shape (n_train, n_test,
-    n_measures); NaN where one of the two robots has a fault."""
-    train_similarity: Array | None = None
-    """Similarity of train robots to each other by each of ``MEASURES``, shape (n_train, n_train,
-    n_measures); NaN where one of the two robots has a fault or both have the same derivation. None
-    if it was not asked for."""
+    """Similarity of all robots by each of ``MEASURES``, shape (n, n, n_measures); NaN for pairs
+    that are not compared, and where one of the two robots has a fault."""
+
+    @property
+    def train(self) -> tuple[SurveyedRobot | Fault, ...]:
+        """The train robots."""
+        return self.robots[: len(self.split.train)]
+
+    @property
+    def test(self) -> tuple[SurveyedRobot | Fault, ...]:
+        """The test robots."""
+        return self.robots[len(self.split.train) :]
 
     def by_measure(self, measure: str) -> Array:
-        """Return the similarity by one measure, shape (n_train, n_test)."""
-        return self.similarity[:, :, tuple(MEASURES).index(measure)]
+        """Return the similarity of train and test robots, shape (n_train, n_test)."""
+        n = len(self.split.train)
+        return self.similarity[:n, n:, tuple(MEASURES).index(measure)]
 
     def composed(self, side: Side) -> tuple[SurveyedRobot, ...]:
         """Return the robots of a side."""
@@ -116,55 +118,8 @@ def robot_stats(robot: Robot) -> RobotStats:
     )
 
 
-def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> MeasuredRobot | Fault:
-    """Measure a robot, unless it has more links than its split allows."""
-    if len(robot.links) > max_links:
-        why = f"it has {len(robot.links)} links, more than max_links {max_links}"
-        return Fault("links-many", why)
-    found = features(robot, token_shapes(robot, folders), max_links=max_links)
-    surveyed = SurveyedRobot(robot_hash(robot), robot_stats(robot), found.workspace.reach)
-    return MeasuredRobot(surveyed, found)
-
-
-def survey_split(
-    split: Split, library: Library, *, within_train: bool = False, jobs: int = 1
-) -> SplitSurvey:
-    """Compose, measure and compare the robots of a split; equal ones once in each side."""
-    (train, rows), (test, columns) = _unique(split.train), _unique(split.test)
-    members, n = [*train, *test], len(train)
-    total = len(members) + n
-    with part_of(total):
-        robots = list(parallel_map(partial(_measure, library, split.max_links), members, jobs))
-    # Workers get the features alone: 74 kB a robot, most of it the density of the workspace.
-    known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
-    with part_of(total, len(members)):
-        compare = partial(_compare, known[:n], known[n:], within_train)
-        results = list(parallel_map(compare, range(n), jobs))
-    similarity = np.array([to_test for to_test, _ in results])
-    pairs = np.full((n, n, len(MEASURES)), np.nan)
-    for i, (_, to_train) in enumerate(results):
-        pairs[i, : len(to_train)] = pairs[: len(to_train), i] = to_train
-    surveyed = [robot if isinstance(robot, Fault) else robot.surveyed for robot in robots]
-    return SplitSurvey(
-        split,
-        tuple(surveyed[row] for row in rows),
-        tuple(surveyed[n + column] for column in columns),
-        similarity.reshape(n, len(test), len(MEASURES))[rows][:, columns],
-        pairs[rows][:, rows] if within_train else None,
-    )
-
-
-def _unique(members: Sequence[Member]) -> tuple[list[Member], list[int]]:
-    """Return the first member of each derivation, and for every member the index of that one."""
-    firsts: dict[str, Member] = {}
-    for member in members:
-        firsts.setdefault(member.derivation, member)
-    order = {derivation: i for i, derivation in enumerate(firsts)}
-    return list(firsts.values()), [order[member.derivation] for member in members]
-
-
-def _measure(library: Library, max_links: int, member: Member) -> MeasuredRobot | Fault:
-    """Compose and measure a member."""
+def survey_robot(library: Library, max_links: int, member: Member) -> SurveyedRobot | Fault:
+    """Compose and measure a robot."""
     try:
         parsed = parse_derivation(member.derivation)
         missing = {node.part for node in parsed.walk()} - library.paths.keys()
@@ -172,28 +127,64 @@ def _measure(library: Library, max_links: int, member: Member) -> MeasuredRobot 
             hints = (f"{part!r}{nearest(part, library.paths)}" for part in sorted(missing))
             return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
         robot = compose(parsed, library, member.name)
-        return measure_robot(robot, library.folders, max_links)
+        if len(robot.links) > max_links:
+            why = f"it has {len(robot.links)} links, more than max_links {max_links}"
+            return Fault("links-many", why)
+        found = features(robot, token_shapes(robot, library.folders), max_links=max_links)
+        return SurveyedRobot(robot_hash(robot), robot_stats(robot), found)
     except MorphgenError as error:
         return Fault("body-broken", str(error))
 
 
-def _compare(
-    train: Sequence[Features | None],
-    test: Sequence[Features | None],
-    within_train: bool,
-    index: int,
-) -> tuple[Array, Array]:
-    """Compare a train robot with the test robots, and with the train robots before it."""
-    before = train[:index] if within_train else ()
-    return _similarity(train[index], test), _similarity(train[index], before)
+def different_members(split: Split) -> list[Member]:
+    """Return the first member of each derivation, train first: a robot is measured once."""
+    firsts: dict[str, Member] = {}
+    for _, member in sided_members(split):
+        firsts.setdefault(member.derivation, member)
+    return list(firsts.values())
 
 
-def _similarity(robot: Features | None, others: Sequence[Features | None]) -> Array:
-    """Return the similarity of a robot to n others, shape (n, n_measures); NaN without features."""
-    values = np.full((len(others), len(MEASURES)), np.nan)
-    for row, other in zip(values, others, strict=True):
-        if robot is not None and other is not None:
-            row[:] = [measure.function(other, robot) for measure in MEASURES.values()]
+def survey_split(
+    split: Split, library: Library, *, pairs: Pairs = "sides", jobs: int = 1
+) -> SplitSurvey:
+    """Compose, measure and compare the robots of a split; equal ones once."""
+    unique = different_members(split)
+    total = 2 * len(unique)
+    with part_of(total):
+        measure = partial(survey_robot, library, split.max_links)
+        robots = list(parallel_map(measure, unique, jobs))
+    with part_of(total, len(unique)):
+        return compare_members(split, robots, pairs, jobs=jobs)
+
+
+def compare_members(
+    split: Split, robots: Sequence[SurveyedRobot | Fault], pairs: Pairs, *, jobs: int = 1
+) -> SplitSurvey:
+    """Return the survey of a split from its robots in the order of ``different_members``."""
+    number = {member.derivation: i for i, member in enumerate(different_members(split))}
+    train, test = ([number[member.derivation] for member in split.side(side)] for side in SIDES)
+    compared = np.zeros((len(robots), len(robots)), dtype=np.bool_)
+    compared[np.ix_(train, test)] = True
+    if pairs != "sides":
+        compared[np.ix_(train, train)] = True
+    compared |= compared.T | (pairs == "all")
+    # Workers get the features alone: 74 kB a robot, most of it the density of the workspace.
+    known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
+    values = np.full((len(robots), len(robots), len(MEASURES)), np.nan)
+    rows = parallel_map(partial(_compare, known, compared), range(len(robots)), jobs)
+    for i, row in enumerate(rows):
+        values[i, : i + 1] = values[: i + 1, i] = row
+    order = [*train, *test]
+    return SplitSurvey(split, tuple(robots[i] for i in order), values[order][:, order])
+
+
+def _compare(known: Sequence[Features | None], compared: NDArray[np.bool_], index: int) -> Array:
+    """Compare a robot with those before it and itself, shape (index + 1, n_measures)."""
+    values = np.full((index + 1, len(MEASURES)), np.nan)
+    robot = known[index]
+    for i in np.flatnonzero(compared[index, : index + 1]).tolist():
+        if robot is not None and (other := known[i]) is not None:
+            values[i] = [measure.function(robot, other) for measure in MEASURES.values()]
     return values
 
 
@@ -334,7 +325,7 @@ def split_difficulty(
     split: Split, library: Library, *, results: BaselineResults | None = None, jobs: int = 1
 ) -> tuple[RobotDifficulty, ...]:
     """Compose, measure and compare the robots of a split; see ``survey_difficulty``."""
-    survey = survey_split(split, library, within_train=True, jobs=jobs)
+    survey = survey_split(split, library, pairs="train", jobs=jobs)
     return survey_difficulty(survey, results)
 
 
@@ -351,47 +342,43 @@ def survey_difficulty(
 
 def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDifficulty]:
     split = survey.split
-    for side in SIDES:
-        robots = survey.composed(side)
-        for i, (member, robot) in enumerate(zip(split.side(side), robots, strict=True)):
-            if robot.robot_hash != member.robot_hash:
-                raise BenchmarkError(
-                    f"split {split.name!r}: robot {member.name!r}: the split names body "
-                    f"{member.robot_hash}, but its derivation gives {robot.robot_hash}: a part, or "
-                    "morphgen, has changed since"
-                )
-            similarity = train_similarity(survey, side, i)
-            key = (side, member.name)
-            yield RobotDifficulty(
-                split.name,
-                side,
-                member.name,
-                member.task,
-                member.obstacles,
-                robot.stats.movable_to_tool,
-                robot.stats.links,
-                _rounded(robot.stats.reach),
-                {
-                    name: NearestTrain(train, _rounded(value))
-                    for name, train, value in nearest_train(split.train, similarity)
-                },
-                {
-                    name: BaselineResult(_rounded(found[key].score), _rounded(found[key].success))
-                    for name, found in results.items()
-                    if key in found
-                },
+    robots = (*survey.composed("train"), *survey.composed("test"))
+    for i, ((side, member), robot) in enumerate(zip(sided_members(split), robots, strict=True)):
+        if robot.robot_hash != member.robot_hash:
+            raise BenchmarkError(
+                f"split {split.name!r}: robot {member.name!r}: the split names body "
+                f"{member.robot_hash}, but its derivation gives {robot.robot_hash}: a part, or "
+                "morphgen, has changed since"
             )
+        nearest = nearest_train(split.train, train_similarity(survey, i))
+        baselines = {
+            name: BaselineResult(_rounded(result.score), _rounded(result.success))
+            for name, found in results.items()
+            if (result := found.get((side, member.name)))
+        }
+        yield RobotDifficulty(
+            split.name,
+            side,
+            member.name,
+            member.task,
+            member.obstacles,
+            robot.stats.movable_to_tool,
+            robot.stats.links,
+            _rounded(robot.stats.reach),
+            {name: NearestTrain(train, _rounded(value)) for name, train, value in nearest},
+            baselines,
+        )
 
 
-def train_similarity(survey: SplitSurvey, side: Side, index: int) -> Array:
+def train_similarity(survey: SplitSurvey, index: int) -> Array:
     """Return the similarity to the train robots, NaN to itself, shape (n_train, n_measures)."""
-    if survey.train_similarity is None:
-        raise ValueError("the survey has no similarity of train robots; expected within_train=True")
-    if side == "test":
-        return np.asarray(survey.similarity[:, index])
-    own = survey.split.train[index].robot_hash
-    is_other = np.array([member.robot_hash != own for member in survey.split.train])
-    return np.where(is_other[:, None], survey.train_similarity[:, index], np.nan)
+    split = survey.split
+    similarity = survey.similarity[: len(split.train), index]
+    if index >= len(split.train):
+        return similarity
+    own = split.train[index].robot_hash
+    is_other = np.array([member.robot_hash != own for member in split.train])
+    return np.where(is_other[:, None], similarity, np.nan)
 
 
 def nearest_train(train: Sequence[Member], similarity: Array) -> Iterator[tuple[str, str, float]]:

@@ -60,7 +60,7 @@ from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import file_sha256, folder_hashes
 from morphgen.grammar.library import Library
 from morphgen.processes import parallel_map
-from morphgen.splits.split import SIDES, Member, Split, compose_member, sided_members, split_id
+from morphgen.splits.split import Member, Split, compose_member, sided_members, split_id
 from morphgen.splits.split_file import find_split, read_split_file
 from morphgen.typing import Array
 
@@ -96,7 +96,7 @@ def _release_differences(
     except MorphgenError as error:
         yield Difference(RELEASE_FILE, str(error))
     if (folder / DIFFICULTY_FILE).exists():  # releases of versions before 0.3 have none
-        survey = survey_split(split, library, within_train=True, jobs=jobs)
+        survey = survey_split(split, library, pairs="train", jobs=jobs)
         for why in _difficulty_differences(folder / DIFFICULTY_FILE, survey):
             yield Difference(DIFFICULTY_FILE, why)
 
@@ -113,7 +113,7 @@ def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
 def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
     """Yield how the structural columns of ``difficulty.csv`` differ from those of a survey."""
     split = survey.split
-    pairs = zip((*split.train, *split.test), (*survey.train, *survey.test), strict=True)
+    pairs = zip((*split.train, *split.test), survey.robots, strict=True)
     if any(isinstance(each, Fault) or each.robot_hash != m.robot_hash for m, each in pairs):
         return  # robots differ from the split: the caller of this module lists them
     try:
@@ -129,14 +129,13 @@ def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
         yield f"it has {len(lines)} robots, not {len(rows)}"
         return
     names = [member.name for member in split.train]
-    indices = [(side, i) for side in SIDES for i in range(len(split.side(side)))]
-    for number, (line, row, (side, i)) in enumerate(zip(lines, rows, indices, strict=True), 2):
+    for i, (line, row) in enumerate(zip(lines, rows, strict=True)):
         if len(line) != len(header):
-            yield f"line {number} has {len(line)} cells, not {len(header)}"
+            yield f"line {i + 2} has {len(line)} cells, not {len(header)}"
             continue
-        similarity = dict(zip(names, train_similarity(survey, side, i), strict=True))
+        similarity = dict(zip(names, train_similarity(survey, i), strict=True))
         for why in _row_differences(line, row, similarity):
-            yield f"line {number}: {why}"
+            yield f"line {i + 2}: {why}"
 
 
 def _row_differences(

@@ -20,8 +20,8 @@ from morphgen.benchmark.survey import (
     robot_stats,
     split_difficulty,
     statistics,
-    survey_difficulty,
     survey_split,
+    train_similarity,
 )
 from morphgen.encoding.similarity import MEASURES, NearThresholds, cosine, features, is_near
 from morphgen.errors import BenchmarkError
@@ -354,13 +354,13 @@ def test_the_csv_has_the_same_bytes_with_any_number_of_jobs(rows):
 
 def test_train_robots_are_compared_symmetrically_and_not_with_themselves():
     twins = split([*TRAIN, member(TRAIN[0], "twin")], TEST)
-    survey = survey_split(twins, LIBRARY, within_train=True)
-    pairs = survey.train_similarity
-    assert pairs.shape == (4, 4, len(MEASURES))
+    survey = survey_split(twins, LIBRARY, pairs="train")
+    assert survey.similarity.shape == (5, 5, len(MEASURES))
+    pairs = survey.similarity[:4, :4]
     assert (pairs[0, 1:3] == pairs[1:3, 0]).all()
     assert (pairs[0, 1:3] == pairs[3, 1:3]).all()
-    assert (pairs[0, [0, 3]] != pairs[0, [0, 3]]).all()  # NaN
-    assert survey_split(combined(), LIBRARY).train_similarity is None
+    assert np.isnan(train_similarity(survey, 0)[[0, 3]]).all()
+    assert np.isnan(survey_split(combined(), LIBRARY).similarity[:3, :3]).all()
 
 
 def test_robots_that_changed_or_cannot_be_composed_are_refused():
@@ -370,5 +370,3 @@ def test_robots_that_changed_or_cannot_be_composed_are_refused():
     missing = replace(other, derivation=other.derivation.replace("plane", "planf"))
     with pytest.raises(BenchmarkError, match=r"'mine/some': robot 'other': .* no part 'planf'"):
         split_difficulty(combined([*TRAIN, missing]), LIBRARY)
-    with pytest.raises(ValueError, match="within_train"):
-        survey_difficulty(survey_split(combined(), LIBRARY))
