@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from itertools import product
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from morphgen.formats.rounding import format_number
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, PartKind, parse_value
+from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, parse_value
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
@@ -48,72 +48,50 @@ from morphgen.splits.candidates import (
 from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 
 MANUFACTURER = "manufacturer"
-"""_Key of conditions on the manufacturer of a part."""
+"""Key of conditions on the manufacturer of a part."""
 EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
 """Examples of rules, for messages."""
 
 
 @dataclass(frozen=True)
-class _PartCondition:
-    """The part has a kind and a name: ``arm=kinova*``."""
+class _Condition:
+    """A property of one part of a robot: its name, its manufacturer, or the range of a parameter.
 
-    kind: PartKind
-    pattern: str  # name of the part, with shell wildcards
+    ``arm=kinova*``, ``manufacturer=Kinova`` or ``arm.manufacturer=Kinova``, and
+    ``arm3.length=0.3..0.4``, bounds included. Patterns have shell wildcards.
+    """
 
-    def __str__(self) -> str:
-        return f"{self.kind}={self.pattern}"
-
-    def matches(self, node: Derivation, library: Library) -> bool:
-        return fnmatchcase(node.part, self.pattern) and library.manifest(node.part).kind == (
-            self.kind
-        )
-
-
-@dataclass(frozen=True)
-class _ManufacturerCondition:
-    """The part is made by a manufacturer: ``manufacturer=Kinova``, ``arm.manufacturer=Kinova``."""
-
-    kind: PartKind | None  # kind of the part; None for any
-    pattern: str  # name of the manufacturer in any case, with shell wildcards
+    owner: str  # kind of the part, or of a range also its name, with wildcards; empty for any
+    key: str = ""  # `MANUFACTURER`, a parameter, or empty for the name of the part
+    pattern: str = ""  # name of the part, or of the manufacturer in any case
+    bounds: tuple[float, float] | None = None  # of a range [SI unit of the parameter]
 
     def __str__(self) -> str:
-        prefix = f"{self.kind}." if self.kind else ""
-        return f"{prefix}{MANUFACTURER}={self.pattern}"
-
-    def matches(self, node: Derivation, library: Library) -> bool:
-        return self.matches_manifest(library.manifest(node.part))
-
-    def matches_manifest(self, manifest: Manifest) -> bool:
-        name = manifest.manufacturer.lower()
-        is_kind = self.kind in (None, manifest.kind)
-        return is_kind and bool(name) and fnmatchcase(name, self.pattern.lower())
-
-
-@dataclass(frozen=True)
-class _RangeCondition:
-    """A parameter of the part is in a range, bounds included: ``arm3.length=0.3..0.4``."""
-
-    owner: str  # kind of the part, or its name with shell wildcards
-    parameter: str
-    low: float  # lower bound [SI unit of the parameter]
-    high: float  # upper bound [SI unit of the parameter]
-
-    def __str__(self) -> str:
-        low, high = format_number(self.low), format_number(self.high)
-        return f"{self.owner}.{self.parameter}={low}..{high}"
+        where = ".".join(filter(None, (self.owner, self.key)))
+        value = "..".join(map(format_number, self.bounds)) if self.bounds else self.pattern
+        return f"{where}={value}"
 
     def applies_to(self, manifest: Manifest) -> bool:
-        return _is_owner(self.owner, manifest) and self.parameter in manifest.attached_parameters
+        """Return whether a part is of the owner and, for a range, has the parameter."""
+        is_owner = not self.owner or _is_owner(self.owner, manifest)
+        return is_owner and (self.bounds is None or self.key in manifest.attached_parameters)
 
-    def matches(self, node: Derivation, library: Library) -> bool:
-        manifest = library.manifest(node.part)
+    def matches(self, manifest: Manifest, values: Mapping[str, float]) -> bool:
+        """Return whether it holds for a part with these values of its parameters."""
         if not self.applies_to(manifest):
             return False
-        default = manifest.attached_parameters[self.parameter].default
-        return self.low <= dict(node.parameters).get(self.parameter, default) <= self.high
+        if self.bounds is not None:
+            low, high = self.bounds
+            value = values.get(self.key, manifest.attached_parameters[self.key].default)
+            return low <= value <= high
+        if self.key == MANUFACTURER:
+            name = manifest.manufacturer.lower()
+            return bool(name) and fnmatchcase(name, self.pattern.lower())
+        return fnmatchcase(manifest.name, self.pattern)
 
-
-_Condition = _PartCondition | _ManufacturerCondition | _RangeCondition
+    def matches_node(self, node: Derivation, library: Library) -> bool:
+        """Return whether it holds for a part of a robot."""
+        return self.matches(library.manifest(node.part), dict(node.parameters))
 
 
 @dataclass(frozen=True)
@@ -128,12 +106,12 @@ class HoldOutRule:
     @property
     def holds_out_parts(self) -> bool:
         """Whether parts are held out as such, rather than a combination or a range."""
-        return len(self.conditions) == 1 and not isinstance(self.conditions[0], _RangeCondition)
+        return len(self.conditions) == 1 and self.conditions[0].bounds is None
 
     def holds(self, derivation: Derivation, library: Library) -> bool:
         """Test if a robot is held out."""
         return all(
-            any(condition.matches(node, library) for node in derivation.walk())
+            any(condition.matches_node(node, library) for node in derivation.walk())
             for condition in self.conditions
         )
 
@@ -142,7 +120,7 @@ class HoldOutRule:
         return frozenset(
             node.part
             for node in derivation.walk()
-            if any(condition.matches(node, library) for condition in self.conditions)
+            if any(condition.matches_node(node, library) for condition in self.conditions)
         )
 
 
@@ -179,11 +157,11 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
     owner, dot, name = key.rpartition(".")
     if key in PART_KINDS:
         _require_match(value, library.names(key), key, where)
-        return _PartCondition(key, value)
+        return _Condition(key, pattern=value)
     if name == MANUFACTURER and (not dot or owner in PART_KINDS):
-        condition = _ManufacturerCondition(cast(PartKind, owner) if dot else None, value)
-        manifests = library.manifests(condition.kind)
-        if not any(map(condition.matches_manifest, manifests)):
+        condition = _Condition(owner if dot else "", MANUFACTURER, value)
+        manifests = list(filter(condition.applies_to, library.manifests()))
+        if not any(condition.matches(manifest, {}) for manifest in manifests):
             valid = {manifest.manufacturer for manifest in manifests} - {""}
             raise BenchmarkError(f"{where}: no manufacturer {value!r}{nearest(value, valid)}")
         return condition
@@ -195,7 +173,7 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
     )
 
 
-def _range(owner: str, name: str, value: str, library: Library, where: str) -> _RangeCondition:
+def _range(owner: str, name: str, value: str, library: Library, where: str) -> _Condition:
     manifests = [manifest for manifest in library.manifests() if _is_owner(owner, manifest)]
     if not manifests:
         _require_match(owner, [*PART_KINDS, *library.paths], "part", where)
@@ -223,7 +201,7 @@ def _range(owner: str, name: str, value: str, library: Library, where: str) -> _
         raise BenchmarkError(f"{where}: {error}") from error
     if bounds[0] > bounds[1]:
         raise BenchmarkError(f"{where}: {low} is above {high}; expected LOW..HIGH")
-    return _RangeCondition(owner, name, *bounds)
+    return _Condition(owner, name, bounds=(bounds[0], bounds[1]))
 
 
 def _is_owner(owner: str, manifest: Manifest) -> bool:
@@ -340,13 +318,14 @@ class _Choice:
 
     label: str  # label of the part in the derivation
     parameter: Parameter
-    condition: _RangeCondition
+    condition: _Condition
 
     def draw(self, rng: np.random.Generator, *, inside: bool) -> float:
         """Draw a value inside of the held-out range, or from all that are valid."""
         low, high = self.parameter.minimum, self.parameter.maximum
         if inside:
-            low, high = max(low, self.condition.low), min(high, self.condition.high)
+            lowest, highest = self.condition.bounds or (low, high)
+            low, high = max(low, lowest), min(high, highest)
         if self.parameter.integer:
             return float(rng.integers(round(low), round(high), endpoint=True))
         return float(format_number(rng.uniform(low, high)))
@@ -360,11 +339,11 @@ def _varied(robot: PatternRobot, maker: _DraftMaker) -> list[_Choice]:
     for node in robot.derivation.walk():
         manifest = maker.library.manifest(node.part)
         for condition in conditions:
-            if not (isinstance(condition, _RangeCondition) and condition.applies_to(manifest)):
+            if condition.bounds is None or not condition.applies_to(manifest):
                 continue
-            parameter = manifest.attached_parameters[condition.parameter]
-            overlaps = condition.low <= parameter.maximum and condition.high >= parameter.minimum
-            if overlaps and f"{node.label}_{condition.parameter}" not in given:
+            (low, high), parameter = condition.bounds, manifest.attached_parameters[condition.key]
+            overlaps = low <= parameter.maximum and high >= parameter.minimum
+            if overlaps and f"{node.label}_{condition.key}" not in given:
                 choices.append(_Choice(node.label, parameter, condition))
     return choices
 
@@ -395,7 +374,7 @@ def _replace_values(
     values: dict[str, dict[str, float]] = {}
     for choice in choices:
         by_name = values.setdefault(choice.label, {})
-        by_name[choice.condition.parameter] = choice.draw(rng, inside=inside)
+        by_name[choice.condition.key] = choice.draw(rng, inside=inside)
 
     def updated(node: Derivation) -> Derivation:
         return replace(
