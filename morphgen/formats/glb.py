@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
@@ -11,7 +13,7 @@ from trimesh.visual.material import PBRMaterial
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Mesh, Rgba, Shape
 from morphgen.model.inertia import solid_mesh
-from morphgen.model.kinematics import movable_positions
+from morphgen.model.kinematics import joint_motions, movable_positions
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
 from morphgen.model.tree import take_name
@@ -56,20 +58,14 @@ def glb_bytes(robot: Robot) -> bytes:
     return data
 
 
-def _home_transforms(robot: Robot) -> list[Array]:
-    """Return the pose of every link at home in its parent's frame, the root's in the scene."""
-    positions = iter(movable_positions(robot, robot.home).tolist())
-    transforms = [T_GLTF_ROOT]
+def _home_transforms(robot: Robot) -> Iterator[Array]:
+    """Yield the pose of every link at home in its parent's frame, the root's in the scene."""
+    yield T_GLTF_ROOT
+    movable = [robot.joints[k] for k in robot.movable_joints]
+    motions = iter(joint_motions(movable, movable_positions(robot, robot.home)))
     for joint in robot.joints:
         T = joint.T_parent_joint.matrix
-        if joint.is_movable:
-            position, axis = next(positions), np.array(joint.unit_axis)
-            if joint.kind == "prismatic":
-                T = T @ trimesh.transformations.translation_matrix(position * axis)
-            else:
-                T = T @ trimesh.transformations.rotation_matrix(position, axis)
-        transforms.append(np.asarray(T))
-    return transforms
+        yield T @ next(motions) if joint.is_movable else T
 
 
 def _mesh(shape: Shape) -> trimesh.Trimesh:
