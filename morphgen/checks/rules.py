@@ -46,9 +46,12 @@ def _rows() -> Mapping[str, Mapping[str, str]]:
     return loaded
 
 
-def found(row: str, where: str, *, repairable: bool = True, **values: Any) -> Finding:  # noqa: ANN401
-    """Return the finding of a row of ``findings.yaml``, with the values of its texts."""
-    entry = _rows()[row]
+def found(row: str, where: str, **values: Any) -> Finding:  # noqa: ANN401
+    """Return the finding of a row of ``findings.yaml``, with the values of its texts.
+
+    values: ``repairable=False`` says that the repair of the row is not possible here.
+    """
+    entry, repairable = _rows()[row], values.pop("repairable", True)
     why, fix, repair = (
         entry.get(key, "").format(density=DEFAULT_DENSITY, **values)
         for key in ("why", "fix", "repair")
