@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import viser
 
 from morphgen.encoding.similarity import MEASURES, features
 from morphgen.encoding.tokens import default_max_links
@@ -21,7 +19,6 @@ from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
-from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.figures import blend
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
@@ -55,49 +52,6 @@ def all_roles(robots: Sequence[Robot]) -> list[str]:
     """Return every role of any of the robots, joints before fingers, by number."""
     roles = {role for robot in robots for role in joint_roles(robot)}
     return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
-
-
-class RoleSliders:
-    """Sliders that move the joints of a role in all robots of a page; other joints stay at home."""
-
-    def __init__(self, session: Session, low: float, move: Callable[[], object]) -> None:
-        """Prepare for sliders from ``low`` to 1; ``move`` is called after the user moved one."""
-        self.moved: dict[str, float] = {}  # positions of the roles that the user moved
-        self._session, self._low, self._move = session, low, move
-        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
-        self._home: dict[str, float] = {}
-
-    def add(self, role: str, home: float, hint: str) -> None:
-        """Add the slider of a role; ``home`` is its position while nobody has moved it."""
-        slider = self._session.client.gui.add_slider(role, self._low, 1.0, 0.01, home, hint=hint)
-        self._sliders[role], self._home[role] = slider, home
-        self._session.on_change(slider, self._read, "move")
-        self._session.keep(
-            role.replace(" ", ""),
-            lambda: f"{self.moved[role]:g}" if role in self.moved else "",
-            lambda text: self._apply(role, text),
-        )
-
-    def set(self, moved: Mapping[str, float]) -> None:
-        """Move roles to positions, and all others home."""
-        self.moved = dict(moved)
-        for role, slider in self._sliders.items():
-            set_value(slider, moved.get(role, self._home[role]))
-        self._move()
-
-    def _read(self) -> None:
-        for role, slider in self._sliders.items():
-            if role in self.moved or slider.value != self._home[role]:
-                self.moved[role] = slider.value
-        self._move()
-
-    def _apply(self, role: str, text: str) -> None:
-        """Take over a position of an address, unless it is invalid; the robots move later."""
-        with contextlib.suppress(ValueError):
-            position = float(text)
-            if not np.isnan(position):
-                self.moved[role] = min(max(position, self._low), 1.0)
-                set_value(self._sliders[role], self.moved[role])
 
 
 def normalized_positions(robot: Robot, q: Array) -> Array:

@@ -14,8 +14,9 @@ import viser
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
-from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import WorkerDied
+from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import (
     Thumbnail,
     make_thumbnail,
@@ -116,8 +117,8 @@ _SORTS = [key for name in robot_rows.SORTS for key in (name, f"-{name}")]
 def add_filter(gallery: Gallery) -> None:
     """Add the controls in the state that the address gives; note values that it cannot have."""
     session, gui = gallery.session, gallery.session.client.gui
-    search = gallery.controls["search"] = gui.add_text("Search", "")
-    session.keep("search", lambda: search.value, lambda text: set_value(search, text))
+    gallery.controls["search"] = gui.add_text("Search", "")
+    bind(session, "search", gallery.controls["search"])
     _add_dropdown(gallery, "scale", "Scale", sorted(SCALES, key=lambda name: name != gallery.scale))
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
     is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
@@ -201,20 +202,19 @@ def parse_range(
 def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str]) -> None:
     """Add a dropdown if there is a choice; the first is the default."""
     session, value = gallery.session, gallery.session.address.state.get(key, "")
-    session.keep(key, str)  # an empty text, which removes a value that is left out
     if value and value not in keys:
         valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
         gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
     labels = [f"{k[1:]}, largest first" if key == "sort" and k[0] == "-" else k for k in keys]
     if len(keys) > 1:
-        dropdown = gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
-        session.keep_choice(key, dropdown, tuple(keys))
+        gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
+        bind(session, key, gallery.controls[key], tuple(keys))
 
 
 def _add_range(gallery: Gallery, fact: str) -> None:
     """Add a slider with two ends for a fact that varies."""
-    session, limits = gallery.session, robot_rows.fact_range(gallery.rows, fact)
-    session.keep(fact, str)
+    session, gui = gallery.session, gallery.session.client.gui
+    limits = robot_rows.fact_range(gallery.rows, fact)
     try:
         ends = parse_range(fact, session.address.state.get(fact, ""), limits)
     except AddressError as error:
@@ -225,19 +225,16 @@ def _add_range(gallery: Gallery, fact: str) -> None:
     step = 1.0 if fact in _COUNTS else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
     initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
-    gui = session.client.gui
     gallery.histograms[fact] = gui.add_html("")
-    gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
-    session.keep(fact, lambda: _range_text(gallery, fact))
+    slider = gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
 
+    def write() -> str:
+        """Return the range for the address; empty if it lets every known value pass."""
+        low, high = slider.value
+        known = robot_rows.fact_range(gallery.rows, fact) or limits
+        return "" if low <= known[0] and high >= known[1] else f"{low:g}..{high:g}"
 
-def _range_text(gallery: Gallery, fact: str) -> str:
-    """Return a range slider's value for the address; empty if it lets every known value pass."""
-    low, high = gallery.controls[fact].value
-    limits = robot_rows.fact_range(gallery.rows, fact)
-    if limits is None or (low <= limits[0] and high >= limits[1]):
-        return ""
-    return f"{low:g}..{high:g}"
+    session.keep(fact, write)
 
 
 REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
@@ -364,7 +361,7 @@ def add_controls(gallery: Gallery) -> None:
 def show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
     session, size = gallery.session, int(gallery.controls["size"].value)
-    rows = robot_rows.sort_rows(passing_rows(gallery), session.state()["sort"] or "order")
+    rows = robot_rows.sort_rows(passing_rows(gallery), session.state().get("sort") or "order")
     gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
     session.show_state()
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"

@@ -7,8 +7,8 @@ three instances. Arrays over instances are sorted by what they are instances of.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -197,74 +197,60 @@ _SPHERE_SUBDIVISIONS = 2
 _FADED_SHARE = 0.8  # share of the background's colour in robots that are not selected
 
 
-@dataclass(eq=False)
 class PopulationScene:
-    """A population in the scene of one browser."""
+    """A population in the scene of one browser, its roots at positions (n, 2) on the ground [m]."""
 
-    client: viser.ClientHandle
-    population: Population
-    handles: Mapping[Prototype, viser.BatchedMeshHandle]
-    positions: Array  # positions of the roots on the ground, shape (n, 2) [m]
-    labels: list[viser.LabelHandle] = field(default_factory=list)
+    def __init__(self, client: viser.ClientHandle, population: Population) -> None:
+        """Draw the robots at home, in the arrangement of a grid."""
+        self.population = population
+        self.positions, _ = arrange(population)
+        self._client = client
+        self._handles: dict[Prototype, viser.BatchedMeshHandle] = {}
+        instances, (wxyzs, origins) = population.instances, self._poses(population.home)
+        for number, (prototype, part) in enumerate(instances.prototypes.items()):
+            is_mesh = isinstance(prototype, Mesh)
+            self._handles[prototype] = client.scene.add_batched_meshes_simple(
+                f"/population/{number}",
+                *surface(prototype),
+                batched_wxyzs=wxyzs[part],
+                batched_positions=origins[part],
+                batched_scales=instances.scale[part],
+                batched_colors=batch_colours(instances.colour[part]),
+                lod="auto" if is_mesh else "off",
+                cast_shadow=len(population) <= MAX_SHADOWS,
+                side="double" if is_mesh else "front",  # some meshes have their faces inside out
+            )
 
+    def parts(self) -> Iterator[tuple[viser.BatchedMeshHandle, slice]]:
+        """Yield the handle and the instances of every prototype."""
+        for prototype, part in self.population.instances.prototypes.items():
+            yield self._handles[prototype], part
 
-def add_population(
-    client: viser.ClientHandle, population: Population, positions: Array, q: Array
-) -> PopulationScene:
-    """Draw a population with its roots at positions (n, 2) [m] and in configurations (n, J)."""
-    instances = population.instances
-    poses = world_poses(population, positions, q)
-    wxyzs = quaternions(poses)
-    handles = {}
-    for number, (prototype, part) in enumerate(instances.prototypes.items()):
-        is_mesh = isinstance(prototype, Mesh)
-        handles[prototype] = client.scene.add_batched_meshes_simple(
-            f"/population/{number}",
-            *surface(prototype),
-            batched_wxyzs=wxyzs[part],
-            batched_positions=poses[part, :3, 3],
-            batched_scales=instances.scale[part],
-            batched_colors=batch_colours(instances.colour[part]),
-            lod="auto" if is_mesh else "off",
-            cast_shadow=len(population) <= MAX_SHADOWS,
-            side="double" if is_mesh else "front",  # some meshes have their faces inside out
-        )
-    return PopulationScene(client, population, handles, positions)
+    def move(self, positions: Array, q: Array) -> None:
+        """Move all robots to positions and configurations (n, J); browsers get one message."""
+        self.positions = positions
+        wxyzs, origins = self._poses(q)
+        with self._client.atomic():
+            for handle, part in self.parts():
+                handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
 
+    def fade(self, selected: NDArray[np.bool_], background: Rgb) -> None:
+        """Fade the robots that are not in a selection (n,), unless it is empty."""
+        instances = self.population.instances
+        colours = instances.colour.astype(np.float64)
+        if selected.any():
+            faded = (1 - _FADED_SHARE) * colours + _FADED_SHARE * np.array(background)
+            colours = np.where(selected[instances.robot][:, None], colours, faded)
+        with self._client.atomic():
+            for handle, part in self.parts():
+                handle.batched_colors = batch_colours(colours[part])
 
-def move(scene: PopulationScene, positions: Array, q: Array) -> None:
-    """Move all robots, see ``add_population``; the browser gets all changes in one message."""
-    poses = world_poses(scene.population, positions, q)
-    wxyzs, origins = quaternions(poses), poses[:, :3, 3]
-    with scene.client.atomic():
-        for prototype, part in scene.population.instances.prototypes.items():
-            handle = scene.handles[prototype]
-            handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
-    scene.positions = positions
-
-
-def fade(scene: PopulationScene, selected: NDArray[np.bool_], background: Rgb) -> None:
-    """Fade the robots that are not in a selection (n,), unless it is empty."""
-    instances = scene.population.instances
-    colours = instances.colour.astype(np.float64)
-    if selected.any():
-        faded = (1 - _FADED_SHARE) * colours + _FADED_SHARE * np.array(background)
-        colours = np.where(selected[instances.robot][:, None], colours, faded)
-    with scene.client.atomic():
-        for prototype, part in instances.prototypes.items():
-            scene.handles[prototype].batched_colors = batch_colours(colours[part])
-
-
-def world_poses(population: Population, positions: Array, q: Array) -> NDArray[np.float32]:
-    """Return the pose of every instance in the world, shape (m, 4, 4); see ``move``."""
-    poses = shape_poses(population, q)
-    poses[:, :2, 3] += positions[population.instances.robot]
-    return poses
-
-
-def quaternions(poses: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the rotations of poses (m, 4, 4) as quaternions (w, x, y, z), shape (m, 4)."""
-    return np.asarray(quaternion_from_matrix(torch.from_numpy(poses[:, :3, :3])).numpy())
+    def _poses(self, q: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return rotations (w, x, y, z) and positions of all instances in the world."""
+        poses = shape_poses(self.population, q)
+        poses[:, :2, 3] += self.positions[self.population.instances.robot]
+        wxyzs = quaternion_from_matrix(torch.from_numpy(poses[:, :3, :3])).numpy()
+        return wxyzs, poses[:, :3, 3]
 
 
 def surface(prototype: Prototype) -> Triangles:
@@ -393,34 +379,31 @@ def _measured(row: Row, robot: Robot) -> Row:
     return replace(row, **facts)  # type: ignore[arg-type]
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Positions of n robots on the ground, with labels."""
-
-    positions: Array  # roots, (n, 2) [m]: x right, y away from the reader
-    labels: tuple[tuple[str, tuple[float, float]], ...] = ()
-    """Texts on the ground and their positions [m]."""
+Labels = list[tuple[str, tuple[float, float]]]
+"""Texts on the ground and their positions [m]."""
 
 
-def grid(home_bounds: Array) -> Layout:
-    """Arrange robots of bounds (n, 2, 3) in rows from the far left to the near right, in order."""
-    return Layout(_rows_of(home_bounds)[0])
+def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
+    """Return positions (n, 2) [m] of robots in rows, x to the right, y away from the reader.
 
-
-def rows_by_fact(rows: Sequence[Row], fact: str, home_bounds: Array) -> Layout:
-    """Arrange robots in rows by a fact, smallest first, with values of rows' first robots."""
+    Rows run from the far left to the near right, in the order of the set. With a fact, the smallest
+    come first, and labels have the values of rows' first robots.
+    """
+    rows, bounds = population.rows, population.home_bounds
     index = {row.uri: i for i, row in enumerate(rows)}
-    order = [index[row.uri] for row in sort_rows(rows, fact)]
-    places, firsts = _rows_of(home_bounds[order])
+    order = [index[row.uri] for row in sort_rows(rows, fact)] if fact else list(range(len(rows)))
+    places, firsts = _rows_of(bounds[order])
     positions = np.zeros((len(rows), 2))
     positions[order] = places
-    edge = float((places[:, 0] + home_bounds[order, 0, 0]).min()) - _LABEL_GAP
-    labels = []
+    if not fact:
+        return positions, []
+    edge = float((places[:, 0] + bounds[order, 0, 0]).min()) - _LABEL_GAP
+    labels: Labels = []
     for i in firsts[:: math.ceil(len(firsts) / _MAX_LABELS)]:
         value = getattr(rows[order[i]], fact)
         text = "unknown" if value is None else f"{value:.3g} {UNITS[fact]}"
         labels.append((text, (edge, float(places[i, 1]))))
-    return Layout(positions, tuple(labels))
+    return positions, labels
 
 
 def _rows_of(bounds: Array) -> tuple[Array, list[int]]:

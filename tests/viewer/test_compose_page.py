@@ -2,12 +2,10 @@
 
 import re
 
-import numpy as np
 import pytest
 
 from helpers.pages import choose, field, nodes, press
 from morphgen.formats.bundle import read_bundle
-from morphgen.viewer.scene.stage import camera_view, project_points
 
 pytestmark = pytest.mark.slow
 
@@ -139,20 +137,3 @@ def test_robots_are_mutated_and_adopted(see, viewer, picture):
     assert "/offspring8" in nodes(on)
     page.get_by_role("heading", name=adopted).wait_for()
     assert page.failures == []
-
-
-def test_a_click_in_the_scene_adopts_a_robot(see, viewer):
-    on = viewer()
-    page = see("?compose=prims&seed=0&number=2", on=on)
-    page.get_by_text("prims-000002").first.wait_for()
-    page.get_by_role("tab", name="Evolve").click()
-    press(page, "mutants")
-    page.locator("[data-do=adopt]").nth(8).wait_for()
-    page.wait_for_url(re.compile(r"evolve=1&tab=Evolve$"))
-    page.wait_for_timeout(1500)
-    (session,) = on.sessions.values()
-    middle = nodes(on)["/offspring4"].position + np.array([0.0, 0.0, 0.5])
-    (x, y), _ = project_points(camera_view(session.client), middle)
-    box = page.locator("canvas").last.bounding_box()
-    page.mouse.click(box["x"] + x * box["height"], box["y"] + y * box["height"])
-    page.wait_for_url(re.compile(r"evolve=2&tab=Evolve$"))

@@ -1,8 +1,8 @@
 """Mutants of robots on the compose page, and grammars around robots that no grammar has given."""
 
-import numpy as np
 import pytest
 
+from helpers.pages import pointer
 from helpers.viser_client import PlainClient
 from morphgen.grammar.analysis import check_grammar
 from morphgen.grammar.derivation import parse_derivation
@@ -20,7 +20,6 @@ from morphgen.viewer.pages.compose_grammar import (
     pack_choices,
     unpack_choices,
 )
-from morphgen.viewer.scene.robot import hit_robot
 
 LIBRARY = default_library()
 
@@ -64,15 +63,6 @@ def test_changes_of_a_derivation_are_lines():
     assert change_lines(after, longer) == ["+ beam2 (beam on beam1:end)"]
 
 
-def test_a_ray_hits_the_nearest_box():
-    boxes = np.array([[[0, 0, 0], [1, 1, 1]], [[2, 0, 0], [3, 1, 1]]], dtype=float)
-    inside = np.array([-1.0, 0.5, 0.5])
-    assert hit_robot(boxes, inside, np.array([1.0, 0, 0])) == 0
-    assert hit_robot(boxes, np.array([9.0, 0.5, 0.5]), np.array([-1.0, 0, 0])) == 1
-    assert hit_robot(boxes, inside, np.array([-1.0, 0, 0])) is None
-    assert hit_robot(boxes, inside, np.array([0, 0, 1.0])) is None
-
-
 def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_viewer):
     with PlainClient(shared_viewer.port, "?compose=robots/prims/prims-000001") as client:
         client.control("Number", "generation")
@@ -82,6 +72,13 @@ def test_a_robot_of_a_set_evolves_and_its_offspring_is_in_the_address(shared_vie
         client.shows('data-do="adopt" data-value="8"')
         client.until(lambda: client.addresses[-1][1].endswith("&evolve=1"))
         assert "&choices=" in client.addresses[-1][1]
+        frame = client.until(
+            lambda: next((m for m in client.messages if m.get("name") == "/offspring4"), None)
+        )
+        client.send(pointer("Click", frame))
+        client.until(lambda: client.addresses[-1][1].endswith("&evolve=2"))
+        client.change(buttons, "none")
+        client.until(lambda: "evolve" not in client.addresses[-1][1])
 
 
 def test_mutants_of_a_robot_without_a_grammar_need_no_other_button(shared_viewer):

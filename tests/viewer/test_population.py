@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics
@@ -15,12 +16,11 @@ from morphgen.viewer.pages import population as population_page
 from morphgen.viewer.pages.population import format_selection, parse_selection, selection_text
 from morphgen.viewer.population import (
     ReadRobot,
+    arrange,
     find_source,
-    grid,
     make_population,
     move_roles,
     read_robots,
-    rows_by_fact,
     shape_poses,
 )
 from morphgen.viewer.robot_rows import Row
@@ -66,22 +66,26 @@ def test_a_role_moves_in_every_robot_by_the_same_share(population):
     np.testing.assert_array_equal(move_roles(population, population.home, {}), population.home)
 
 
+def plain(sizes, reaches):
+    """Return a population of robots without shapes that take boxes (n, 3) [m] on the ground."""
+    read = []
+    for i, (size, reach) in enumerate(zip(sizes, reaches, strict=True)):
+        bounds = np.array([np.zeros(3), size])
+        read.append(ReadRobot(Row(f"{i}", f"{i}", reach=reach, order=i), arm(), bounds))
+    return make_population(read)
+
+
 def test_rows_are_sorted_and_labelled_by_their_first_robot():
-    rows = [
-        Row(name, name, reach=reach) for name, reach in zip("abcd", (3, 1, None, 2), strict=True)
-    ]
-    bounds = np.tile([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]], (4, 1, 1))
-    sorted_rows = rows_by_fact(rows, "reach", bounds)
-    order = np.lexsort((sorted_rows.positions[:, 0], -sorted_rows.positions[:, 1]))
-    assert [rows[i].name for i in order] == ["b", "d", "a", "c"]
-    assert [text for text, _ in sorted_rows.labels] == ["1 m", "3 m"]
+    positions, labels = arrange(plain(np.ones((4, 3)), (3, 1, None, 2)), "reach")
+    assert np.lexsort((positions[:, 0], -positions[:, 1])).tolist() == [1, 3, 0, 2]
+    assert [text for text, _ in labels] == ["1 m", "3 m"]
 
 
 def test_robots_in_rows_take_their_own_width_so_that_a_large_one_does_not_spread_the_others():
-    size = np.tile([0.3, 0.1, 0.2], (1000, 1))
+    size = np.tile([0.3, 0.1, 0.2], (300, 1))
     size[::50] = [3.0, 0.1, 0.2]
-    bounds = np.stack([np.zeros_like(size), size], axis=1)
-    places = grid(bounds).positions
+    places, labels = arrange(plain(size, [None] * len(size)))
+    assert labels == []
     left, right = places[:, 0], places[:, 0] + size[:, 0]
     for y in np.unique(places[:, 1]):
         row = places[:, 1] == y

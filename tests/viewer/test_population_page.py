@@ -1,15 +1,12 @@
 """The population page: its pointer, its addresses, and its actions."""
 
-import io
 import re
-import zipfile
 
 import numpy as np
 import pytest
 
 from helpers.pages import field, nodes, pointer, press
 from helpers.viser_client import PlainClient
-from morphgen.splits.split_file import read_split
 from morphgen.viewer.scene.stage import camera_view, project_points
 
 
@@ -84,24 +81,6 @@ def test_a_rectangle_selects_and_the_address_keeps_arrangement_and_selection(see
     assert all(part in page.url for part in ("arrange=reach", "joint1=0.25"))
     press(page, "Home")
     page.wait_for_url(re.compile(r"arrange=reach&select=2,4-5$"))
-
-
-@pytest.mark.slow
-def test_selected_robots_are_exported_and_split(see, folder):
-    page = see("?population=robots/prims&select=0-1")
-    page.get_by_text("2 selected").wait_for()
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Export bundles").click()
-    with zipfile.ZipFile(io.BytesIO(download.value.path().read_bytes())) as archive:
-        urdfs = [name for name in archive.namelist() if name.endswith("/robot.urdf")]
-    assert [name.split("/")[1] for name in urdfs] == ["0000-prims-000000", "0001-prims-000001"]
-    page.get_by_text("New split").click()
-    field(page, "split name").last.fill("from/population")
-    press(page, "Save")
-    page.get_by_text("morphgen split audit splits/from/population.yaml").wait_for()
-    split = read_split(folder / "splits" / "from" / "population.yaml")
-    assert [member.name for member in split.test] == ["prims-000000", "prims-000001"]
-    assert len(split.train) == 28
 
 
 @pytest.mark.slow

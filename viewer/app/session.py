@@ -294,24 +294,6 @@ class Session:
         """Keep a value of the page in its address; see ``StateValue``."""
         self.values[key] = StateValue(write, apply)
 
-    def keep_choice(
-        self, key: str, dropdown: viser.GuiDropdownHandle[str], keys: Sequence[str]
-    ) -> None:
-        """Keep the chosen option of a dropdown by a key of each; the first is the default.
-
-        An unknown key in the address changes nothing.
-        """
-
-        def write() -> str:
-            i = dropdown.options.index(dropdown.value)
-            return keys[i] if i else ""
-
-        def apply(text: str) -> None:
-            if text in keys:
-                set_value(dropdown, dropdown.options[keys.index(text)])
-
-        self.keep(key, write, apply)
-
     def state(self) -> dict[str, str]:
         """Return the page's state as its controls have it, by key; defaults are empty."""
         return {key: value.write() for key, value in self.values.items()}
@@ -324,8 +306,10 @@ class Session:
                 value.apply(asked[key])
 
     def show_state(self) -> None:
-        """Show the page's state in the address and its title in the browser's tab."""
-        self.address = self.address.with_state(**self.state())
+        """Show the page's state in the address, without keys that the page does not have."""
+        state = self.state()
+        known = {key: value for key, value in self.address.state.items() if key in state}
+        self.address = replace(self.address, state=known).with_state(**state)
         self.show_address(self.title)
 
     def show_state_later(self) -> None:

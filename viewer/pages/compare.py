@@ -14,9 +14,8 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup
 from morphgen.viewer.app.address import MAX_COMPARED, Address
-from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.comparison import RoleSliders
-from morphgen.viewer.robot_picker import add_picker, picked_uri, robot_lists
+from morphgen.viewer.app.session import Session
+from morphgen.viewer.controls import RoleSliders, add_picker, bind, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
@@ -27,7 +26,6 @@ EMPTY = (
     "press <i>compare</i> in the tray."
 )
 ONE_ROBOT = "Add a second robot to see how similar they are."
-PRIMITIVES = "primitives"  # value of `show` in the address when primitives are drawn
 GAP = 0.35  # distance between the bounding boxes of two robots [m]
 _CAMERA_DIRECTION = (0.74, 0.09, 0.28)  # robots along y are seen from left to right
 
@@ -69,22 +67,18 @@ def show(session: Session) -> None:
         box = gui.add_checkbox("primitives in place of meshes, coloured by IoU", False)
         page.texts["fits"] = gui.add_html("")
 
-    def toggle_primitives() -> None:
+    def show_primitives() -> None:
         session.show_state()
         session.run_in_background(lambda: _show_fits(page, on=box.value))
 
-    session.on_change(box, toggle_primitives)
+    session.on_change(box, show_primitives)
     session.set_status("")
     session.title = "compare " + ", ".join(robot.name for robot in robots)
-
-    def apply_show(text: str) -> None:
-        if text == PRIMITIVES:
-            set_value(box, True)
-            session.run_in_background(lambda: _show_fits(page, on=True))
-
-    session.keep("show", lambda: PRIMITIVES if box.value else "", apply_show)
+    bind(session, "show", box, ("primitives",))
     session.apply_state()
     _move(page)
+    if box.value:
+        show_primitives()
     session.show_state()
     session.run_in_background(lambda: _compare(page))
 

@@ -6,8 +6,8 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Literal
@@ -36,6 +36,7 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, AddressError, pack_text, parse_count, unpack_text
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.pages.compose_parts import Shown, ShowRobot
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess, resolve_grammar, resolve_words
 
 _SHARE_OF_RANGE, _SHARE_OF_VALUE = 0.15, 0.3  # deviation: the smaller one; tuned by eye
@@ -225,74 +226,142 @@ Mode = Literal["typical", "drawn", "chosen"]
 """The typical robot, one that is drawn by seed and number, or the one that choices give."""
 _PLACE = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
 """Beginning of an error that names a place in a grammar."""
-ShowRobot = Callable[[Robot, Derivation, str, str], None]  # gets command and URI, too
 
 
-@dataclass(eq=False)
 class GrammarTab:
-    """Controls of the grammar tab in one browser."""
+    """The tab of a grammar's text, from which robots are drawn."""
 
-    session: Session
-    show_robot: ShowRobot
-    source: str  # name or file of the grammar, or the robot that it is around; see `source_text`
-    name: str  # name of the grammar, from which its robots get theirs
-    original: str  # text of the grammar before it was edited
-    start: viser.GuiDropdownHandle[str]  # grammars to start from
-    text: viser.GuiTextHandle
-    fault: viser.GuiHtmlHandle
-    too_long: viser.GuiHtmlHandle  # says that an address cannot hold the text, or empty
-    seed: viser.GuiNumberHandle[int]
-    number: viser.GuiNumberHandle[int]
-    num_parts: viser.GuiSliderHandle[int] = field(init=False)
-    tree: viser.GuiHtmlHandle = field(init=False)
-    derivation: Derivation | None = None  # the whole robot's; fewer parts may be shown
-    choices: Choices = field(default_factory=dict)  # choices that gave the robot
-    mode: Mode = "typical"  # which robot of the grammar is shown
-    on_shown: Callable[[Individual], object] | None = None  # called with a whole robot
+    def __init__(
+        self, session: Session, tabs: viser.GuiTabGroupHandle, source: str, show_robot: ShowRobot
+    ) -> None:
+        """Add the tab, with the text, seed and number that the page's address gives.
+
+        source: Name or file of the grammar, or the robot that it is around; see ``source_text``.
+        """
+        gui, state = session.client.gui, session.address.state
+        self._session, self._show_robot, self._source = session, show_robot, source
+        self._name, self._original = source_text(source, session.files)
+        self._derivation: Derivation | None = None  # the whole robot's; fewer parts may be shown
+        self._state: Mapping[str, str] = {}  # state of the address
+        self.choices: Choices = {}  # choices that gave the robot
+        self.mode: Mode = "typical"
+        if "choices" in state:
+            self.choices, self.mode = unpack_choices(state["choices"]), "chosen"
+        elif "number" in state:
+            self.mode = "drawn"
+        seed, number = (parse_count(state.get(key, ""), 0) for key in ("seed", "number"))
+        text = unpack_text(state["text"]) if "text" in state else self._original
+        with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
+            self._start = gui.add_dropdown("start from", _starts(source), initial_value=source)
+            self._text = gui.add_text("grammar", text, multiline=True)
+            self._fault = gui.add_html("")
+            self._too_long = gui.add_html("")
+            self._seed = gui.add_number("seed", seed, min=0, step=1)
+            self._number = gui.add_number("robot number", number, min=0, step=1)
+            buttons = gui.add_button_group("robot", ("typical", "this", "next"))
+            hint = "how much of the derivation is shown"
+            self._num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
+            self._tree = gui.add_html("")
+        session.on_change(self._start, lambda: self.load(self._start.value))
+        session.on_change(self._text, lambda: self.show(self.mode), "grammar")
+        session.on_change(buttons, lambda: self._draw(buttons.value))
+        session.on_change(self._num_parts, self._show_parts, "parts")
 
     @property
-    def is_edited(self) -> bool:
-        """Whether the text differs from the grammar's own."""
-        return self.text.value != self.original
+    def grammar(self) -> Grammar:
+        """The grammar of the text."""
+        return grammar_from_text(self._text.value, self._name)
 
+    def load(self, source: str) -> None:
+        """Replace the text by that of another grammar, and show its typical robot."""
+        self._name, self._original = source_text(source, self._session.files)
+        self._source = source
+        self._start.options = _starts(source)
+        set_value(self._start, source)
+        set_value(self._text, self._original)
+        self.show("typical")
 
-def add_grammar_tab(
-    session: Session,
-    tabs: viser.GuiTabGroupHandle,
-    source: str,
-    show_robot: ShowRobot,
-) -> GrammarTab:
-    """Add the tab, with the text, seed and number that the page's address gives."""
-    gui, state = session.client.gui, session.address.state
-    name, original = source_text(source, session.files)
-    text = unpack_text(state["text"]) if "text" in state else original
-    with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
-        tab = GrammarTab(
-            session,
-            show_robot,
-            source,
-            name,
-            original,
-            gui.add_dropdown("start from", _starts(source), initial_value=source),
-            gui.add_text("grammar", text, multiline=True),
-            gui.add_html(""),
-            gui.add_html(""),
-            gui.add_number("seed", parse_count(state.get("seed", ""), 0), min=0, step=1),
-            gui.add_number("robot number", parse_count(state.get("number", ""), 0), min=0, step=1),
-        )
-        buttons = gui.add_button_group("robot", ("typical", "this", "next"))
-        hint = "how much of the derivation is shown"
-        tab.num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
-        tab.tree = gui.add_html("")
-    if "choices" in state:
-        tab.choices, tab.mode = unpack_choices(state["choices"]), "chosen"
-    elif "number" in state:
-        tab.mode = "drawn"
-    session.on_change(tab.start, lambda: load_source(tab, tab.start.value))
-    session.on_change(tab.text, lambda: show_grammar(tab, tab.mode), "grammar")
-    session.on_change(buttons, lambda: _draw(tab, buttons.value))
-    session.on_change(tab.num_parts, lambda: _show_parts(tab), "parts")
-    return tab
+    def show(self, mode: Mode) -> None:
+        """Show a robot of the text, or what is wrong with the text; then the last robot stays."""
+        self.mode, self._too_long.content = mode, ""
+        text: dict[str, str] = {}
+        if self._text.value != self._original:
+            try:
+                text["text"] = pack_text(self._text.value)
+            except AddressError as error:
+                self._too_long.content = markup.framed(markup.dim(str(error)))
+        try:
+            individual, command, state = self._make_robot()
+        except (MorphgenError, RecursionError) as error:
+            self._session.address = Address("compose", (self._source,), text)
+            self._session.show_address(f"compose {self._source}")
+            self._show_fault(error)
+            return
+        # Without a text that is too long for it, the address would name another robot.
+        self._state = {} if self._too_long.content else state | text
+        self.choices, self._derivation = individual.choices, individual.derivation
+        n = sum(1 for _ in individual.derivation.walk())
+        self._num_parts.max = max(n, 2)  # a slider needs a range
+        set_value(self._num_parts, n)
+        self._show_tree(individual.derivation, n)
+        self._show(individual.robot, individual.derivation, command, individual.choices)
+        self._show_fault(None)
+
+    def _show(
+        self, robot: Robot, derivation: Derivation, command: str, choices: Choices | None
+    ) -> None:
+        uri = f"{DERIVATION}{derivation}"
+        self._show_robot(Shown(robot, derivation, command, uri, self._source, self._state, choices))
+
+    def _make_robot(self) -> tuple[Individual, str, dict[str, str]]:
+        """Return the robot of the mode, the command that makes it, and its address's state."""
+        session, library, grammar = self._session, self._session.files.library, self.grammar
+        typical = make_individual(grammar, library, {}, self._name)  # also checks the grammar
+        is_text = self._text.value != self._original or is_robot(self._source)
+        name = shlex.quote(f"{self._name}{SUFFIX}" if is_text else self._source)
+        note = f"# with the text of the tab Grammar in {name}\n" if is_text else ""
+        if self.mode == "drawn":
+            seed, number = self._seed.value, self._number.value
+            with session.activity(f"drawing robot {number} of seed {seed}"):
+                sample = sample_robot(grammar, library, number, seed=seed)
+            command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
+            individual = Individual(sample.robot, sample.derivation, sample.choices)
+            return individual, command, {"seed": str(seed), "number": str(number)}
+        if self.mode == "typical":
+            return typical, f"{note}morphgen compose {name}", {}
+        individual = make_individual(grammar, library, self.choices)
+        state = {"choices": pack_choices(individual.choices)}
+        return individual, f"# {individual.derivation}", state
+
+    def _show_fault(self, error: Exception | None) -> None:
+        """Show what is wrong with the grammar, below the text and at its place in the text."""
+        text = "" if error is None else self._session.files.redact(error)
+        self._fault.content = markup.error(text) if text else ""
+        place = _PLACE.match(text)
+        is_here = place is not None and place["origin"] == self._name
+        line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
+        self._session.run_script(call("mark", line, column))
+
+    def _draw(self, action: str) -> None:
+        """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
+        if action == "next":
+            set_value(self._number, self._number.value + 1)
+        self.show("typical" if action == "typical" else "drawn")
+
+    def _show_parts(self) -> None:
+        """Show the robot with the number of parts that the slider gives."""
+        if self._derivation is None:
+            return
+        partial = first_parts(self._derivation, self._num_parts.value)
+        self._show_tree(self._derivation, self._num_parts.value)
+        robot = compose(partial, self._session.files.library, self._name)
+        self._show(robot, partial, f"# {partial}", None)
+
+    def _show_tree(self, derivation: Derivation, n: int) -> None:
+        """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
+        lines = [escape(line) for line in outline(derivation).splitlines()]
+        lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
+        self._tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")
 
 
 def source_text(source: str, files: FileAccess) -> tuple[str, str]:
@@ -313,100 +382,9 @@ def is_robot(source: str) -> bool:
     return source.startswith(DERIVATION) or "=" in source.split()[0]
 
 
-def edited_grammar(tab: GrammarTab) -> Grammar:
-    """Return the grammar of the text."""
-    return grammar_from_text(tab.text.value, tab.name)
-
-
-def show_grammar(tab: GrammarTab, mode: Mode) -> None:
-    """Show a robot of the edited grammar, or what is wrong with the text; then the last stays."""
-    session = tab.session
-    tab.mode = mode
-    try:
-        grammar = edited_grammar(tab)
-        typical = make_individual(grammar, session.files.library, {}, tab.name)
-        individual, command, state = _make_robot(tab, grammar, typical)
-    except (MorphgenError, RecursionError) as error:
-        _update_address(tab, {})
-        _show_fault(tab, error)
-        return
-    tab.choices, tab.derivation = individual.choices, individual.derivation
-    n = sum(1 for _ in tab.derivation.walk())
-    tab.num_parts.max = max(n, 2)  # a slider needs a range
-    set_value(tab.num_parts, n)
-    _update_address(tab, state)
-    _show_tree(tab, tab.derivation, n)
-    tab.show_robot(individual.robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
-    _show_fault(tab, None)
-    if tab.on_shown is not None:
-        tab.on_shown(individual)
-
-
-def _make_robot(
-    tab: GrammarTab, grammar: Grammar, typical: Individual
-) -> tuple[Individual, str, dict[str, str]]:
-    """Return the robot of the tab's mode, the command that makes it, and its address's state."""
-    session, library = tab.session, tab.session.files.library
-    is_text = tab.is_edited or is_robot(tab.source)
-    name = shlex.quote(f"{tab.name}{SUFFIX}" if is_text else tab.source)
-    note = f"# with the text of the tab Grammar in {name}\n" if is_text else ""
-    if tab.mode == "drawn":
-        seed, number = tab.seed.value, tab.number.value
-        with session.activity(f"drawing robot {number} of seed {seed}"):
-            sample = sample_robot(grammar, library, number, seed=seed)
-        command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
-        individual = Individual(sample.robot, sample.derivation, sample.choices)
-        return individual, command, {"seed": str(seed), "number": str(number)}
-    if tab.mode == "typical":
-        return typical, f"{note}morphgen compose {name}", {}
-    individual = make_individual(grammar, library, tab.choices)
-    state = {"choices": pack_choices(individual.choices)}
-    return individual, f"# {individual.derivation}", state
-
-
 def _starts(source: str) -> tuple[str, ...]:
     """Return the grammars to start from: the present one, and all that have a name."""
     return tuple(dict.fromkeys((source, *grammar_names())))
-
-
-def load_source(tab: GrammarTab, source: str) -> None:
-    """Replace the text by that of another grammar, and show its typical robot."""
-    tab.name, tab.original = source_text(source, tab.session.files)
-    tab.source = source
-    tab.start.options = _starts(source)
-    set_value(tab.start, source)
-    set_value(tab.text, tab.original)
-    show_grammar(tab, "typical")
-
-
-def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
-    """Show grammar, state and edited text in the address; say if the text is too long for it."""
-    tab.too_long.content = ""
-    if tab.is_edited:
-        try:
-            state = state | {"text": pack_text(tab.text.value)}
-        except AddressError as error:
-            tab.too_long.content = markup.framed(markup.dim(str(error)))
-            state = {}  # without the text it would name another robot
-    tab.session.address = Address("compose", (tab.source,), state)
-    tab.session.show_address(f"compose {tab.source}")
-
-
-def _show_fault(tab: GrammarTab, error: Exception | None) -> None:
-    """Show what is wrong with the grammar, below the text and at its place in the text."""
-    text = "" if error is None else tab.session.files.redact(error)
-    tab.fault.content = markup.error(text) if text else ""
-    place = _PLACE.match(text)
-    is_here = place is not None and place["origin"] == tab.name
-    line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
-    tab.session.run_script(call("mark", line, column))
-
-
-def _draw(tab: GrammarTab, action: str) -> None:
-    """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
-    if action == "next":
-        set_value(tab.number, tab.number.value + 1)
-    show_grammar(tab, "typical" if action == "typical" else "drawn")
 
 
 def first_parts(derivation: Derivation, n: int) -> Derivation:
@@ -418,21 +396,3 @@ def first_parts(derivation: Derivation, n: int) -> Derivation:
         return replace(node, children=tuple(children))
 
     return prune(derivation)
-
-
-def _show_parts(tab: GrammarTab) -> None:
-    """Show the robot with the number of parts that the slider gives."""
-    if tab.derivation is None:
-        return
-    n = tab.num_parts.value
-    partial = first_parts(tab.derivation, n)
-    _show_tree(tab, tab.derivation, n)
-    robot = compose(partial, tab.session.files.library, tab.name)
-    tab.show_robot(robot, partial, f"# {partial}", f"{DERIVATION}{partial}")
-
-
-def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
-    """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
-    lines = [escape(line) for line in outline(derivation).splitlines()]
-    lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
-    tab.tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")

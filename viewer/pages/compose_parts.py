@@ -13,18 +13,33 @@ from morphgen.errors import CompositionError, MorphgenError, nearest
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.derive import Choices
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest, Parameter, PartKind, parse_value
 from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, parse_request
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.pages.compose_grammar import ShowRobot
 from morphgen.viewer.robot_tables import part_title, slider_step
 from morphgen.viewer.robot_uri import DERIVATION, WORDS, resolve_words
 
 NO_PART = "(none)"  # option of a dropdown that leaves a slot empty
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A robot that the page shows."""
+
+    robot: Robot
+    derivation: Derivation
+    command: str  # command that makes the robot, or a comment with its derivation
+    uri: str  # URI of the robot
+    subject: str  # subject and state of the page's address that show the robot again
+    state: Mapping[str, str] = field(default_factory=dict)
+    choices: Choices | None = None  # choices that gave the robot, if a grammar did
+
+
+ShowRobot = Callable[[Shown], None]
 
 
 @dataclass(frozen=True)
@@ -152,101 +167,132 @@ def with_value(choice: PartChoice, key: str, value: float, default: float) -> Pa
     return replace(choice, values=values)
 
 
-@dataclass(eq=False)
 class PartsTab:
-    """Controls of the tab in one browser."""
+    """The tab with a dropdown of parts for the base and its slots, and sliders of parameters."""
 
-    session: Session
-    show_robot: ShowRobot
-    choice: PartChoice
-    fault: viser.GuiHtmlHandle
-    folder: viser.GuiFolderHandle
-    slots: list[viser.GuiFolderHandle] = field(default_factory=list)
-    """Folders with the controls of each slot."""
+    def __init__(
+        self,
+        session: Session,
+        tabs: viser.GuiTabGroupHandle,
+        choice: PartChoice,
+        show_robot: ShowRobot,
+    ) -> None:
+        """Add the tab; ``show`` shows the chosen robot."""
+        gui, library = session.client.gui, session.files.library
+        self._session, self._library, self._choice = session, library, choice
+        self._show_robot = show_robot
+        self._slots: list[viser.GuiFolderHandle] = []  # folders with the controls of each slot
+        with tabs.add_tab("Parts", viser.Icon.PUZZLE):
+            self._fault = gui.add_html("")
+            bases = tuple(library.names("base"))
+            base = gui.add_dropdown("base", bases, initial_value=choice.parts["base"])
+            self._folder = gui.add_folder(None)
+        session.on_change(base, lambda: self._choose("base", base.value))
+        self._add_slots()
+
+    def show(self) -> None:
+        """Show the robot of the chosen parts, or why they do not fit."""
+        words = self._choice.words
+        command = shlex.join(["morphgen", "compose", *words.split()])
+
+        def resolve() -> Shown:
+            derivation, name = resolve_words(words, self._session.files)
+            robot = compose(derivation, self._library, name)
+            return Shown(robot, derivation, command, WORDS + words, words)
+
+        _show_composed(self._session, self._fault, resolve, self._show_robot)
+
+    def _add_slots(self) -> None:
+        """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
+        gui, choice = self._session.client.gui, self._choice
+        for folder in self._slots:
+            folder.remove()
+        self._slots = []
+        for slot in ("base", *slots_of(choice, self._library)):
+            with self._folder:
+                self._slots.append(folder := gui.add_folder(slot))
+            with folder:
+                if slot != "base":
+                    self._add_part_dropdown(slot)
+                if part := choice.parts.get(slot):
+                    manifest = self._library.manifest(part, kind_of(slot))
+                    for name, parameter in parameters_of(slot, manifest).items():
+                        key = f"{slot}.{name}"
+                        value = choice.values.get(key, parameter.default)
+                        change = functools.partial(self._change, key, parameter.default)
+                        _add_slider(self._session, name, parameter, value, key, change)
+
+    def _add_part_dropdown(self, slot: str) -> None:
+        names, chosen = part_options(slot, self._library), self._choice.parts.get(slot)
+        dropdown = self._session.client.gui.add_dropdown(
+            kind_of(slot), tuple(names), initial_value=chosen if chosen in names else NO_PART
+        )
+        self._session.on_change(dropdown, lambda: self._choose(slot, dropdown.value))
+
+    def _choose(self, slot: str, part: str) -> None:
+        """Put a part into a slot, and show its controls and the robot."""
+        self._choice = with_part(self._choice, slot, part, self._library)
+        self._add_slots()
+        self.show()
+
+    def _change(self, key: str, default: float, value: float) -> None:
+        self._choice = with_value(self._choice, key, value, default)
+        self.show()
 
 
-def add_parts_tab(
-    session: Session, tabs: viser.GuiTabGroupHandle, choice: PartChoice, show_robot: ShowRobot
-) -> Callable[[], None]:
-    """Add the tab of the base and its slots; return the function that shows the chosen robot."""
-    gui = session.client.gui
-    with tabs.add_tab("Parts", viser.Icon.PUZZLE):
-        fault = gui.add_html("")
-        bases = tuple(session.files.library.names("base"))
-        base = gui.add_dropdown("base", bases, initial_value=choice.parts["base"])
-        tab = PartsTab(session, show_robot, choice, fault, gui.add_folder(None))
-    session.on_change(base, lambda: _choose_part(tab, "base", base.value))
-    _add_slots(tab)
-    return lambda: _show_choice(tab)
+class ParametersTab:
+    """The tab with sliders for every part of a derivation that words cannot describe."""
+
+    def __init__(
+        self,
+        session: Session,
+        tabs: viser.GuiTabGroupHandle,
+        derivation: Derivation,
+        show_robot: ShowRobot,
+    ) -> None:
+        """Add the tab; ``show`` shows the robot."""
+        gui, library = session.client.gui, session.files.library
+        self._session, self._derivation, self._show_robot = session, derivation, show_robot
+        with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
+            self._fault = gui.add_html("")
+            for node in derivation.walk():
+                manifest, values = library.manifest(node.part), dict(node.parameters)
+                is_root = node is derivation
+                parameters = manifest.parameters if is_root else manifest.attached_parameters
+                if names := [name for name in parameters if name in values]:
+                    with gui.add_folder(part_title(node.label, node.part)):
+                        for name in names:
+                            change = functools.partial(self._change, node.label, name)
+                            key = f"{node.label}.{name}"
+                            _add_slider(session, name, parameters[name], values[name], key, change)
+
+    def show(self) -> None:
+        """Show the robot, or why its values do not fit."""
+        derivation, library = self._derivation, self._session.files.library
+
+        def resolve() -> Shown:
+            uri = f"{DERIVATION}{derivation}"
+            robot = compose(derivation, library, default_name(derivation, library))
+            return Shown(robot, derivation, f"# {derivation}", uri, uri)
+
+        _show_composed(self._session, self._fault, resolve, self._show_robot)
+
+    def _change(self, label: str, name: str, value: float) -> None:
+        self._derivation = with_parameter(self._derivation, label, name, value)
+        self.show()
 
 
 def _show_composed(
-    session: Session,
-    fault: viser.GuiHtmlHandle,
-    subject: str,
-    resolve: Callable[[], tuple[Derivation, str]],
-    show: Callable[[Robot, Derivation], None],
+    session: Session, fault: viser.GuiHtmlHandle, make: Callable[[], Shown], show: ShowRobot
 ) -> None:
-    """Show a robot and its address, or why it cannot be composed; then the last robot stays."""
+    """Show a robot, or why it cannot be composed; then the last robot stays."""
     try:
-        derivation, name = resolve()
-        robot = compose(derivation, session.files.library, name)
+        shown = make()
     except MorphgenError as error:
         fault.content = markup.error(session.files.redact(error))
         return
     fault.content = ""
-    session.address = Address("compose", (subject,))
-    session.show_address(f"compose {name}")
-    show(robot, derivation)
-
-
-def _show_choice(tab: PartsTab) -> None:
-    """Show the robot of the chosen parts, or why they do not fit."""
-    session, words = tab.session, tab.choice.words
-    command = shlex.join(["morphgen", "compose", *words.split()])
-    _show_composed(
-        session,
-        tab.fault,
-        words,
-        lambda: resolve_words(words, session.files),
-        lambda robot, derivation: tab.show_robot(robot, derivation, command, WORDS + words),
-    )
-
-
-def _add_slots(tab: PartsTab) -> None:
-    """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
-    gui, library = tab.session.client.gui, tab.session.files.library
-    for folder in tab.slots:
-        folder.remove()
-    tab.slots.clear()
-    for slot in ("base", *slots_of(tab.choice, library)):
-        with tab.folder:
-            folder = gui.add_folder(slot)
-        tab.slots.append(folder)
-        with folder:
-            if slot != "base":
-                _add_part_dropdown(tab, slot)
-            if part := tab.choice.parts.get(slot):
-                parameters = parameters_of(slot, library.manifest(part, kind_of(slot)))
-                for name, parameter in parameters.items():
-                    _add_choice_slider(tab, f"{slot}.{name}", name, parameter)
-
-
-def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
-    names, chosen = part_options(slot, tab.session.files.library), tab.choice.parts.get(slot)
-    dropdown = tab.session.client.gui.add_dropdown(
-        kind_of(slot), tuple(names), initial_value=chosen if chosen in names else NO_PART
-    )
-    tab.session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
-
-
-def _add_choice_slider(tab: PartsTab, key: str, name: str, parameter: Parameter) -> None:
-    def change(value: float) -> None:
-        tab.choice = with_value(tab.choice, key, value, parameter.default)
-        _show_choice(tab)
-
-    value = tab.choice.values.get(key, parameter.default)
-    _add_slider(tab.session, name, parameter, value, key, change)
+    show(shown)
 
 
 def _add_slider(
@@ -268,49 +314,6 @@ def _add_slider(
         hint=parameter.summary or name,
     )
     session.on_change(slider, lambda: change(slider.value), key)
-
-
-def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
-    """Put a part into a slot, and show its controls and the robot."""
-    tab.choice = with_part(tab.choice, slot, part, tab.session.files.library)
-    _add_slots(tab)
-    _show_choice(tab)
-
-
-def add_parameters_tab(
-    session: Session, tabs: viser.GuiTabGroupHandle, derivation: Derivation, show_robot: ShowRobot
-) -> Callable[[], None]:
-    """Add the tab with sliders for every part of any derivation; return what shows the robot."""
-    gui, library, root = session.client.gui, session.files.library, derivation
-
-    def show() -> None:
-        """Show the robot, or why its values do not fit."""
-        uri = f"{DERIVATION}{derivation}"
-        _show_composed(
-            session,
-            fault,
-            uri,
-            lambda: (derivation, default_name(derivation, library)),
-            lambda robot, _: show_robot(robot, derivation, f"# {derivation}", uri),
-        )
-
-    def change(label: str, name: str, value: float) -> None:
-        nonlocal derivation
-        derivation = with_parameter(derivation, label, name, value)
-        show()
-
-    with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
-        fault = gui.add_html("")
-        for node in root.walk():
-            manifest, values = library.manifest(node.part), dict(node.parameters)
-            parameters = manifest.parameters if node is root else manifest.attached_parameters
-            if names := [name for name in parameters if name in values]:
-                with gui.add_folder(part_title(node.label, node.part)):
-                    for name in names:
-                        set_value = functools.partial(change, node.label, name)
-                        key = f"{node.label}.{name}"
-                        _add_slider(session, name, parameters[name], values[name], key, set_value)
-    return show
 
 
 def with_parameter(derivation: Derivation, label: str, name: str, value: float) -> Derivation:

@@ -13,9 +13,10 @@ from morphgen.grammar.robot_set import INDEX
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address, parse_count
+from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.uploads import store_upload
+from morphgen.viewer.controls import bind
 from morphgen.viewer.gallery import Gallery, add_controls, open_panels, passing_rows, show_page
 from morphgen.viewer.robot_rows import (
     Row,
@@ -112,10 +113,10 @@ def show_chosen(session: Session) -> None:
     gallery = Gallery(session, "Chosen robots", rows, SIDES, "common")
     header = "The first robots that you chose are to train on, the others to test on."
     open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
-    gui, n = session.client.gui, len(rows)
-    default = max(n - 1, 1)
-    initial = min(parse_count(session.address.state.get("train", ""), default), n)
-    num_train = gui.add_slider("to train on", 0, n, 1, initial)
+    num_train = session.client.gui.add_slider("to train on", 0, len(rows), 1, max(len(rows) - 1, 1))
+    bind(session, "train", num_train)
+    session.apply_state()
+    _set_sides(gallery.rows, num_train.value)
 
     def divide() -> None:
         _set_sides(gallery.rows, num_train.value)
@@ -128,8 +129,6 @@ def show_chosen(session: Session) -> None:
         address = replace(session.address, subjects=session.chosen or ("",))
         session.open_address(address, instead=True)
 
-    session.keep("train", lambda: "" if num_train.value == default else str(num_train.value))
-    _set_sides(gallery.rows, initial)
     add_controls(gallery)
     add_split_form(session, lambda: sides, expanded=True)
     session.on_change(num_train, divide, "sides")

@@ -21,8 +21,8 @@ from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError, parse_count
 from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.controls import Robots, add_picker, picked_uri, robot_lists
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.robot_picker import Robots, add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
 from morphgen.viewer.rollout import (
     SPEEDS,

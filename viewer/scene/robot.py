@@ -134,6 +134,11 @@ class RobotView:
         for shape in self._shapes("visual"):
             shape.handle.opacity = None if opacity >= 1 else opacity
 
+    def cast_no_shadow(self) -> None:
+        """Let the visual shapes cast no shadow."""
+        for shape in self._shapes("visual"):
+            shape.handle.cast_shadow = False
+
     def paint_red(self, names: Collection[str]) -> None:
         """Paint the named links red, and the other links in their own colours."""
         if (names := frozenset(names)) == self.red:
@@ -227,55 +232,29 @@ _GAP = 1.25  # distance of two columns in widths of the widest robot
 _ROW = 0.8  # smallest distance of rows in longest sides: they are seen from above at an angle
 
 
-@dataclass(eq=False)
-class OffspringScene:
-    """The offspring in a scene."""
-
-    views: list[RobotView]
-    boxes: Array  # lowest and highest corner of each robot in the world, shape (n, 2, 3) [m]
-
-
 def add_offspring(
     client: viser.ClientHandle, parent: Robot, robots: Sequence[Robot]
-) -> OffspringScene:
+) -> list[RobotView]:
     """Draw the offspring beside the parent, which stands at the origin, and look at all."""
     bounds = np.array([robot_bounds(robot) for robot in (parent, *robots)])
     sizes = (bounds[:, 1] - bounds[:, 0]).max(axis=0)
     step_x = _GAP * float(sizes[0])
     step_y = max(_GAP * float(sizes[1]), _ROW * float(sizes.max()))
     views = []
-    boxes = np.empty((len(robots), 2, 3))
     with client.atomic():
         for i, robot in enumerate(robots):
             row, column = divmod(i, COLUMNS)
             position = ((column + 1.3) * step_x, (1 - row) * step_y, 0.0)
-            boxes[i] = bounds[i + 1] + position
+            bounds[i + 1] += position
             views.append(add_robot(client.scene, split_colours(robot), f"/offspring{i}", position))
             above = (0.0, 0.0, float(bounds[i + 1, 1, 2]) + 0.04 * step_x)
             client.scene.add_label(
                 f"/offspring{i}/label", str(i + 1), position=above, anchor="bottom-center"
             )
-        low = np.minimum(boxes[:, 0].min(axis=0), bounds[0, 0])
-        high = np.maximum(boxes[:, 1].max(axis=0), bounds[0, 1])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
         add_ground(client.scene, float(np.linalg.norm(high - low)))
         look_at(client, low, high, CAMERA_DIRECTION)
-    return OffspringScene(views, boxes)
-
-
-def remove_offspring(scene: OffspringScene) -> None:
-    """Remove the offspring from the scene."""
-    for view in scene.views:
-        view.base.remove()
-
-
-def hit_robot(boxes: Array, origin: Array, direction: Array) -> int | None:
-    """Return the index of the nearest box of (n, 2, 3) that a ray meets; None without one."""
-    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    distances = (boxes - origin) / safe
-    near = distances.min(axis=1).max(axis=1)
-    far = distances.max(axis=1).min(axis=1)
-    hits = np.flatnonzero((near <= far) & (far > 0))
-    return int(hits[np.argmin(near[hits])]) if len(hits) else None
+    return views
 
 
 SIZE = (640, 480)  # width and height of a frame [pixels]

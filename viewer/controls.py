@@ -1,0 +1,193 @@
+"""Controls that several pages have: values in the address, joints of a role, a robot to pick."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import viser
+
+from morphgen.benchmark.split_file import split_names
+from morphgen.grammar.robot_source import is_set_folder
+from morphgen.viewer.app.address import parse_count
+from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
+from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_folder, resolve_split
+
+
+def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> None:  # noqa: ANN401
+    """Keep the value of a control in the page's address; its present value is the default.
+
+    A value of the address that the control cannot have changes nothing.
+
+    Args:
+        session: Session of the page.
+        key: Key of the value in the address.
+        control: A dropdown, check box, text, slider or number field.
+        keys: Texts in the address that stand for the options of a dropdown, by default the options,
+            or for a check box that is on, by default any.
+    """
+    default, keys = control.value, tuple(keys)
+
+    def write() -> str:
+        value = control.value
+        if value == default:
+            return ""
+        if isinstance(control, viser.GuiDropdownHandle):
+            return keys[control.options.index(value)] if keys else str(value)
+        if isinstance(control, viser.GuiCheckboxHandle):
+            return keys[0] if keys else "yes"
+        return f"{value:g}" if isinstance(value, float) else str(value)
+
+    def apply(text: str) -> None:
+        if (value := parse_value(control, text, keys)) is not None:
+            set_value(control, value)
+
+    session.keep(key, write, apply)
+
+
+def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # noqa: ANN401
+    """Return the value of a control that a text of an address stands for; None for none."""
+    match control:
+        case viser.GuiDropdownHandle():
+            keys = keys or control.options
+            return control.options[keys.index(text)] if text in keys else None
+        case viser.GuiCheckboxHandle():
+            return text in keys if keys else bool(text)
+        case viser.GuiNumberHandle():
+            return parse_count(text, control.value)
+        case viser.GuiSliderHandle():
+            try:
+                number = float(text)
+            except ValueError:
+                return None
+            low, high = control.min, control.max
+            return None if math.isnan(number) else type(low)(min(max(number, low), high))
+    return text
+
+
+class RoleSliders:
+    """Sliders that move the joints of a role in all robots of a page; other joints stay at home."""
+
+    def __init__(self, session: Session, low: float, move: Callable[[], object]) -> None:
+        """Prepare for sliders from ``low`` to 1; ``move`` is called after the user moved one."""
+        self.moved: dict[str, float] = {}  # positions of the roles that the user moved
+        self._session, self._low, self._move = session, low, move
+        self._sliders: dict[str, tuple[viser.GuiSliderHandle[float], float]] = {}
+
+    def add(self, role: str, home: float, hint: str) -> None:
+        """Add the slider of a role; ``home`` is its position while nobody has moved it."""
+        session, moved = self._session, self.moved
+        slider = session.client.gui.add_slider(role, self._low, 1.0, 0.01, home, hint=hint)
+        self._sliders[role] = slider, home
+
+        def apply(text: str) -> None:
+            """Take over a position of an address, unless it is invalid; the robots move later."""
+            if (position := parse_value(slider, text)) is not None:
+                moved[role] = position
+                set_value(slider, position)
+
+        def read() -> None:
+            moved[role] = slider.value
+            self._move()
+
+        def write() -> str:
+            return f"{moved[role]:g}" if role in moved else ""
+
+        session.on_change(slider, read, f"move {role}")
+        session.keep(role.replace(" ", ""), write, apply)
+
+    def set(self, moved: Mapping[str, float]) -> None:
+        """Move roles to positions, and all others home."""
+        self.moved.clear()
+        self.moved.update(moved)
+        for role, (slider, home) in self._sliders.items():
+            set_value(slider, moved.get(role, home))
+        self._move()
+
+
+ARMS = "arms with a plate"
+MAX_CHOICES = 500  # robots that a dropdown offers; others can be named by words
+
+Robots = list[tuple[str, str]]  # names and URIs
+RobotLists = Mapping[str, Callable[[], Robots]]  # functions that list robots, by source
+
+
+@dataclass(eq=False)
+class RobotPicker:
+    """Controls that pick a robot in one browser."""
+
+    lists: RobotLists
+    current: Callable[[], str]  # returns the URI of the robot that the dropdown shows first
+    source: viser.GuiDropdownHandle[str]
+    robot: viser.GuiDropdownHandle[str]  # robots of the source; typing searches them
+    words: viser.GuiTextHandle
+    uris: dict[str, str]  # URIs of the robots in the dropdown, by label
+
+
+def add_picker(session: Session, lists: RobotLists, current: Callable[[], str]) -> RobotPicker:
+    """Add controls that pick a robot: from a list to search, or by words of the command."""
+    gui = session.client.gui
+    source = gui.add_dropdown("from", tuple(lists))
+    robot = gui.add_dropdown("robot", ("",), hint="type to search")
+    words = gui.add_text("or words", "", hint="such as arm=ur5 ee=plane, or the folder of a bundle")
+    picker = RobotPicker(lists, current, source, robot, words, {})
+    session.on_change(source, lambda: _list_robots(picker))
+    _list_robots(picker)
+    return picker
+
+
+def _list_robots(picker: RobotPicker) -> None:
+    """Fill the dropdown of robots from the chosen source, each with a label of its own."""
+    current = picker.current()
+    robots = picker.lists[picker.source.value]()[:MAX_CHOICES]
+    if current and current not in (uri for _, uri in robots):
+        robots = [(current, current), *robots]
+    picker.uris = {}
+    for name, uri in robots:
+        while name in picker.uris:
+            name += "'"
+        picker.uris[name] = uri
+    picker.robot.options = tuple(picker.uris)
+    if current:
+        set_value(picker.robot, next(name for name, uri in picker.uris.items() if uri == current))
+
+
+def picked_uri(picker: RobotPicker) -> str:
+    """Return the URI of the robot that the user named or picked, and clear the words."""
+    text = picker.words.value.strip()
+    if not text:
+        return picker.uris[picker.robot.value]
+    set_value(picker.words, "")
+    return WORDS + text if "=" in text and ":" not in text else text
+
+
+def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:
+    """Return lists of robots to pick from, those beside a robot and ``first`` before others."""
+    lists = dict(first)
+    if split := member_split(uri):
+        lists[split] = functools.partial(_split_robots, split, files)
+    folder = parent_folder(uri)
+    if folder and is_set_folder(files.path(folder)):
+        lists[folder] = functools.partial(_folder_robots, folder, files)
+    lists[ARMS] = lambda: [
+        *((arm, f"{WORDS}arm={arm} ee=plane") for arm in files.library.names("arm")),
+        ("planar-cube", f"{WORDS}base=planar ee=cube"),
+    ]
+    for name in robot_folders(files.roots[0]):
+        lists.setdefault(name, functools.partial(_folder_robots, name, files))
+    for split in split_names():
+        lists.setdefault(split, functools.partial(_split_robots, split, files))
+    return lists
+
+
+def _folder_robots(folder: str, files: FileAccess) -> Robots:
+    return [(row.name, row.uri) for row in folder_rows(folder, files)]
+
+
+def _split_robots(split: str, files: FileAccess) -> Robots:
+    rows = split_rows(split, resolve_split(split, files))
+    return [(f"{row.role}: {row.name}", row.uri) for row in rows]
