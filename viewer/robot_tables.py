@@ -117,38 +117,19 @@ def link_table(robot: Robot) -> str:
     return markup.table(("link", "joint", "kg", "shapes"), rows, numbers=(2,))
 
 
-def link_details(robot: Robot, name: str) -> str:
-    """Return a table of a link's properties and of the joint above it."""
-    link, i = robot.link(name), robot.link_index[name]
-    rows: list[tuple[str, str]] = []
-    if i:
-        joint = robot.joints[i - 1]
-        rows += [("parent", joint.parent), ("joint", joint_hint(joint))]
-        rows.append(("position", _numbers(joint.T_parent_joint.position) + " m"))
-        if joint.is_movable:
-            rows.append(("axis", _numbers(joint.axis)))
-        if joint.mimic:
-            mimic = joint.mimic
-            rows.append(("mimics", f"{mimic.multiplier:g} × {mimic.joint} + {mimic.offset:g}"))  # noqa: RUF001
-    rows += _inertial_rows(link)
-    rows += [("visual", _shape_text(shape)) for shape in link.visuals]
-    rows += [("collision", _shape_text(shape)) for shape in link.collisions]
-    rows += [("frame", frame.name) for frame in robot.frames if frame.link == name]
-    return markup.table(
-        ("", escape(name)), [(f"<b>{escape(key)}</b>", escape(text)) for key, text in rows]
-    )
-
-
 def link_card(robot: Robot, name: str, findings: Sequence[Finding]) -> str:
-    """Return a link's mass and inertia, its joint with limits, and the findings about both."""
+    """Return a table of a link, the joint above it with its limits, and the findings about both."""
     link, i = robot.link(name), robot.link_index[name]
     joint = robot.joints[i - 1] if i else None
     rows = _inertial_rows(link)
     rows += [("joint", "none, it is the root")] if joint is None else _joint_rows(joint)
-    about = [f for f in findings if is_about(f, name, joint.name if joint else "")]
+    rows += [("visual", _shape_text(shape)) for shape in link.visuals]
+    rows += [("collision", _shape_text(shape)) for shape in link.collisions]
+    rows += [("frame", frame.name) for frame in robot.frames if frame.link == name]
     texts = [
         f"{markup.tag(finding.severity, finding.severity)} {escape(finding.why)}"
-        for finding in about
+        for finding in findings
+        if is_about(finding, name, joint.name if joint else "")
     ]
     cells = [(escape(key), escape(text)) for key, text in rows]
     cells.append(("findings", "<br>".join(texts) or "none"))
@@ -173,21 +154,27 @@ def collision_text(pairs: Mapping[tuple[str, str], float]) -> str:
 
 
 def _joint_rows(joint: Joint) -> list[tuple[str, str]]:
-    """Return a joint's kind, its limits (angles in both units) and what drives it."""
+    """Return where a joint is, its limits (angles in both units) and what drives it."""
     position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)
-    rows = [("joint", f"{joint.name}, {joint.kind}")]
+    rows = [
+        ("joint", f"{joint.name}, {joint.kind}"),
+        ("parent", joint.parent),
+        ("position", _numbers(joint.T_parent_joint.position) + " m"),
+    ]
     if joint.is_movable:
         low, high = joint.effective_limits
         limits = f"{low:.3g} to {high:.3g} {position}"
         if joint.kind != "prismatic":
             limits += f" ({math.degrees(low):.3g} to {math.degrees(high):.3g}°)"
+        rows.append(("axis", _numbers(joint.axis)))
         rows.append(("limits", limits if joint.limits else "none"))
     if joint.effort is not None:
         rows.append(("effort", f"at most {joint.effort:.3g} {effort}"))
     if joint.velocity is not None:
         rows.append(("velocity", f"at most {joint.velocity:.3g} {speed}"))
     if joint.mimic:
-        rows.append(("mimics", joint.mimic.joint))
+        mimic = joint.mimic
+        rows.append(("mimics", f"{mimic.multiplier:g} × {mimic.joint} + {mimic.offset:g}"))  # noqa: RUF001
     return rows
 
 

@@ -25,7 +25,6 @@ from morphgen.viewer.robot_tables import (
     joint_groups,
     joint_hint,
     link_card,
-    link_details,
     link_table,
     slider_step,
     summary,
@@ -76,8 +75,8 @@ def test_tables_name_every_link_and_escape_it():
         joints=(replace(robot.joints[0], parent="<b>"), *robot.joints[1:]),
     )
     assert "&lt;b&gt;" in link_table(odd)
-    assert "<b><b></b>" not in link_details(odd, "<b>")
-    assert "mimics" in link_details(robot, "right")
+    assert "<b>" not in link_card(odd, "<b>", ())
+    assert "mimics" in link_card(robot, "right", ())
     assert summary(robot, 0.9).startswith("6 links · 4 DoF · 1 mimic joint · ")
 
 
