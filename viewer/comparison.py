@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.encoding.similarity import MEASURES, features
-from morphgen.encoding.tokens import default_max_links
+from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
+from morphgen.benchmark.tokens import default_max_links
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
@@ -81,10 +81,7 @@ def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str
         features(robot, shape, max_links=max_links)
         for robot, shape in zip(robots, shapes, strict=True)
     ]
-    return {
-        name: np.array([[measure.function(a, b) for b in compared] for a in compared])
-        for name, measure in MEASURES.items()
-    }
+    return {name: similarity_matrix(compared, name) for name in MEASURES}
 
 
 def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:

@@ -167,27 +167,28 @@ def picked_uri(picker: RobotPicker) -> str:
 
 def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:
     """Return lists of robots to pick from, those beside a robot and ``first`` before others."""
+
+    def folder_robots(folder: str) -> Robots:
+        return [(row.name, row.uri) for row in folder_rows(folder, files)]
+
+    def split_robots(split: str) -> Robots:
+        rows = split_rows(split, resolve_split(split, files))
+        return [(f"{row.role}: {row.name}", row.uri) for row in rows]
+
+    def arms() -> Robots:
+        names = files.library.names("arm")
+        plates = [(arm, f"{WORDS}arm={arm} ee=plane") for arm in names]
+        return [*plates, ("planar-cube", f"{WORDS}base=planar ee=cube")]
+
     lists = dict(first)
     if split := member_split(uri):
-        lists[split] = functools.partial(_split_robots, split, files)
+        lists[split] = functools.partial(split_robots, split)
     folder = parent_folder(uri)
     if folder and is_set_folder(files.path(folder)):
-        lists[folder] = functools.partial(_folder_robots, folder, files)
-    lists[ARMS] = lambda: [
-        *((arm, f"{WORDS}arm={arm} ee=plane") for arm in files.library.names("arm")),
-        ("planar-cube", f"{WORDS}base=planar ee=cube"),
-    ]
+        lists[folder] = functools.partial(folder_robots, folder)
+    lists[ARMS] = arms
     for name in robot_folders(files.roots[0]):
-        lists.setdefault(name, functools.partial(_folder_robots, name, files))
+        lists.setdefault(name, functools.partial(folder_robots, name))
     for split in split_names():
-        lists.setdefault(split, functools.partial(_split_robots, split, files))
+        lists.setdefault(split, functools.partial(split_robots, split))
     return lists
-
-
-def _folder_robots(folder: str, files: FileAccess) -> Robots:
-    return [(row.name, row.uri) for row in folder_rows(folder, files)]
-
-
-def _split_robots(split: str, files: FileAccess) -> Robots:
-    rows = split_rows(split, resolve_split(split, files))
-    return [(f"{row.role}: {row.name}", row.uri) for row in rows]

@@ -186,18 +186,21 @@ def split_rows(name: str, split: Split) -> list[Row]:
     ]
 
 
+def sibling_rows(uri: str, files: FileAccess) -> list[Row]:
+    """Return the robots of the split or set that has a robot; none if it is in neither."""
+    if split := member_split(uri):
+        return split_rows(split, resolve_split(split, files))
+    folder = parent_folder(uri)
+    is_in_set = folder and (files.path(folder) / INDEX).is_file()
+    return folder_rows(folder, files) if is_in_set else []
+
+
 def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
     """Return the rows of robots; those of sets and splits have the facts that these know."""
     rows = []
     for i, uri in enumerate(uris):
-        split, folder = member_split(uri), parent_folder(uri)
-        listed: Iterable[Row] = ()
-        if split:
-            listed = split_rows(split, resolve_split(split, files))
-        elif folder and (files.path(folder) / INDEX).is_file():
-            listed = folder_rows(folder, files)
-        row = next((row for row in listed if row.uri == uri), Row(uri_name(uri), uri))
-        rows.append(replace(row, order=i))
+        known = (row for row in sibling_rows(uri, files) if row.uri == uri)
+        rows.append(replace(next(known, Row(uri_name(uri), uri)), order=i))
     return rows
 
 
@@ -218,17 +221,9 @@ def part_rows(library: Library) -> list[Row]:
 
 def neighbour_uris(uri: str, files: FileAccess) -> tuple[str, str]:
     """Return the URIs of the previous and next robot in a robot's set or split, or empty texts."""
-    if split := member_split(uri):
-        rows = split_rows(split, resolve_split(split, files))
-    elif (folder := parent_folder(uri)) and (files.path(folder) / INDEX).is_file():
-        rows = folder_rows(folder, files)
-    else:
-        return "", ""
-    uris = ["", *(row.uri for row in rows), ""]
-    if uri.rstrip("/") not in uris:
-        return "", ""
-    i = uris.index(uri.rstrip("/"))
-    return uris[i - 1], uris[i + 1]
+    uris = ["", *(row.uri for row in sibling_rows(uri, files)), ""]
+    i = uris.index(uri.rstrip("/")) if uri.rstrip("/") in uris[1:-1] else 0
+    return (uris[i - 1], uris[i + 1]) if i else ("", "")
 
 
 def _set_rows(uri: str, folder: Path) -> Iterator[Row]:

@@ -58,33 +58,20 @@ class RolloutConfig:
     simulator: str = "mujoco"
 
 
-class EpisodeSource(Protocol):
-    """Source of an episode: a simulation or a file."""
+class EpisodeSource:
+    """Source of an episode: a file, whose episode is complete, or a simulation."""
 
-    episode: Episode
-    max_steps: int  # longest possible episode [control steps]
-    faults: dict[str, str]  # errors of robots that cannot do the task, by URI
+    def __init__(self, episode: Episode, max_steps: int) -> None:
+        """Take over an episode with its longest possible duration [control steps]."""
+        self.episode, self.max_steps = episode, max_steps
+        self.faults: dict[str, str] = {}  # errors of robots that cannot do the task, by URI
 
     def advance(self) -> bool:
         """Simulate one more control step; return False if the episode has ended."""
-
-    def close(self) -> None:
-        """Free the simulation."""
-
-
-class RecordedEpisode:
-    """An episode from a file."""
-
-    def __init__(self, episode: Episode) -> None:
-        self.episode, self.max_steps = episode, episode.num_steps
-        self.faults: dict[str, str] = {}
-
-    def advance(self) -> bool:
-        """Return False: a recorded episode has ended."""
         return False
 
     def close(self) -> None:
-        """Do nothing: there is no simulation."""
+        """Free the simulation."""
 
 
 @dataclass(eq=False)
@@ -97,7 +84,7 @@ class _SimulatedRobot:
     is_running: bool = True
 
 
-class Rollout:
+class Rollout(EpisodeSource):
     """Robots under a policy; each has the episode of ``morphgen play`` with the same seed."""
 
     def __init__(
@@ -107,21 +94,19 @@ class Rollout:
         progress: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Start an episode."""
-        self.faults: dict[str, str] = {}
+        faults: dict[str, MorphgenError] = {}
         self._robots: list[_SimulatedRobot] = []
         spec = _read_controller(config.policy, config.task, files)
-        first_error: MorphgenError | None = None
         for uri in config.robots[:MAX_PLAYED]:
             progress(f"preparing {uri_name(uri)}")
             try:
                 self._robots.append(_start_robot(config, uri, spec, files))
             except MorphgenError as error:
-                first_error = first_error or error
-                self.faults[uri] = str(error)
+                faults[uri] = error
         if not self._robots:
-            raise first_error or UriError("no robot is named: add one with &robot=")
-        self.max_steps = max(int(robot.env.batch.max_episode_steps[0]) for robot in self._robots)
-        self.episode = Episode(
+            none = UriError("no robot is named: add one with &robot=")
+            raise next(iter(faults.values()), none)
+        episode = Episode(
             config.task,
             config.policy,
             config.seed,
@@ -130,6 +115,9 @@ class Rollout:
             CONTROL_PERIOD,
             [robot.track for robot in self._robots],
         )
+        max_steps = max(int(robot.env.batch.max_episode_steps[0]) for robot in self._robots)
+        super().__init__(episode, max_steps)
+        self.faults |= {uri: str(error) for uri, error in faults.items()}
 
     def advance(self) -> bool:
         """Simulate one control step of every running robot; return False if none is running."""
@@ -310,7 +298,22 @@ class Player:
 
     def load(self, make_source: Callable[[], EpisodeSource], *, start: float | None = None) -> None:
         """Show the episode that was requested last, paused at a time [s] or playing from 0."""
-        self._command("load", lambda: self._load(make_source, start))
+
+        def load() -> None:
+            self.is_playing = False
+            previous, self._source = self._source, None
+            if previous is not None:
+                previous.close()
+            self._source = make_source()
+            self.step = 0
+            self._display.show_start(self._source)
+            self._display.show_step(0)
+            if start is None:
+                self._play()
+            else:
+                self._simulate_to(round(start / self._source.episode.period))
+
+        self._command("load", load)
 
     def play(self) -> None:
         """Continue; restart an episode that was shown to its end."""
@@ -318,7 +321,13 @@ class Player:
 
     def pause(self) -> None:
         """Pause at the current step."""
-        self._command("play", self._pause)
+
+        def pause() -> None:
+            self.is_playing = False
+            self._display.show_position(self.step)
+            self._display.show_stopped()
+
+        self._command("play", pause)
 
     def go_to(self, step: int) -> None:
         """Pause at a step, or at the last simulated one before it."""
@@ -327,11 +336,17 @@ class Player:
     def go_by(self, num_steps: int) -> None:
         """Pause a number of steps forward or back; simulate missing steps."""
         # Each press of a button counts, so each command has a key of its own.
-        self._command(f"by {next(self._counter)}", lambda: self._go_by(num_steps))
+        key = f"by {next(self._counter)}"
+        self._command(key, lambda: self._simulate_to(self.step + num_steps))
 
     def set_speed(self, speed: float) -> None:
         """Set the speed of playback [simulated seconds per second]."""
-        self._command("speed", lambda: self._set_speed(speed))
+
+        def change() -> None:
+            self._speed = speed
+            self._restart_clock()
+
+        self._command("speed", change)
 
     def stop(self) -> None:
         """End the thread after its current work."""
@@ -352,23 +367,20 @@ class Player:
             self._wake.notify()
 
     def _run(self) -> None:
+        """Run commands as they come, and show frames between them, until the player is stopped."""
         try:
-            while work := self._next_work():
-                for call in work:
-                    self._call(call)
+            while True:
+                with self._wake:
+                    if not self._commands and not self._ended:
+                        self._wake.wait(FRAME_TIME if self.is_playing else None)
+                    commands, self._commands = list(self._commands.values()), {}
+                    if self._ended:
+                        return
+                for work in commands or [self._tick]:
+                    self._call(work)
         finally:
             if self._source is not None:
                 self._source.close()
-
-    def _next_work(self) -> list[Callable[[], object]]:
-        """Wait for commands or the next frame; return nothing when the player is stopped."""
-        with self._wake:
-            if not self._commands and not self._ended:
-                self._wake.wait(FRAME_TIME if self.is_playing else None)
-            commands, self._commands = list(self._commands.values()), {}
-            if self._ended:
-                return []
-        return commands or [self._tick]
 
     def _call(self, work: Callable[[], object]) -> None:
         """Run work; show a failure, and ignore errors after the browser has disconnected."""
@@ -381,21 +393,6 @@ class Player:
             if not self._ended:  # expected from a browser that has disconnected
                 raise
 
-    def _load(self, make_source: Callable[[], EpisodeSource], start: float | None) -> None:
-        """Replace the episode by a new one, and show its start."""
-        self.is_playing = False
-        previous, self._source = self._source, None
-        if previous is not None:
-            previous.close()
-        self._source = make_source()
-        self.step = 0
-        self._display.show_start(self._source)
-        self._display.show_step(0)
-        if start is None:
-            self._play()
-        else:
-            self._go_by(round(start / self._source.episode.period))
-
     def _play(self) -> None:
         if self._source is None:
             return
@@ -404,11 +401,6 @@ class Player:
         self.is_playing = True
         self._display.show_position(None)
         self._restart_clock()
-
-    def _pause(self) -> None:
-        self.is_playing = False
-        self._display.show_position(self.step)
-        self._display.show_stopped()
 
     def _go_to(self, step: int) -> None:
         if self._source is None:
@@ -419,17 +411,13 @@ class Player:
         self._display.show_position(self.step)
         self._display.show_stopped()
 
-    def _go_by(self, num_steps: int) -> None:
-        source, target = self._source, self.step + num_steps
+    def _simulate_to(self, step: int) -> None:
+        source = self._source
         if source is None:
             return
-        while source.episode.num_steps < target and not self._ended and source.advance():
+        while source.episode.num_steps < step and not self._ended and source.advance():
             pass
-        self._go_to(target)
-
-    def _set_speed(self, speed: float) -> None:
-        self._speed = speed
-        self._restart_clock()
+        self._go_to(step)
 
     def _restart_clock(self) -> None:
         """Measure playback time from now and from the current step."""

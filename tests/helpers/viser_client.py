@@ -1,11 +1,13 @@
 """A client of a viewer without a browser: it speaks viser's protocol over a real websocket."""
 
 import contextlib
+import http.client
 import json
 import re
 import socket
 import time
 import uuid
+from urllib.parse import quote
 
 import msgspec
 import viser
@@ -29,13 +31,14 @@ CAMERA = {
 
 
 class PlainClient:
-    """Connects, reports an address when the server asks for it, and stores all messages."""
+    """Connects, asks for the page of a query when it is connected, and stores all messages."""
 
     def __init__(self, port, query="", *, origin=None, host=None, address="127.0.0.1", dark=False):
         name = f"[{address}]" if ":" in address else address
         self.query, self.dark, self.messages = query, dark, []
+        self.address, self.port, self.host = address, port, host or f"{name}:{port}"
         self.websocket = connect(
-            f"ws://{host or f'{name}:{port}'}",
+            f"ws://{self.host}",
             origin=Origin(origin) if origin else None,
             subprotocols=[f"viser-v{viser.__version__}"],
             sock=socket.create_connection((address, port)),
@@ -147,15 +150,17 @@ class PlainClient:
         plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
         for message in msgspec.msgpack.decode(plain)["messages"]:
             self.messages.append(message)
-            if message["type"] == "LocalStorageGetItemRequestMessage":
-                self.send(
-                    {
-                        "type": "LocalStorageGetItemResponseMessage",
-                        "request_uuid": message["request_uuid"],
-                        "value": json.dumps({"query": self.query, "dark": self.dark}),
-                        "error": None,
-                    }
-                )
+            if "?.connect(" in message.get("source", ""):
+                self._open(json.JSONDecoder().raw_decode(message["source"].split("(", 1)[1])[0])
+
+    def _open(self, token):
+        """Ask for the page of the query, as the script of a page does."""
+        connection = http.client.HTTPConnection(self.address, self.port, timeout=60)
+        state = f"visit=0&dark={'yes' if self.dark else ''}"
+        path = f"/morphgen/{token}?open={quote(self.query, safe='')}&{state}"
+        connection.request("GET", path, headers={"Host": self.host})
+        assert connection.getresponse().status == 200
+        connection.close()
 
 
 def _texts(value):

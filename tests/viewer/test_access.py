@@ -84,22 +84,13 @@ def test_duplicate_host_or_origin_headers_are_rejected():
     [
         "websocket=wss://evil.example",
         "robot=x&websocket=ws://evil.example:8080/",
-        "websocket=//[",
-        "playbackPath=https://evil.example/a.viser",
+        "websocket=",
         "playbackPath=a.viser",
-        "websocket=ws://localhost:8080&websocket=wss://evil.example",
-        "websocket=wss://evil.example&websocket=ws://localhost:8080",
-        "websocket=ws://localhost:8080&websocket=ws://localhost:8080",
-        "websocket=&websocket=wss://evil.example",
-        "%77ebsocket=wss://evil.example&websocket=ws://localhost:8080",
-        "playbackPath=&websocket=ws://localhost:8080",
+        "%77ebsocket=wss://evil.example&robot=x",
     ],
 )
 def test_url_cannot_connect_to_another_server(query):
     assert "another server" in asked(AccessPolicy(), "localhost:8080", path=f"/?{query}")
-    assert (
-        asked(AccessPolicy(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
-    )
 
 
 @pytest.mark.parametrize(
@@ -110,21 +101,11 @@ def test_malformed_origin_is_rejected(origin):
         access_policy("127.0.0.1", [origin])
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:{port}"])
-def test_foreign_origin_gets_no_websocket(shared_viewer, origin):
-    port = shared_viewer.port
+def test_foreign_origin_gets_no_websocket(shared_viewer):
     with pytest.raises(InvalidStatus) as refused:
-        PlainClient(port, origin=origin.format(port=port))
+        PlainClient(shared_viewer.port, origin="http://evil.example")
     assert refused.value.response.status_code == 403
     assert b"may not use this viewer" in refused.value.response.body
-
-
-def test_foreign_host_name_gets_no_websocket(shared_viewer):
-    port = shared_viewer.port
-    host = f"evil.example:{port}"
-    with pytest.raises(InvalidStatus) as refused:
-        PlainClient(port, host=host, origin=f"http://{host}")
-    assert b"is not a name of this viewer" in refused.value.response.body
 
 
 @pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from helpers.pages import nodes
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.grammar.compose import compose
@@ -71,12 +72,20 @@ def test_fits_have_an_iou():
     assert "not fitted yet" in fit_table(robot, {})
 
 
-def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(shared_viewer):
-    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&show=primitives"
-    with PlainClient(shared_viewer.port, query) as client:
+def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(viewer):
+    on = viewer()
+    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&show=primitives&lost=1"
+    with PlainClient(on.port, query) as client:
         client.shows("compare=robots/some-arm&joint1=-1&show=primitives")
+        client.shows("<th >link</th>")
+        assert not nodes(on)["/robot0/1/visual0"].visible
+        before = nodes(on)["/robot0/2"].position.copy()
         client.change(client.control("Slider", "joint 2"), 0.5)
         client.shows("joint1=-1&show=primitives&joint2=0.5")
+        rotated = nodes(on)["/robot0/2"]
+        assert not np.allclose(rotated.position, before) or not np.allclose(
+            rotated.wxyz, [1, 0, 0, 0]
+        )
         client.change(client.control("ButtonGroup", "Go to"), "middle")
         client.shows("joint1=0&show=primitives&joint2=0&joint3=0&finger1=0")
         client.change(client.control("ButtonGroup", "Go to"), "home")

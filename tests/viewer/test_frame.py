@@ -18,7 +18,7 @@ A, B = "words:arm=ur5 ee=plane", "robots/prims/prims-000001"
 
 
 def targets(address, chosen=()):
-    return {label: target.query for label, target, _ in page_links(address, chosen)}
+    return {label: target.query for label, target in page_links(address, chosen).items()}
 
 
 def test_links_of_the_bar_keep_the_subject_of_the_page():

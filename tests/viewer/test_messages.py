@@ -19,6 +19,14 @@ from morphgen.viewer.app.server import message_fault
         {"type": "ShareUrlRequest"},
         {"type": "RunJavascriptMessage", "source": "alert()"},
         {"type": "GuiUpdateMessage", "uuid": 3, "updates": {}},
+        {
+            "type": "ScenePointerMessage",
+            "event_type": "rect-select",
+            "modifier": None,
+            "ray_origin": None,
+            "ray_direction": None,
+            "screen_pos": [[0.5, 0.5]],
+        },
         {"type": "GuiUpdateMessage", "uuid": "x", "updates": {}, "more": 1},
         {"type": "GuiUpdateMessage", "uuid": "x"},
         {**CAMERA, "wxyz": [1.0, 0.0]},
@@ -57,7 +65,7 @@ def test_valid_messages_are_accepted():
         ("Dropdown", "Sort by", "/etc/passwd", "not one of the choices"),
         ("Dropdown", "Sort by", ["name"], "not one of the choices"),
         ("ButtonGroup", "Page", "beyond", "not one of the choices"),
-        ("UploadButton", "Open a URDF, an MJCF or a zip", "x", "takes no value"),
+        ("UploadButton", "Open a URDF, an MJCF or a zip", "x", "takes no value such as"),
     ],
 )
 def test_invalid_control_values_are_rejected(shared_viewer, capfd, kind, label, value, why):

@@ -1,4 +1,4 @@
-"""The way through the pages in a browser, without loading viser's client again; comparing."""
+"""The way through the pages in a browser, without loading viser's client again."""
 
 import re
 
@@ -121,29 +121,3 @@ def test_the_open_tab_is_in_the_address_and_back_returns_to_it(same):
     page.get_by_role("tab", name="Move").click()
     page.wait_for_url(re.compile(r"prims-000001$"))
     assert page.failures == []
-
-
-def test_robots_are_compared(see, viewer, picture):
-    on = viewer()
-    page = see("?compare=words:base=gantry ee=plane&compare=robots/some-arm", on=on)
-    page.get_by_text("Similarity").wait_for()
-    page.get_by_text(re.compile("gantry-plane and arm")).wait_for()
-    picture(page, "compare")
-    page.get_by_role("tab", name="Move").click()
-    before = [nodes(on)[f"/robot{i}/2"].position.copy() for i in range(2)]
-    field(page, "joint 1").last.fill("0.9")
-    page.wait_for_timeout(1500)
-    after = [nodes(on)[f"/robot{i}/2"].position for i in range(2)]
-    assert all(abs(a - b).max() > 0.01 for a, b in zip(after, before, strict=True))
-    assert page.failures == []
-
-
-def test_primitives_are_coloured_by_their_iou(see, viewer, picture):
-    on = viewer()
-    page = see("?compare=words:arm=ur5 ee=plane", on=on)
-    page.get_by_role("tab", name="Primitives").click()
-    page.get_by_role("checkbox").first.click()
-    page.get_by_text("IoU", exact=True).wait_for()
-    page.get_by_role("cell", name="arm_forearm_link").wait_for()
-    picture(page)
-    assert not nodes(on)["/robot0/3/visual0"].visible

@@ -202,8 +202,7 @@ def episode(*num_steps):
 
 
 def test_curves_have_distance_score_and_a_line_at_the_step():
-    scores = [[], []]
-    distances, totals = curves(episode(5, 3), 2, scores)
+    distances, totals = curves(episode(5, 3), 2)
     assert distances[0] == pytest.approx(0.02 * np.arange(1, 6))
     assert distances[1] == pytest.approx([1, 0.9, 0.8, 0.7, 0.6])
     assert distances[2] == pytest.approx([1, 0.9, 0.8, 0.8, 0.8])  # it ended after three steps
@@ -213,15 +212,8 @@ def test_curves_have_distance_score_and_a_line_at_the_step():
     assert len(totals) == 4
 
 
-def test_curves_continue_the_scores_that_are_known():
-    scores = [[7.0]]
-    _, totals = curves(episode(3), 1, scores)
-    assert totals[1][0] == 7.0
-    assert len(scores[0]) == 3
-
-
 def test_curves_are_finite_before_the_first_step():
-    for data in curves(episode(0, 0), 0, [[], []]):
+    for data in curves(episode(0, 0), 0):
         assert all(np.isfinite(line).all() for line in data)
         assert {len(line) for line in data} == {1}
 

@@ -19,7 +19,7 @@ from morphgen.viewer.app.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.pages.play import parse_rollout, rollout_address
 from morphgen.viewer.robot_uri import FileAccess
-from morphgen.viewer.rollout import RecordedEpisode, Rollout, RolloutConfig, simulators
+from morphgen.viewer.rollout import EpisodeSource, Rollout, RolloutConfig, simulators
 from morphgen.viewer.scene.rollout import (
     GAP,
     episode_page,
@@ -125,7 +125,7 @@ def test_an_episode_at_its_start_can_be_saved(files, root, module_cache):
     rollout.close()
     read = read_episode(root / "start.npz", files)
     assert read.num_steps == 0
-    assert not RecordedEpisode(read).advance()
+    assert not EpisodeSource(read, 0).advance()
 
 
 def changed(path, **arrays):

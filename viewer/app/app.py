@@ -24,7 +24,7 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
-from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session, read_location
+from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session
 from morphgen.viewer.app.viser_internals import clear_page
 from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_files import change_tray
@@ -113,7 +113,8 @@ def _accept_browsers(viewer: Viewer) -> None:
                 current.report_error(reason)
 
         MessageFilter(client, report)
-        session.enqueue(lambda: open_first_page(session, token))
+        # The script of the page then asks for the page of its URL.
+        session.enqueue(lambda: session.run_script(call("connect", token)))
 
     async def disconnect(client: viser.ClientHandle) -> None:
         for token, session in list(viewer.sessions.items()):
@@ -139,8 +140,9 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
     if action != "open":
         session.enqueue(lambda: change_tray(session, action, value), even_closed=True)
         return True
+    visit = parse_count(state.get("visit", ""), 0)
     following = session.next_session(
-        parse_count(state.get("visit", ""), 0),
+        visit,
         dark=bool(state.get("dark")),
         width=parse_count(state.get("width", ""), DEFAULT_WIDTH),
     )
@@ -148,23 +150,11 @@ def _receive(viewer: Viewer, token: str, query: str) -> bool:
 
     def find_address() -> None:
         following.address = parse_address(value) or viewer.start
-        following.chosen = session.chosen  # after the changes that were queued before
+        # The tray after the changes that were queued before; at first that of the URL.
+        following.chosen = session.chosen if visit else following.address.chosen
 
     following.enqueue(lambda: open_page(following, find_address))
     return True
-
-
-def open_first_page(session: Session, token: str) -> None:
-    """Build the page that a browser's URL names."""
-
-    def find_address() -> None:
-        location = read_location(session.client)
-        session.dark, session.width = location.dark, location.width
-        session.run_script(call("connect", token))
-        session.address = parse_address(location.query) or session.address
-        session.chosen = session.address.chosen
-
-    open_page(session, find_address)
 
 
 def open_page(session: Session, find_address: Callable[[], object]) -> None:

@@ -62,8 +62,8 @@ def call(function: str, *arguments: object) -> str:
     return f"window.morphgen?.{function}({', '.join(map(json.dumps, arguments))});"
 
 
-def page_links(address: Address, chosen: Sequence[str]) -> list[tuple[str, Address, bool]]:
-    """Return the links of the top bar: label, address, and whether it is the current page.
+def page_links(address: Address, chosen: Sequence[str]) -> dict[str, Address]:
+    """Return the addresses of the links in the top bar by their labels.
 
     A link keeps what the current page is about; *Compare* and *Playback* take the chosen robots.
     """
@@ -71,18 +71,15 @@ def page_links(address: Address, chosen: Sequence[str]) -> list[tuple[str, Addre
     robots = tuple(chosen) or ((uri,) if uri else ())
     folder, split = _surroundings(address)
     is_derived = address.page == "robot" and uri.startswith((WORDS, DERIVATION, MEMBER))
-    composed = Address("compose", (uri.removeprefix(WORDS) if is_derived else DEFAULT_WORDS,))
-    play = Address("play", ("reach",), robots=robots[:MAX_PLAYED])
-    links = [
-        ("Library", Address("library"), ("library",)),
-        ("Gallery", Address("gallery", (folder,)), ("gallery",)),
-        ("Population", Address("population", (split or folder,)), ("population",)),
-        ("Compose", composed, ("compose",)),
-        ("Compare", Address("compare", robots[:MAX_COMPARED] or ("",)), ("compare",)),
-        ("Splits", Address("split", (split,)), ("split",)),
-        ("Playback", play, ("play",)),
-    ]
-    return [(label, target, address.page in pages) for label, target, pages in links]
+    return {
+        "Library": Address("library"),
+        "Gallery": Address("gallery", (folder,)),
+        "Population": Address("population", (split or folder,)),
+        "Compose": Address("compose", (uri.removeprefix(WORDS) if is_derived else DEFAULT_WORDS,)),
+        "Compare": Address("compare", robots[:MAX_COMPARED] or ("",)),
+        "Splits": Address("split", (split,)),
+        "Playback": Address("play", ("reach",), robots=robots[:MAX_PLAYED]),
+    }
 
 
 def _surroundings(address: Address) -> tuple[str, str]:
@@ -99,8 +96,9 @@ def _surroundings(address: Address) -> tuple[str, str]:
 def bar_html(address: Address, chosen: Sequence[str], *, dark: bool) -> str:
     """Return the content of the top bar."""
     links = "".join(
-        f'<a href="{escape(target.query)}"{" class=current" if is_current else ""}>{label}</a>'
-        for label, target, is_current in page_links(address, chosen)
+        f'<a href="{escape(target.query)}"'
+        f"{' class=current' if target.page == address.page else ''}>{label}</a>"
+        for label, target in page_links(address, chosen).items()
     )
     theme = "light" if dark else "dark"
     switch = escape(address.with_state(theme=theme).query)

@@ -43,7 +43,7 @@ from morphgen.viewer.app.viser_internals import (
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # names of this machine that nobody else can claim
 _PORTS = {"http": 80, "https": 443}
-_FOREIGN_SERVER, _FOREIGN_FILE = "websocket", "playbackPath"
+_FOREIGN = ("websocket", "playbackPath")
 """Query keys that make viser's page show another server, or a file, under this viewer's name."""
 
 
@@ -90,10 +90,8 @@ def refusal_reason(policy: AccessPolicy, path: str, headers: Headers) -> str:
             "viewer with --allow-origin and its origin."
         )
     query = parse_qsl(urlsplit(path).query, keep_blank_values=True)
-    shown = [(key, value) for key, value in query if key in (_FOREIGN_SERVER, _FOREIGN_FILE)]
-    # A browser takes the first of several values, other programs the last.
-    if shown and not (len(shown) == 1 and _is_viewer_socket(policy, *shown[0])):
-        return f"an address with {_FOREIGN_SERVER}= or {_FOREIGN_FILE}= would show another server."
+    if any(key in _FOREIGN for key, _ in query):
+        return f"an address with {'= or '.join(_FOREIGN)}= would show another server."
     return ""
 
 
@@ -124,12 +122,6 @@ def _is_viewer_name(policy: AccessPolicy, netloc: str) -> bool:
         or (policy.any_address and _is_ip_address(url.hostname))
         or any(url.netloc == urlsplit(origin).netloc for origin in policy.origins)
     )
-
-
-def _is_viewer_socket(policy: AccessPolicy, key: str, value: str) -> bool:
-    """Return whether a value of a query names a server, and this one."""
-    server = _split_url(value) if key == _FOREIGN_SERVER else None
-    return server is not None and _is_viewer_name(policy, server.netloc.lower())
 
 
 def _is_allowed_origin(policy: AccessPolicy, origin: str, host: str) -> bool:
@@ -207,11 +199,10 @@ def message_fault(data: object) -> str:
         msgspec.convert(content, message_type)
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
         return f"malformed message: {error}"
-    if message_type is ScenePointer:  # its fields have valid types, but have to fit its gesture
-        rays = (content["ray_origin"], content["ray_direction"])
-        is_click = content["event_type"] == "click"
-        if len(content["screen_pos"]) != (1 if is_click else 2) or (is_click and None in rays):
-            return "a click needs a ray and a point, a rectangle needs two points"
+    # No page listens to clicks beside the nodes of its scene.
+    rectangle = (content.get("event_type"), len(content.get("screen_pos", ())))
+    if message_type is ScenePointer and rectangle != ("rect-select", 2):
+        return "expected a rectangle with two points"
     norm = math.hypot(*content.get("wxyz", (1.0,)))
     if not _all_finite(content.values()) or norm < MIN_QUATERNION_NORM:
         return "a number of the message is not finite, or a quaternion is zero"
@@ -288,34 +279,30 @@ def _upload_fault(message: UploadStart) -> str:
 def _valid_value(handle: Any, value: object) -> object:  # noqa: ANN401
     """Return a browser's value for a control, clipped to the range of a slider or number field."""
     match handle:
-        case viser.GuiButtonHandle() | viser.GuiCheckboxHandle():
-            is_valid, expected = isinstance(value, bool), "true or false"
-        case viser.GuiTextHandle():
-            is_valid = isinstance(value, str) and len(value) <= MAX_TEXT
-            expected = f"a text of at most {MAX_TEXT} characters"
-        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
-            if value not in handle.options:
-                raise MessageError(f"{value!r:.80} is not one of the choices")
+        case viser.GuiButtonHandle() | viser.GuiCheckboxHandle() if isinstance(value, bool):
             return value
+        case viser.GuiTextHandle() if isinstance(value, str) and len(value) <= MAX_TEXT:
+            return value
+        case viser.GuiTextHandle():
+            raise MessageError(f"expected a text of at most {MAX_TEXT} characters")
+        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle() if value in handle.options:
+            return value
+        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
+            raise MessageError(f"{value!r:.80} is not one of the choices")
         case viser.GuiSliderHandle() | viser.GuiNumberHandle():
-            return _clip(value, handle.min, handle.max)
+            return _clip(value, handle)
         case viser.GuiMultiSliderHandle():
             if isinstance(value, list) and len(value) == len(handle.value):
-                return [_clip(number, handle.min, handle.max) for number in value]
-            is_valid, expected = False, f"{len(handle.value)} numbers"
-        case _:
-            raise MessageError("that control takes no value")
-    if not is_valid:
-        raise MessageError(f"expected {expected}, not {value!r:.80}")
-    return value
+                return [_clip(number, handle) for number in value]
+    raise MessageError(f"that control takes no value such as {value!r:.80}")
 
 
-def _clip(value: object, low: float | None, high: float | None) -> float:
-    """Clip a number to a range; browsers round, and so may leave it by a little."""
+def _clip(value: object, handle: Any) -> float:  # noqa: ANN401
+    """Clip a number to a control's range; browsers round, and so may leave it by a little."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise MessageError(f"expected a number, not {value!r:.80}")
-    low = -MAX_NUMBER if low is None else low
-    high = MAX_NUMBER if high is None else high
+    low = -MAX_NUMBER if handle.min is None else handle.min
+    high = MAX_NUMBER if handle.max is None else handle.max
     return min(max(value, low), high)
 
 

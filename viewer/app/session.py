@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import traceback
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,13 +12,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
-import msgspec
 import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.progress import show_progress
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address, AddressError, require_few_chosen
+from morphgen.viewer.app.address import Address, require_few_chosen
 from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
 from morphgen.viewer.app.viser_internals import run_javascript
 from morphgen.viewer.app.workers import SharedResults, Workers
@@ -28,45 +25,6 @@ from morphgen.viewer.robot_uri import FileAccess
 
 DEFAULT_WIDTH = 1400  # width of a window that a browser does not tell [pixels]
 ADDRESS_DELAY = 0.5  # delay of URL updates after a move [s]; Safari allows 100 updates in 30 s
-URL_TIMEOUT = 20.0  # time in which a browser has to report its URL [s]
-
-_READ_LOCATION = """
-const name = Object.keys(localStorage).find((key) => key.endsWith(%s));
-const state = {query: window.location.search, dark: window.morphgen.theme(),
-  width: window.innerWidth};
-if (name) localStorage.setItem(name, JSON.stringify(state));
-"""
-
-
-@dataclass(frozen=True)
-class Location:
-    """The URL and the theme that a browser reports."""
-
-    query: str = ""  # query of its URL with the question mark; empty if there is none
-    dark: bool = False
-    """Whether pages are dark: as the address says (``theme=dark``) or said before, else as the
-    browser prefers."""
-    width: int = DEFAULT_WIDTH  # width of its window [pixels]
-
-
-def read_location(client: viser.ClientHandle) -> Location:
-    """Return the URL and the theme of a browser.
-
-    viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
-    local storage, under a key that no other tab uses, and viser reads it from there.
-    """
-    key = f"morphgen-{uuid.uuid4().hex}"
-    client.local_storage.set_item(key, "")
-    run_javascript(client, _READ_LOCATION % json.dumps(key))
-    try:
-        text = client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
-    finally:
-        client.local_storage.remove_item(key)
-    try:
-        return msgspec.json.decode(text, type=Location) if text else Location()
-    except msgspec.MsgspecError as error:
-        raise AddressError(f"the browser sent no valid location: {error}") from error
-
 
 BUG = "this is a bug of morphgen; its traceback is in the terminal where the viewer was started"
 """Text that a page shows for an unexpected error."""
@@ -76,15 +34,6 @@ T = TypeVar("T")
 
 class SessionClosed(RuntimeError):  # noqa: N818
     """The browser has left the session's page, or has disconnected."""
-
-
-@dataclass(frozen=True)
-class StateValue:
-    """A value of a page that its address keeps, as text."""
-
-    write: Callable[[], str]  # returns the value; empty for the default, which is left out
-    apply: Callable[[str], object] | None
-    """Takes over the value of an address; None if the page has read it before it was built."""
 
 
 @dataclass(eq=False)
@@ -125,7 +74,9 @@ class Session:
     """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
     called with the element's ``data-value``."""
     on_choice: Work | None = field(init=False, default=None)  # called after a choice
-    values: dict[str, StateValue] = field(init=False, default_factory=dict)
+    values: dict[str, tuple[Callable[[], str], Callable[[str], object] | None]] = field(
+        init=False, default_factory=dict
+    )
     """The page's state by its keys in the address; see ``keep``."""
 
     @property
@@ -289,21 +240,30 @@ class Session:
         )
 
     def keep(
-        self, key: str, write: Callable[[], str], apply: Callable[[str], object] | None = None
+        self,
+        key: str,
+        write: Callable[[], str] | None = None,
+        apply: Callable[[str], object] | None = None,
     ) -> None:
-        """Keep a value of the page in its address; see ``StateValue``."""
-        self.values[key] = StateValue(write, apply)
+        """Keep a value of the page in its address, by default what the address has.
+
+        Args:
+            key: Key of the value in the address.
+            write: Returns the value as text; empty for the default, which is left out.
+            apply: Takes over the value of an address, unless the page has read it before.
+        """
+        self.values[key] = write or (lambda: self.address.state.get(key, "")), apply
 
     def state(self) -> dict[str, str]:
         """Return the page's state as its controls have it, by key; defaults are empty."""
-        return {key: value.write() for key, value in self.values.items()}
+        return {key: write() for key, (write, _) in self.values.items()}
 
     def apply_state(self) -> None:
         """Take over the state that the page's address has, in the order of ``keep``."""
         asked = self.address.state  # a new value may show the state, which changes the address
-        for key, value in list(self.values.items()):
-            if key in asked and value.apply is not None:
-                value.apply(asked[key])
+        for key, (_, apply) in list(self.values.items()):
+            if key in asked and apply is not None:
+                apply(asked[key])
 
     def show_state(self) -> None:
         """Show the page's state in the address, without keys that the page does not have."""

@@ -3,7 +3,7 @@
 No other module of the viewer uses a private name of viser. ``pyproject.toml`` requires viser below
 1.2; check this module before raising that limit. Why each part is needed:
 
-- ``RunJavascriptMessage``: viser has no public way to read or change a browser's URL.
+- ``RunJavascriptMessage``: viser has no public way to change a browser's URL.
 - Callbacks of the camera: viser can add them, but not remove them.
 - Message classes and handlers: viser applies what browsers send without validating it, so
   ``app.server`` has to see it first. Public callbacks run only after the value has been applied.
@@ -39,7 +39,6 @@ ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
         _messages.TransformControlsUpdateMessage,
         _messages.TransformControlsDragStartMessage,
         _messages.TransformControlsDragEndMessage,
-        _messages.LocalStorageGetItemResponseMessage,
         _messages.GetRenderResponseMessage,
     )
 }

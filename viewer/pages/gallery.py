@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import viser
@@ -43,7 +42,7 @@ NONE_CHOSEN = (
 def show_library(session: Session) -> None:
     """Build the first page: all parts, links to everything else, and the upload button."""
     gallery = Gallery(session, "Parts", part_rows(session.files.library), noun="part")
-    open_panels(gallery, "", INTRODUCTION + section_links(library_sections(session.files)))
+    open_panels(gallery, "", INTRODUCTION + section_links(session.files))
     upload = session.client.gui.add_upload_button(
         "Open a URDF, an MJCF or a zip", icon=viser.Icon.UPLOAD
     )
@@ -141,24 +140,10 @@ def _set_sides(rows: list[Row], num_train: int) -> None:
 
 
 INDEX_WIDTH = 620.0  # width of the panel [pixels]
-Sections = Mapping[str, list[tuple[str, Address]]]
-"""Labels and addresses of links, by the title of their section."""
-_ROBOTS, _SPLITS, _GRAMMARS = "Robots in this folder", "Splits", "Grammars"
 _TITLES = {
     "gallery": "Open the gallery of which robots?",
     "population": "Show which robots on one ground?",
     "split": "Open which split?",
-}
-_SECTIONS = {
-    "gallery": (_ROBOTS, _SPLITS),
-    "population": (_ROBOTS, _SPLITS, _GRAMMARS),
-    "split": (_SPLITS,),
-}
-"""Sections of each page's index."""
-_EMPTY = {
-    _ROBOTS: "none yet: compose a robot and write it to robots/, or run "
-    "<code>morphgen sample arm3</code>",
-    _SPLITS: "none yet: choose robots in a gallery, then split in the tray",
 }
 
 
@@ -166,43 +151,36 @@ def show_index(session: Session) -> None:
     """Build the page that asks for the subject of a gallery, a population or a split."""
     page = session.address.page
     session.open_panel(INDEX_WIDTH, markup.breadcrumbs((page, None)), left=True)
-    targets = _subjects(session.files)
-    sections = {
-        title: [
-            (name, Address("split" if page == "gallery" and title == _SPLITS else page, (name,)))
-            for name in targets[title]
-        ]
-        for title in _SECTIONS[page]
-    }
-    html = f"<h2>{_TITLES[page]}</h2>{section_links(sections)}"
+    html = f"<h2>{_TITLES[page]}</h2>{section_links(session.files, page)}"
     session.client.gui.add_html(markup.framed(html))
     session.show_address(page)
 
 
-def library_sections(files: FileAccess) -> Sections:
-    """Return links to the robots of the current folder, the splits and the grammars."""
-    pages = {_ROBOTS: "gallery", _SPLITS: "split", _GRAMMARS: "compose"}
-    return {
-        title: [(name, Address(pages[title], (name,))) for name in names]
-        for title, names in _subjects(files).items()
-    }
-
-
-def section_links(sections: Sections) -> str:
-    """Return sections of links as HTML; an empty section says what to do."""
-    html = ""
-    for title, links in sections.items():
-        text = " · ".join(markup.link(address, name) for name, address in links)
-        html += f"<h3>{title}</h3>{text or markup.dim(_EMPTY[title])}"
-    return html
-
-
-def _subjects(files: FileAccess) -> Mapping[str, list[str]]:
-    """Return what addresses can name: folders of robots, splits with the user's first, grammars."""
+def section_links(files: FileAccess, page: str = "library") -> str:
+    """Return links to what a page can show: robots, splits with the user's first, and grammars."""
     root = files.roots[0]
     own = sorted(path.relative_to(root).as_posix() for path in (root / SPLITS).rglob("*.yaml"))
-    return {
-        _ROBOTS: robot_folders(root),
-        _SPLITS: [*own, *split_names()],
-        _GRAMMARS: grammar_names(),
-    }
+    sections = (  # title, names, pages that show them, pages with the section, text without names
+        (
+            *("Robots in this folder", robot_folders(root)),
+            *(("gallery", "population"), ("library", "gallery", "population")),
+            "none yet: compose a robot and write it to robots/, or run "
+            "<code>morphgen sample arm3</code>",
+        ),
+        (
+            *("Splits", [*own, *split_names()]),
+            *(("split", "population"), ("library", *_TITLES)),
+            "none yet: choose robots in a gallery, then split in the tray",
+        ),
+        (
+            *("Grammars", grammar_names()),
+            *(("compose", "population"), ("library", "population"), ""),
+        ),
+    )
+    html = ""
+    for title, names, targets, pages, empty in sections:
+        if page in pages:
+            target = page if page in targets else targets[0]
+            text = " · ".join(markup.link(Address(target, (name,)), name) for name in names)
+            html += f"<h3>{title}</h3>{text or markup.dim(empty)}"
+    return html

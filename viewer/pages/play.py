@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -28,7 +28,6 @@ from morphgen.viewer.rollout import (
     SPEEDS,
     EpisodeSource,
     Player,
-    RecordedEpisode,
     Rollout,
     RolloutConfig,
     list_checkpoints,
@@ -44,143 +43,242 @@ from morphgen.viewer.scene.rollout import (
 )
 from morphgen.viewer.scene.stage import look_at
 
-PLOT_INTERVAL = 0.25  # time between two updates of the curves [s]
-COLOURS = (
-    *("#1c7ed6", "#f76707", "#2f9e44", "#ae3ec9", "#e03131"),
-    *("#0ca678", "#f59f00", "#7048e8", "#868e96"),
-)
-"""Colours of the robots, in their order."""
-_HEIGHT = 150  # height of a chart [pixels]
-_NOW = "#868e96"  # colour of the line at the current time
-
-
-@dataclass(eq=False)
-class EpisodePlots:
-    """The charts of a page."""
-
-    session: Session
-    folder: viser.GuiFolderHandle
-    charts: list[viser.GuiUplotHandle] = field(default_factory=list)
-    """Charts of the distance and of the score; empty until an episode is shown."""
-    step: int = 0  # number of control steps that the scene shows
-    scores: list[list[float]] = field(default_factory=list)  # after each step, by robot
-
-
-def start_plots(plots: EpisodePlots, episode: Episode) -> None:
-    """Replace the charts by those of a new episode."""
-    clear_plots(plots)
-    plots.step, plots.scores = 0, [[] for _ in episode.tracks]
-    names, dark = [track.robot.name for track in episode.tracks], plots.session.dark
-    labels = (f"m from {TASKS[episode.task].target}", "score so far")
-    for label, data in zip(labels, curves(episode, 0, plots.scores), strict=True):
-        with plots.folder:
-            chart = plots.session.client.gui.add_uplot(
-                data,
-                _series(names),
-                axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
-                scales={"x": uplot.Scale(time=False)},
-                legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
-                height=_HEIGHT,
-            )
-        plots.charts.append(chart)
-
-
-def clear_plots(plots: EpisodePlots) -> None:
-    """Remove the charts."""
-    for chart in plots.charts:
-        chart.remove()
-    plots.charts = []
-
-
-def show_plots(plots: EpisodePlots, episode: Episode, step: int) -> None:
-    """Update the charts to what is simulated and shown, at most every ``PLOT_INTERVAL``."""
-    plots.step = step
-
-    def update() -> None:
-        if len(plots.scores) == len(episode.tracks):  # no other episode has begun meanwhile
-            data = curves(episode, plots.step, plots.scores)
-            for chart, values in zip(plots.charts, data, strict=False):  # none after a failure
-                chart.data = values
-
-    plots.session.call_later(PLOT_INTERVAL, update, "plots")
-
-
-def curves(
-    episode: Episode, step: int, scores: list[list[float]]
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the data of the charts of distance and score: time, the robots' curves, and a line.
-
-    uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
-    Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
-    """
-    num_steps = max(episode.num_steps, 1)
-    time = np.arange(1, num_steps + 1) * episode.period
-    distances, totals = [], []
-    for track, known in zip(episode.tracks, scores, strict=True):
-        n = min(len(track.score), len(track.distance), num_steps)
-        for i in range(len(known) + 1, n + 1):
-            value = score_until(track, episode.task, i)
-            known.append(0.0 if value is None else value)
-        distances.append(_padded(track.distance[:n], num_steps))
-        totals.append(_padded(known[:n], num_steps))
-    is_now = np.arange(1, num_steps + 1) == min(step, num_steps)
-
-    def with_line(values: list[Array]) -> tuple[Array, ...]:
-        low, high = np.min(values), np.max(values)
-        return (time, *values, np.where(is_now, high, low))
-
-    return with_line(distances), with_line(totals)
-
-
-def _padded(values: list[float], length: int) -> Array:
-    """Return values, the last one repeated up to a length; zeros if there are none."""
-    last = values[-1] if values else 0.0
-    return np.array([*values, *[last] * (length - len(values))], dtype=np.float64)
-
-
-def _series(names: list[str]) -> tuple[uplot.Series, ...]:
-    """Return the curves of the robots, and the line at the current time."""
-    colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
-    lines = [
-        uplot.Series(label=name, stroke=colour, width=2, points={"show": False})
-        for name, colour in zip(names, colours, strict=True)
-    ]
-    now = uplot.Series(label="shown", stroke=_NOW, width=1, points={"show": False})
-    return (uplot.Series(label="time (s)"), *lines, now)
-
-
-def _axis(label: str, *, dark: bool) -> uplot.Axis:
-    """Return an axis whose text is readable on the page."""
-    colour, lines = ("#ced4da", "#495057") if dark else ("#495057", "#e9ecef")
-    return uplot.Axis(
-        label=label,
-        labelSize=18,
-        size=34,
-        labelFont="11px sans-serif",
-        font="11px sans-serif",
-        stroke=colour,
-        grid={"stroke": lines, "width": 1},
-        ticks={"stroke": lines, "width": 1, "size": 4},
-    )
-
-
+PANEL_WIDTH = 400.0  # width of the panel [pixels]
+PLANNERS = ("ik", "scripted")  # policies whose first step takes seconds, because they plan a path
 ACTIONS = ("replace", "add", "only")  # replace the first robot, add one, or remove all others
 
 
-@dataclass(eq=False)
-class RolloutControls:
-    """Controls of a rollout in one browser."""
+def show(session: Session) -> None:
+    """Build the page."""
+    subject = session.address.subject
+    start = parse_time(session.address.state.get("t", ""))
+    header = markup.breadcrumbs((uri_name(subject) or "play", None))
+    session.open_panel(PANEL_WIDTH, header, "reading")
+    if subject.endswith(EPISODE_SUFFIX):
+        episode = read_episode(session.files.path(subject), session.files)
+        page = PlayPage(session)
+        session.client.gui.add_html(markup.framed(_description(episode)))
+        page.player.load(lambda: EpisodeSource(episode, episode.num_steps), start=start)
+        session.show_address(f"play {uri_name(subject)}")
+    else:
+        trained_on = complete_address(session)
+        config = parse_rollout(session.address, trained_on)
+        page = PlayPage(session)
+        page.add_rollout_controls(config, trained_on)
+        page.start(config, start)
+    page.add_downloads()
 
-    session: Session
-    robots: tuple[str, ...]  # URIs of the robots
-    start: Callable[[RolloutConfig], object]  # starts a rollout
-    handles: dict[str, Any] = field(default_factory=dict)
-    """Controls by the field of ``RolloutConfig``."""
 
-    def restart(self) -> None:
-        """Start an episode with what the controls say."""
-        values = {name: handle.value for name, handle in self.handles.items()}
-        self.start(RolloutConfig(robots=self.robots, **values))
+class PlayPage:
+    """Playback in one browser; the display of its player."""
+
+    def __init__(self, session: Session) -> None:
+        """Add the controls of the playback."""
+        gui, self.session = session.client.gui, session
+        self.player = Player(self)
+        session.on_close(self.player.stop)
+        self._source: EpisodeSource | None = None
+        self._scene: RolloutScene | None = None
+        self._framed: tuple[str, ...] = ()  # URIs of the robots that the camera was pointed at
+        self._is_planning = False  # whether the policy is still planning its first step
+        self._position: int | None = None  # step of a pause; None while the episode plays
+        self._step = 0  # step that is shown
+        self._charts: list[viser.GuiUplotHandle] = []  # of distance and score
+        self._fault = gui.add_html("")
+        buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
+        speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+        speed = gui.add_dropdown("speed", speeds, initial_value="1x")
+        hint = "as far as it was simulated"
+        self._time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint=hint)
+        self._score, self._plots = gui.add_html(""), gui.add_folder("Distance and score")
+        commands: Mapping[str, Callable[[], None]] = {
+            "play": self.player.play,
+            "pause": self.player.pause,
+            "back": lambda: self.player.go_by(-1),
+            "step": lambda: self.player.go_by(1),
+        }
+        session.on_change(buttons, lambda: commands[buttons.value]())
+        session.on_change(
+            speed, lambda: self.player.set_speed(float(speed.value.removesuffix("x")))
+        )
+        session.on_change(self._time, self._go_to_time, "time")
+        for key in ("policy", "seed", "obstacles", "sim"):
+            session.keep(key)
+        session.keep("t", self._write_time)
+
+    def start(self, config: RolloutConfig, start: float | None = None) -> None:
+        """Show a rollout's address, and let the player simulate it."""
+        session = self.session
+        session.address = rollout_address(config)
+        session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+        self.player.load(lambda: Rollout(config, session.files, session.set_status), start=start)
+
+    def add_rollout_controls(self, config: RolloutConfig, trained_on: Robots) -> None:
+        """Add the controls that start another episode, in the state of a config."""
+        gui, session = self.session.client.gui, self.session
+        robots, handles = config.robots, dict[str, Any]()
+        next_one = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
+        with gui.add_folder("Task"):
+            handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
+            policies = _policies(session.files, config.task, config.policy)
+            handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
+            handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
+            handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
+            handles["simulator"] = gui.add_dropdown(
+                "simulator", tuple(simulators()), initial_value=config.simulator
+            )
+        with gui.add_folder("Robots"):
+            first = {"trained on": lambda: trained_on} if trained_on else {}
+            lists = robot_lists(robots[0], session.files, first)
+            picker = add_picker(session, lists, lambda: robots[0])
+            action = gui.add_button_group("this robot", ACTIONS)
+
+        def restart() -> None:
+            values = {name: handle.value for name, handle in handles.items()}
+            self.start(RolloutConfig(robots=robots, **values))
+
+        def start_next() -> None:
+            set_value(handles["seed"], handles["seed"].value + 1)
+            restart()
+
+        def change_task() -> None:
+            """Start another task, with its own baseline if the current one is for the other."""
+            task, dropdown = handles["task"].value, handles["policy"]
+            policy = dropdown.value
+            if is_named(policy) and policy not in policies_for(task):
+                policy = baselines_for(task)[0]
+            dropdown.options = _policies(session.files, task, policy)
+            dropdown.value = policy
+            restart()
+
+        def use_robot(action: str) -> None:
+            """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
+            nonlocal robots
+            uri = picked_uri(picker)
+            if action == "add" and len(robots) >= MAX_PLAYED:
+                raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
+            kept = {"add": robots, "replace": robots[1:], "only": ()}[action]
+            robots = (*kept, uri) if action == "add" else (uri, *kept)
+            restart()
+
+        session.on_change(next_one, start_next)
+        session.on_change(handles["task"], change_task)
+        for name in ("policy", "obstacles", "seed", "simulator"):
+            session.on_change(handles[name], restart, name)
+        session.on_change(picker.robot, lambda: use_robot("replace"))
+        session.on_change(action, lambda: use_robot(action.value))
+
+    def add_downloads(self) -> None:
+        """Add buttons that send the episode, as far as it is simulated, as a file or a film."""
+        gui, session = self.session.client.gui, self.session
+
+        def send(suffix: str, make: Callable[[Episode], bytes]) -> None:
+            if self._source is None:
+                raise MorphgenError("there is no episode yet")
+            episode = snapshot(self._source.episode)
+            seconds = episode.num_steps * episode.period
+            name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
+            with session.activity(f"making the {suffix} of {seconds:.2f} s"):
+                session.send_file(name, make(episode))
+
+        film = functools.partial(session.run_in_worker, render_video)
+        downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
+            (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
+            ("Film (.mp4)", ".mp4", film),
+            (
+                "Web page (.html)",
+                ".html",
+                lambda episode: session.run_in_worker(episode_page, episode, session.dark),
+            ),
+        )
+        with gui.add_folder("Get"):
+            for label, suffix, make in downloads:
+                button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
+                session.on_press(button, functools.partial(send, suffix, make))
+
+    def show_start(self, source: EpisodeSource) -> None:
+        """Show a new episode at its start."""
+        client, self._source, episode = self.session.client, source, source.episode
+        with client.atomic():
+            if self._scene is not None:
+                self._scene.root.remove()
+            self._scene = add_episode(client.scene, episode)
+        if self.session.closed.is_set():  # the browser has left the page meanwhile
+            self._scene.root.remove()
+            return
+        uris = tuple(track.uri for track in episode.tracks)
+        if uris != self._framed:  # the next episode of the same robots keeps the user's camera
+            self._framed = uris
+            look_at(client, self._scene.low, self._scene.high)
+        self._clear_plots()
+        with self._plots:
+            self._charts = add_charts(client.gui, episode, dark=self.session.dark)
+        self._time.max = max(source.max_steps, 1) * episode.period
+        self._show_faults(source.faults.values())
+        self._is_planning = isinstance(source, Rollout) and episode.policy in PLANNERS
+        self.session.set_status("the policy plans its path" if self._is_planning else "")
+
+    def show_step(self, step: int) -> None:
+        """Show the episode after a number of control steps."""
+        if self._scene is None or self._source is None:
+            return
+        episode, self._step = self._source.episode, step
+        with self.session.client.atomic():
+            show_step(self._scene, step)
+        if step > 0 and self._is_planning:
+            self._is_planning = False
+            self.session.set_status("")
+        set_value(self._time, step * episode.period)
+        self._score.content = markup.framed(score_table(episode, step))
+        self.session.call_later(PLOT_INTERVAL, self._update_plots, "plots")
+
+    def show_stopped(self) -> None:
+        """Show errors that ended robots' episodes early."""
+        tracks = self._source.episode.tracks if self._source else []
+        if faults := [track.fault for track in tracks if track.fault]:
+            self._show_faults(faults)
+
+    def show_position(self, step: int | None) -> None:
+        """Show in the address where the user paused."""
+        self._position = step
+        self.session.show_state_later()
+
+    def show_failure(self, reason: str) -> None:
+        """Show why there is no episode."""
+        self.session.set_status("")
+        self._show_faults([reason])
+        self._score.content = ""
+        self._clear_plots()
+        if self._scene is not None:
+            self._scene.root.remove()
+        self._scene = self._source = None
+
+    def _write_time(self) -> str:
+        """Return the time at which the episode is paused, for the address."""
+        if self._position is None or self._source is None:
+            return ""
+        return f"{self._position * self._source.episode.period:.4g}"
+
+    def _go_to_time(self) -> None:
+        if self._source is not None:
+            self.player.go_to(round(self._time.value / self._source.episode.period))
+
+    def _update_plots(self) -> None:
+        """Update the charts to what is simulated and shown."""
+        if self._source is not None:
+            for chart, data in zip(
+                self._charts, curves(self._source.episode, self._step), strict=False
+            ):
+                chart.data = data
+
+    def _clear_plots(self) -> None:
+        for chart in self._charts:
+            chart.remove()
+        self._charts = []
+
+    def _show_faults(self, texts: Iterable[str]) -> None:
+        redact = self.session.files.redact
+        self._fault.content = "".join(markup.error(redact(text)) for text in texts)
 
 
 def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
@@ -230,177 +328,9 @@ def complete_address(session: Session) -> Robots:
     return robots
 
 
-def add_rollout_controls(
-    controls: RolloutControls, config: RolloutConfig, trained_on: Robots
-) -> None:
-    """Add the controls in the state of a config to the page."""
-    gui, session, handles = controls.session.client.gui, controls.session, controls.handles
-    next_one = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
-    with gui.add_folder("Task"):
-        handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
-        policies = _policies(session.files, config.task, config.policy)
-        handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
-        handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
-        handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
-        names = tuple(simulators())
-        handles["simulator"] = gui.add_dropdown("simulator", names, initial_value=config.simulator)
-    with gui.add_folder("Robots"):
-        first = {"trained on": lambda: trained_on} if trained_on else {}
-        lists = robot_lists(config.robots[0], session.files, first)
-        picker = add_picker(session, lists, lambda: controls.robots[0])
-        action = gui.add_button_group("this robot", ACTIONS)
-
-    def start_next() -> None:
-        set_value(handles["seed"], handles["seed"].value + 1)
-        controls.restart()
-
-    session.on_change(next_one, start_next)
-    session.on_change(handles["task"], lambda: _change_task(controls))
-    for name in ("policy", "obstacles", "seed", "simulator"):
-        session.on_change(handles[name], controls.restart, name)
-    session.on_change(picker.robot, lambda: _use_robot(controls, picked_uri(picker), "replace"))
-    session.on_change(action, lambda: _use_robot(controls, picked_uri(picker), action.value))
-
-
 def _policies(files: FileAccess, task: str, policy: str) -> tuple[str, ...]:
     """Return the task's baselines and shipped policies, the folder's checkpoints and the policy."""
     return tuple(dict.fromkeys((*policies_for(task), *list_checkpoints(files), policy)))
-
-
-def _use_robot(controls: RolloutControls, uri: str, action: str) -> None:
-    """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
-    robots = controls.robots
-    if action == "add" and len(robots) >= MAX_PLAYED:
-        raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
-    kept = {"add": robots, "replace": robots[1:], "only": ()}[action]
-    controls.robots = (*kept, uri) if action == "add" else (uri, *kept)
-    controls.restart()
-
-
-def _change_task(controls: RolloutControls) -> None:
-    """Start another task, with its own baseline if the current one is for the other task."""
-    task, dropdown = controls.handles["task"].value, controls.handles["policy"]
-    policy = dropdown.value
-    if is_named(policy) and policy not in policies_for(task):
-        policy = baselines_for(task)[0]
-    dropdown.options = _policies(controls.session.files, task, policy)
-    dropdown.value = policy
-    controls.restart()
-
-
-PANEL_WIDTH = 400.0  # width of the panel [pixels]
-PLANNERS = ("ik", "scripted")  # policies whose first step takes seconds, because they plan a path
-
-
-@dataclass(eq=False)
-class PlayPage:
-    """Playback in one browser; the display of its player."""
-
-    session: Session
-    time: viser.GuiSliderHandle[float]
-    fault: viser.GuiHtmlHandle
-    score: viser.GuiHtmlHandle
-    plots: EpisodePlots
-    source: EpisodeSource | None = None
-    scene: RolloutScene | None = None
-    framed: tuple[str, ...] = ()  # URIs of the robots that the camera was pointed at
-    is_planning: bool = False  # whether the policy is still planning its first step
-    position: int | None = None  # step at which the user paused; None while the episode plays
-
-    def show_start(self, source: EpisodeSource) -> None:
-        """Show a new episode at its start."""
-        client, self.source = self.session.client, source
-        with client.atomic():
-            if self.scene is not None:
-                self.scene.root.remove()
-            self.scene = add_episode(client.scene, source.episode)
-        if self.session.closed.is_set():  # the browser has left the page meanwhile
-            self.scene.root.remove()
-            return
-        uris = tuple(track.uri for track in source.episode.tracks)
-        if uris != self.framed:  # the next episode of the same robots keeps the user's camera
-            self.framed = uris
-            look_at(client, self.scene.low, self.scene.high)
-        start_plots(self.plots, source.episode)
-        self.time.max = max(source.max_steps, 1) * source.episode.period
-        self._show_faults(source.faults.values())
-        self.is_planning = isinstance(source, Rollout) and source.episode.policy in PLANNERS
-        self.session.set_status("the policy plans its path" if self.is_planning else "")
-
-    def show_step(self, step: int) -> None:
-        """Show the episode after a number of control steps."""
-        if self.scene is None or self.source is None:
-            return
-        episode = self.source.episode
-        with self.session.client.atomic():
-            show_step(self.scene, step)
-        if step > 0 and self.is_planning:
-            self.is_planning = False
-            self.session.set_status("")
-        set_value(self.time, step * episode.period)
-        self.score.content = markup.framed(score_table(episode, step))
-        show_plots(self.plots, episode, step)
-
-    def show_stopped(self) -> None:
-        """Show errors that ended robots' episodes early."""
-        tracks = self.source.episode.tracks if self.source else []
-        if faults := [track.fault for track in tracks if track.fault]:
-            self._show_faults(faults)
-
-    def show_position(self, step: int | None) -> None:
-        """Show in the address where the user paused."""
-        self.position = step
-        self.session.show_state_later()
-
-    def paused_at(self) -> str:
-        """Return the time at which the episode is paused, for the address."""
-        if self.position is None or self.source is None:
-            return ""
-        return f"{self.position * self.source.episode.period:.4g}"
-
-    def show_failure(self, reason: str) -> None:
-        """Show why there is no episode."""
-        self.session.set_status("")
-        self._show_faults([reason])
-        self.score.content = ""
-        clear_plots(self.plots)
-        if self.scene is not None:
-            self.scene.root.remove()
-            self.scene = None
-        self.source = None
-
-    def _show_faults(self, texts: Iterable[str]) -> None:
-        redact = self.session.files.redact
-        self.fault.content = "".join(markup.error(redact(text)) for text in texts)
-
-
-def show(session: Session) -> None:
-    """Build the page."""
-    gui, subject = session.client.gui, session.address.subject
-    paused_at = parse_time(session.address.state.get("t", ""))
-    header = markup.breadcrumbs((uri_name(subject) or "play", None))
-    session.open_panel(PANEL_WIDTH, header, "reading")
-    if subject.endswith(EPISODE_SUFFIX):
-        episode = read_episode(session.files.path(subject), session.files)
-        page, player = _add_player(session)
-        gui.add_html(markup.framed(_description(episode)))
-        player.load(lambda: RecordedEpisode(episode), start=paused_at)
-        session.show_address(f"play {uri_name(subject)}")
-    else:
-        trained_on = complete_address(session)
-        config = parse_rollout(session.address, trained_on)
-        page, player = _add_player(session)
-
-        def start(config: RolloutConfig, paused_at: float | None = None) -> None:
-            """Show a rollout's address, and let the player simulate it."""
-            session.address = rollout_address(config)
-            session.show_address(f"{config.task} {uri_name(config.robots[0])}")
-            player.load(lambda: Rollout(config, session.files, session.set_status), start=paused_at)
-
-        add_rollout_controls(RolloutControls(session, config.robots, start), config, trained_on)
-        start(config, paused_at)
-    with gui.add_folder("Get"):
-        _add_downloads(page)
 
 
 def parse_time(text: str) -> float | None:
@@ -434,65 +364,6 @@ def score_table(episode: Episode, step: int) -> str:
     return head + markup.table(header, rows, (1, 2))
 
 
-def _add_player(session: Session) -> tuple[PlayPage, Player]:
-    """Add the controls of the playback; return the page and its player."""
-    gui = session.client.gui
-    fault = gui.add_html("")
-    buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
-    speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
-    speed = gui.add_dropdown("speed", speeds, initial_value="1x")
-    time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint="as far as it was simulated")
-    score, plots = gui.add_html(""), EpisodePlots(session, gui.add_folder("Distance and score"))
-    page = PlayPage(session, time, fault, score, plots)
-    player = Player(page)
-    session.on_close(player.stop)
-    session.keep("t", page.paused_at)
-    commands: dict[str, Callable[[], None]] = {
-        "play": player.play,
-        "pause": player.pause,
-        "back": lambda: player.go_by(-1),
-        "step": lambda: player.go_by(1),
-    }
-
-    def go_to_time() -> None:
-        if page.source is not None:
-            player.go_to(round(time.value / page.source.episode.period))
-
-    session.on_change(buttons, lambda: commands[buttons.value]())
-    session.on_change(speed, lambda: player.set_speed(float(speed.value.removesuffix("x"))))
-    session.on_change(time, go_to_time, "time")
-    return page, player
-
-
-def _add_downloads(page: PlayPage) -> None:
-    """Add buttons that send the episode as a file, a film or a web page."""
-    gui, session = page.session.client.gui, page.session
-    downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
-        (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
-        ("Film (.mp4)", ".mp4", functools.partial(session.run_in_worker, render_video)),
-        (
-            "Web page (.html)",
-            ".html",
-            lambda episode: session.run_in_worker(episode_page, episode, session.dark),
-        ),
-    )
-    for label, suffix, make in downloads:
-        button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
-        send = functools.partial(_send, page, suffix, make)
-        session.on_press(button, send)
-
-
-def _send(page: PlayPage, suffix: str, make: Callable[[Episode], bytes]) -> None:
-    """Send a file of the episode as far as it has been simulated."""
-    if page.source is None:
-        raise MorphgenError("there is no episode yet")
-    episode = snapshot(page.source.episode)
-    seconds = episode.num_steps * episode.period
-    name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
-    with page.session.activity(f"making the {suffix} of {seconds:.2f} s"):
-        page.session.send_file(name, make(episode))
-
-
 def _description(episode: Episode) -> str:
     """Return a table about a recorded episode, with links to its robots."""
     rows = [
@@ -504,3 +375,86 @@ def _description(episode: Episode) -> str:
     for track in episode.tracks:
         rows.append(("robot", markup.link(Address("robot", (track.uri,)), track.robot.name)))
     return markup.table(("recorded", ""), rows)
+
+
+PLOT_INTERVAL = 0.25  # time between two updates of the curves [s]
+COLOURS = (
+    *("#1c7ed6", "#f76707", "#2f9e44", "#ae3ec9", "#e03131"),
+    *("#0ca678", "#f59f00", "#7048e8", "#868e96"),
+)
+"""Colours of the robots, in their order."""
+_HEIGHT = 150  # height of a chart [pixels]
+_NOW = "#868e96"  # colour of the line at the current time
+
+
+def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser.GuiUplotHandle]:
+    """Add the charts of the distance to success and of the score, one below the other."""
+    names = [track.robot.name for track in episode.tracks]
+    labels = (f"m from {TASKS[episode.task].target}", "score so far")
+    return [
+        gui.add_uplot(
+            data,
+            _series(names),
+            axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
+            scales={"x": uplot.Scale(time=False)},
+            legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
+            height=_HEIGHT,
+        )
+        for label, data in zip(labels, curves(episode, 0), strict=True)
+    ]
+
+
+def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return the data of the charts of distance and score: time, the robots' curves, and a line.
+
+    uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
+    Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
+    """
+    num_steps = max(episode.num_steps, 1)
+    time = np.arange(1, num_steps + 1) * episode.period
+    distances, totals = [], []
+    for track in episode.tracks:
+        n = min(len(track.score), len(track.distance), num_steps)
+        sums = zip(np.cumsum(track.score[:n]).tolist(), track.score[:n], strict=True)
+        score = TASKS[episode.task].episode_score
+        values = [score(total, last, i) for i, (total, last) in enumerate(sums, 1)]
+        distances.append(_padded(track.distance[:n], num_steps))
+        totals.append(_padded(values, num_steps))
+    is_now = np.arange(1, num_steps + 1) == min(step, num_steps)
+
+    def with_line(values: list[Array]) -> tuple[Array, ...]:
+        low, high = np.min(values), np.max(values)
+        return (time, *values, np.where(is_now, high, low))
+
+    return with_line(distances), with_line(totals)
+
+
+def _padded(values: list[float], length: int) -> Array:
+    """Return values, the last one repeated up to a length; zeros if there are none."""
+    return np.pad(np.array(values or [0.0]), (0, length - max(len(values), 1)), mode="edge")
+
+
+def _series(names: list[str]) -> tuple[uplot.Series, ...]:
+    """Return the curves of the robots, and the line at the current time."""
+    colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
+    lines = [
+        uplot.Series(label=name, stroke=colour, width=2, points={"show": False})
+        for name, colour in zip(names, colours, strict=True)
+    ]
+    now = uplot.Series(label="shown", stroke=_NOW, width=1, points={"show": False})
+    return (uplot.Series(label="time (s)"), *lines, now)
+
+
+def _axis(label: str, *, dark: bool) -> uplot.Axis:
+    """Return an axis whose text is readable on the page."""
+    colour, lines = ("#ced4da", "#495057") if dark else ("#495057", "#e9ecef")
+    return uplot.Axis(
+        label=label,
+        labelSize=18,
+        size=34,
+        labelFont="11px sans-serif",
+        font="11px sans-serif",
+        stroke=colour,
+        grid={"stroke": lines, "width": 1},
+        ticks={"stroke": lines, "width": 1, "size": 4},
+    )

@@ -59,8 +59,8 @@ def show(session: Session) -> None:
     seed = parse_count(state.get("seed", ""), 0)
     number = parse_count(state.get("number", ""), NUM_SAMPLED)
     source = find_source(subject, session.files, seed, number)
-    session.keep("seed", lambda: state.get("seed", "") if source.grammar else "")
-    session.keep("number", lambda: state.get("number", "") if source.grammar else "")
+    for key in ("seed", "number") if source.grammar else ():
+        session.keep(key)
     crumbs = markup.breadcrumbs((subject, _gallery_address(subject, source)), ("population", None))
     session.open_panel(PANEL_WIDTH, crumbs, f"reading {len(source.rows)} robots")
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, gaussian_filter
 from scipy.spatial import cKDTree
 
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Box, Geometry
+from morphgen.model.geometry import Box
 from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
 from morphgen.model.rotation import Vec3
@@ -274,27 +273,24 @@ _RADIUS = 0.18  # radius of the arc that shows a range, in extents of the robot
 _ARC_STEPS = 48
 
 
-def outline_triangles(geometry: Geometry, thickness: float) -> Triangles:
-    """Return the surface of a geometry, moved outwards by a thickness [m] and inside out.
-
-    Where only front faces are drawn, it is visible around the geometry and nowhere else.
-    """
-    vertices, faces = grown_triangles(geometry, thickness)
-    return vertices, np.ascontiguousarray(faces[:, ::-1])
-
-
 def show_outline(overlays: Overlays, link: int | None) -> None:
-    """Draw the outline of a link's visual shapes; without a link, of none."""
+    """Draw the outline of a link's visual shapes; without a link, of none.
+
+    It is the surface moved outwards and turned inside out: where only front faces are drawn, it is
+    visible around the shapes and nowhere else.
+    """
     remove_overlay(overlays, "outline")
     if link is None:
         return
     view = overlays.view
     thickness = _OUTLINE * robot_extent(view.robot)
     shapes = view.robot.links[link].visuals or view.robot.links[link].collisions
+    surfaces = [grown_triangles(shape.geometry, thickness) for shape in shapes]
     overlays.nodes["outline"] = [
         view.scene.add_mesh_simple(
             f"{view.name}/{link}/outline{i}",
-            *outline_triangles(shape.geometry, thickness),
+            vertices,
+            np.ascontiguousarray(faces[:, ::-1]),
             color=_OUTLINE_COLOUR,
             side="front",
             flat_shading=True,
@@ -303,7 +299,7 @@ def show_outline(overlays: Overlays, link: int | None) -> None:
             cast_shadow=False,
             receive_shadow=False,
         )
-        for i, shape in enumerate(shapes)
+        for i, (shape, (vertices, faces)) in enumerate(zip(shapes, surfaces, strict=True))
     ]
 
 
@@ -347,7 +343,8 @@ def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Arra
     axis_line = np.array([[-size * axis, size * axis]])
     if joint.kind == "prismatic":
         across = 0.15 * size * side
-        track = np.array([[low * axis, high * axis], *_ticks(axis, across, (low, high))])
+        ticks = ([end * axis - across, end * axis + across] for end in (low, high))
+        track = np.array([[low * axis, high * axis], *ticks])
         return np.array([[-2 * across, 2 * across]]), track, axis_line
     high = min(high, low + 2 * np.pi)
     angles = np.linspace(low, high, _ARC_STEPS + 1)
@@ -357,11 +354,6 @@ def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Arra
     ends = np.array([[0.8 * points[0], points[0]], [0.8 * points[-1], points[-1]]])
     needle = np.array([[0.7 * size * side, 1.25 * size * side]])
     return needle, np.concatenate([arc, ends]), axis_line
-
-
-def _ticks(axis: NDArray[np.float64], across: Array, positions: tuple[float, float]) -> list[Array]:
-    """Return a line across the axis at each position [m]."""
-    return [np.array([p * axis - across, p * axis + across]) for p in positions]
 
 
 def _needle_direction(view: RobotView, index: int) -> Vec3:
