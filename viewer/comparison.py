@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
-from morphgen.benchmark.tokens import default_max_links
+from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
+from morphgen.encoding.tokens import default_max_links
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library

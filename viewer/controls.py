@@ -10,8 +10,8 @@ from typing import Any
 
 import viser
 
-from morphgen.benchmark.split_file import split_names
 from morphgen.grammar.robot_source import is_set_folder
+from morphgen.splits.split_file import split_names
 from morphgen.viewer.app.address import parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
