@@ -53,7 +53,7 @@ def beginning(episode):
 @pytest.fixture(scope="module")
 def episode(files, module_cache):
     """An episode of two reach robots: one composed, one from a bundle."""
-    rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), files)
+    rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "jacobian", 3), files)
     while rollout.advance():
         pass
     rollout.close()
@@ -62,7 +62,7 @@ def episode(files, module_cache):
 
 @pytest.mark.slow
 def test_episode_equals_that_of_morphgen_play(episode):
-    spec = read_controller("ik", "reach")
+    spec = read_controller("jacobian", "reach")
     env, controller = make_env_and_controller(spec, "planar-cube", 3, sim="mujoco")
     results = []
     list(play(env, controller, 1, 3, results.append))
@@ -89,7 +89,7 @@ def test_episode_is_restored_from_its_file(episode, files, root, monkeypatch):
     monkeypatch.chdir(root)
     assert start_address(("episode.npz",), files) == Address("play", ("episode.npz",))
     read = read_episode(root / "episode.npz", files)
-    assert (read.task, read.policy, read.seed, read.simulator) == ("reach", "ik", 3, "mujoco")
+    assert (read.task, read.policy, read.seed, read.simulator) == ("reach", "jacobian", 3, "mujoco")
     for one, other in zip(read.tracks, episode.tracks, strict=True):
         assert one.uri == other.uri
         assert np.array_equal(one.q, other.q)
