@@ -17,7 +17,7 @@ from msgspec import NODEFAULT
 
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.records import Record, read_record
-from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
+from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields, require_numbers
 from morphgen.splits.split import Side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
@@ -191,20 +191,12 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        for name in ("total_timesteps", "num_steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                raise TaskError(f"{name} {getattr(self, name)}: expected 1 or more")
-        if self.num_steps > MAX_NUM_STEPS:
-            raise TaskError(f"num_steps {self.num_steps}: expected at most {MAX_NUM_STEPS}")
-        for name in ("clip_coef", "learning_rate", "adam_epsilon", "max_grad_norm"):
-            if not getattr(self, name) > 0:
-                raise TaskError(f"{name} {getattr(self, name):g}: expected more than 0")
-        for name in ("gamma", "gae_lambda", "slow_decay"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TaskError(f"{name} {getattr(self, name):g}: expected 0 to 1")
-        for name in ("ent_coef", "desired_kl"):
-            if not getattr(self, name) >= 0:
-                raise TaskError(f"{name} {getattr(self, name):g}: expected 0 or more")
+        require_numbers(self, "total_timesteps", "epochs", "minibatches", low=1)
+        require_numbers(self, "num_steps", low=1, high=MAX_NUM_STEPS)
+        positive = ("clip_coef", "learning_rate", "adam_epsilon", "max_grad_norm")
+        require_numbers(self, *positive, above=True)
+        require_numbers(self, "gamma", "gae_lambda", "slow_decay", high=1)
+        require_numbers(self, "ent_coef", "desired_kl")
 
     def num_updates(self, num_envs: int) -> int:
         """Return how many updates ``total_timesteps`` are with so many environments."""

@@ -54,9 +54,9 @@ def plan_submission(
     from morphgen.benchmark.scores.submission import (
         make_submission,
         require_rules,
-        write_submission,
+        submission_text,
     )
-    from morphgen.formats.files import require_writable_file
+    from morphgen.formats.files import require_writable_file, write_file
     from morphgen.rl.runs.robot_source import split_of
 
     if args.submission is None:
@@ -75,7 +75,9 @@ def plan_submission(
         facts["method"] = args.method
     facts["evaluation"] = followed
     make_submission(split, (), **facts)  # refuses an invalid name or seed before hours of episodes
-    return lambda scores: write_submission(args.submission, make_submission(split, scores, **facts))
+    return lambda scores: write_file(
+        args.submission, submission_text(make_submission(split, scores, **facts))
+    )
 
 
 @command(

@@ -180,14 +180,13 @@ def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
             outcomes = run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
-        for done, outcome in enumerate(outcomes, 1):
+        for done, (cell, error) in enumerate(outcomes, 1):
             show.close()
-            cell = outcome.cell
             seed = "" if cell.seed is None else f" seed {cell.seed}"
-            state = f"failed: {outcome.error}" if outcome.error else "done"
+            state = f"failed: {error}" if error else "done"
             line = f"{done} of {len(cells)}: {cell.split} {cell.agent}{seed} {state}"
             note(line)
-            failures += bool(outcome.error)
+            failures += bool(error)
     return failures
 
 

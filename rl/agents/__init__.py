@@ -8,6 +8,7 @@ heavy, so that the command line lists agents at once. A module of an agent has t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
@@ -18,6 +19,18 @@ from morphgen.tasks.registry import Registry
 
 MAX_WIDTH = 8192  # largest width of a layer; the weights between two such layers take 256 MiB
 MAX_LAYERS = 100  # largest number of layers of a network
+
+
+def require_numbers(
+    config: object, *names: str, low: float = 0, high: float = math.inf, above: bool = False
+) -> None:
+    """Require that fields are between two numbers, or ``above`` the lower one."""
+    for name in names:
+        value = getattr(config, name)
+        if not low <= value <= high or (above and value == low):
+            expected = f"{low} or more" if high == math.inf else f"{low} to {high}"
+            expected = f"more than {low}" if above else expected
+            raise TaskError(f"{name} {value:.15g}: expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -31,15 +44,11 @@ class NetworkConfig:
             TaskError: If a size is out of its range.
         """
         for size in fields(self):
-            value = getattr(self, size.name)
             if isinstance(size.default, int):
                 most = MAX_LAYERS if size.name.endswith("layers") else MAX_WIDTH
-                if value < 1:
-                    raise TaskError(f"{size.name} {value}: expected 1 or more")
-                if value > most:
-                    raise TaskError(f"{size.name} {value}: expected at most {most}")
-            elif not value > 0:
-                raise TaskError(f"{size.name} {value:g}: expected more than 0")
+                require_numbers(self, size.name, low=1, high=most)
+            else:
+                require_numbers(self, size.name, above=True)
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,7 @@ def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1), finetune=()):
 
 
 def finished(cells):
-    outcomes = list(run_cells(cells, QUIET))
-    assert [each.error for each in outcomes] == [""] * len(cells)
+    assert [error for _, error in run_cells(cells, QUIET)] == [""] * len(cells)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +157,7 @@ def test_a_cell_locked_by_another_process_is_done_last(tmp_path, monkeypatch):
         threading.Thread(target=other.release).start()
 
     monkeypatch.setattr(study.time, "sleep", wait)
-    order = [outcome.cell.agent for outcome in run_cells(cells, QUIET)]
+    order = [cell.agent for cell, _ in run_cells(cells, QUIET)]
     assert order == ["zero", "jacobian", "ik", "random"]
     assert waits
 
@@ -176,11 +175,11 @@ def test_a_failed_cell_is_reported_and_the_others_continue(tmp_path, monkeypatch
         return train(folder, config, **options)
 
     monkeypatch.setattr(study, "train", without_memory)
-    first, second, third = run_cells([bad, worse, good], QUIET)
-    assert "another run: ppo.gamma 0.5, not 0.99" in first.error
-    assert second.error == "RuntimeError: CUDA out of memory"
+    (_, first), (_, second), (_, third) = run_cells([bad, worse, good], QUIET)
+    assert "another run: ppo.gamma 0.5, not 0.99" in first
+    assert second == "RuntimeError: CUDA out of memory"
     assert "Traceback" in capsys.readouterr().err
-    assert third.error == ""
+    assert third == ""
     assert not stored_results(bad)
 
 
@@ -303,8 +302,8 @@ def test_ray_gives_the_same_scores(whole, tmp_path):
     cells = cells_in(tmp_path, seeds=(0,))
     for _ in range(2):
         outcomes = list(run_cells_on_ray(cells, QUIET, None))
-        assert sorted(each.cell.agent for each in outcomes) == sorted(c.agent for c in cells)
-        assert all(each.error == "" for each in outcomes)
+        assert sorted(cell.agent for cell, _ in outcomes) == sorted(c.agent for c in cells)
+        assert not any(error for _, error in outcomes)
     same = [cell for cell in whole if cell.seed != 1]
     for one, other in zip(same, cells, strict=True):
         assert stored_results(one) == stored_results(other)

@@ -229,7 +229,7 @@ RUN --on test => is one robot and not a split: it has no test robots
 RUN --whole => --whole is for --agent se, not for me-mlp
 RUN --set logit_scale=8 => --set logit_scale: me-mlp has none; valid for me-tf
 RUN --set features=8 => --set features: me-mlp has none; valid for me-tf
-RUN --set mlp_layers=0 => mlp_layers 0: expected 1 or more
+RUN --set mlp_layers=0 => mlp_layers 0: expected 1 to 100
 RUN --goal poses => invalid choice: 'poses'
 RUN --train-goals 1 => argument --train-goals: 1: expected a whole number, 2 or more
 RUN --fixed-deviation => fixed-deviation: discrete actions have no

@@ -273,12 +273,8 @@ def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> Submission:
 POLL = 2.0  # time between two checks of cells that another process works on [s]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Success or failure of a cell."""
-
-    cell: Cell  # the finished or failed cell
-    error: str = ""  # error message; empty after success
+Outcome = tuple[Cell, str]
+"""A cell and its error message, which is empty after success."""
 
 
 def run_cells(
@@ -291,14 +287,13 @@ def run_cells(
     Other processes may work on the same cells. Each cell is done by one process; this one waits at
     the end for the cells of the others.
     """
-    waiting = deque(cells)
-    skipped = 0
+    waiting, skipped = deque(cells), 0
     while waiting:
         cell = waiting.popleft()
-        outcome = _do_locked(cell, execution, show)
-        if outcome is not None:
+        error = _do_locked(cell, execution, show)
+        if error is not None:
             skipped = 0
-            yield outcome
+            yield cell, error
             continue
         waiting.append(cell)
         skipped += 1
@@ -326,22 +321,22 @@ def run_cells_on_ray(
             (done, *_), _ = ray.wait(list(running))
             cell = running.pop(done)
             try:
-                yield Outcome(cell, ray.get(done))
+                yield cell, ray.get(done)
             except ray.exceptions.RayError as error:
-                yield Outcome(cell, f"its Ray task failed: {type(error).__name__}: {error}")
+                yield cell, f"its Ray task failed: {type(error).__name__}: {error}"
 
 
 def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
-    (outcome,) = run_cells([cell], execution)
-    return outcome.error
+    ((_, error),) = run_cells([cell], execution)
+    return error
 
 
 def _do_locked(
     cell: Cell,
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None,
-) -> Outcome | None:
-    """Train and evaluate a cell and return its outcome; None if another process works on it."""
+) -> str | None:
+    """Train and evaluate a cell and return its error; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
@@ -349,13 +344,13 @@ def _do_locked(
     except Timeout:
         return None
     except MorphgenError as error:
-        return Outcome(cell, str(error))
+        return str(error)
     except OSError as error:
-        return Outcome(cell, f"{error.filename or cell.folder}: {error.strerror}")
+        return f"{error.filename or cell.folder}: {error.strerror}"
     except Exception as error:  # such as a GPU out of memory: the other cells go on
         traceback.print_exc(file=sys.stderr)
-        return Outcome(cell, f"{type(error).__name__}: {error}")
-    return Outcome(cell)
+        return f"{type(error).__name__}: {error}"
+    return ""
 
 
 TABLE, DATA, CURVES = "table.md", "results.json", "curves.png"

@@ -34,7 +34,7 @@ from msgspec import Meta
 from morphgen.benchmark.eval_protocol import EvalProtocol, ExpectedRobot
 from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import parse_json, read_bytes, read_json
-from morphgen.formats.files import LOCK, write_atomic, write_file
+from morphgen.formats.files import LOCK, write_atomic
 from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.rl.scores import Count, Name, RobotOutcomes, Score
 from morphgen.splits.split import Split, split_id
@@ -131,23 +131,6 @@ def submission_text(submission: Submission) -> str:
     ]
     body = ",\n".join(f"    {{\n{block}\n    }}" for block in blocks)
     return f'{head},\n  "robots": [\n{body}\n  ]\n}}\n'
-
-
-def write_submission(path: Path, submission: Submission) -> None:
-    """Write a submission."""
-    write_file(path, submission_text(submission))
-
-
-def json_files(path: Path, *patterns: str) -> Iterator[tuple[Path, Any]]:
-    """Yield a JSON file with its content, or those of a folder in the order of their paths."""
-    if path.is_dir():
-        files = sorted({file for pattern in patterns for file in path.glob(pattern)})
-    elif path.is_file():
-        files = [path]
-    else:
-        raise BenchmarkError(f"{path}: no such file or folder")
-    for file in files:
-        yield file, read_json(file)
 
 
 def is_submission(data: object) -> bool:
@@ -379,21 +362,20 @@ MAX_BYTES = 128 * 2**20
 1 GiB to read."""
 
 
-def table_text(submissions: Iterable[Submission]) -> str:
-    """Return the lines of submissions, without the names of the columns."""
+def _table_text(submission: Submission) -> str:
+    """Return the lines of a submission, without the names of the columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    for submission in submissions:
-        head = msgspec.to_builtins(submission)
-        del head["robots"]
-        text.write(f"# {json.dumps(head)}\n")
-        run = [submission.split.name, *(getattr(submission, name) for name in RUN[1:])]
-        for robot in submission.robots:
-            named = [getattr(robot, name) for name in ROBOT]
-            columns = [getattr(robot, name) for name in (*LISTS, *RANDOM)]
-            for values in itertools.zip_longest(*columns, fillvalue=""):
-                cells = (int(each) if isinstance(each, bool) else each for each in values)
-                writer.writerow([*run, *named, 1, *cells])
+    head = msgspec.to_builtins(submission)
+    del head["robots"]
+    text.write(f"# {json.dumps(head)}\n")
+    run = [submission.split.name, *(getattr(submission, name) for name in RUN[1:])]
+    for robot in submission.robots:
+        named = [getattr(robot, name) for name in ROBOT]
+        columns = [getattr(robot, name) for name in (*LISTS, *RANDOM)]
+        for values in itertools.zip_longest(*columns, fillvalue=""):
+            cells = (int(each) if isinstance(each, bool) else each for each in values)
+            writer.writerow([*run, *named, 1, *cells])
     return text.getvalue()
 
 
@@ -401,7 +383,7 @@ def append_submission(path: Path, submission: Submission) -> None:
     """Add a submission to a table, which is made if it does not exist; processes may share it."""
     with FileLock(path.with_name(LOCK)):
         before = path.read_bytes() if path.is_file() else _packed(f"{','.join(COLUMNS)}\n")
-        write_atomic(path, before + _packed(table_text([submission])))
+        write_atomic(path, before + _packed(_table_text(submission)))
 
 
 def _packed(text: str) -> bytes:
@@ -482,10 +464,14 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
     found: dict[str, Submission] = {}
     for path in paths:
         before = len(found)
-        tables = [path] if path.name == EPISODES else sorted(path.rglob(EPISODES))
-        for table in tables:
+        is_table = path.name == EPISODES
+        if not is_table and not path.exists():
+            raise BenchmarkError(f"{path}: no such file or folder")
+        for table in [path] if is_table else sorted(path.rglob(EPISODES)):
             found |= {f"{table}: {name_of(each)}": each for each in read_table(table)}
-        for file, data in () if path in tables else json_files(path, "**/*.json"):
+        files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
+        for file in () if is_table else files:
+            data = read_json(file)
             if is_submission(data) or file == path:
                 found[str(file)] = submission = submission_from(data, file)
                 if not submission.robots:
