@@ -1,20 +1,17 @@
 """Measure how well primitives approximate a solid: volume ratios and surface distances.
 
-The measurement is independent of the search for primitives: it draws its own samples and computes
-exact distances. All volumes are counted on the same scrambled Sobol points, so that errors cancel
-in ratios.
+The measurement is independent of the search for primitives: it draws its own samples. All volumes
+are counted on the same scrambled Sobol points, so that errors cancel in ratios. The outer surface
+of several primitives is that of the boolean union of their tessellations.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree
+import trimesh
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
@@ -24,13 +21,10 @@ from morphgen.typing import Array
 
 SolidPrimitive = Box | Cylinder | Capsule
 """A primitive; a sphere is a capsule of length 0."""
-SurfacePoints = tuple[Array, Array]
-"""Points and their outward normals, both of shape (n, 3)."""
-Patch = tuple[float, Callable[[Array], SurfacePoints]]
-"""Area of a patch of a surface, and its area-preserving map from the unit square (n, 2)."""
-
 _ON_SURFACE = 1e-6
 """Distance up to which a point counts as on the surface of the solid, not outside [m]."""
+_SECTIONS = 128  # number of sides of a tessellated circle, within 0.03% of its radius
+_SUBDIVISIONS = 5  # number of subdivisions of the icosahedron of a tessellated sphere
 
 
 @dataclass(frozen=True)
@@ -84,19 +78,20 @@ def quality(
         raise FitError(f"none of {len(points)} sample points lies in the solid")
     intersection = np.count_nonzero(in_primitives & in_solid)
 
-    outer = _outer_surface(primitives, surface_points, rng)
-    corners = [_outer(primitives, i, *_corners(shape)) for i, shape in enumerate(primitives)]
-    to_solid = solid.distance(np.concatenate([outer, *corners]))
-    protrusion = np.where(solid.contains(outer), 0.0, to_solid[: len(outer)])
+    union = trimesh.boolean.union([_tessellated(shape) for shape in primitives])
+    outer = _surface_points(union, surface_points, rng)
+    to_solid = solid.distance(outer)
+    protrusion = np.where(solid.contains(outer), 0.0, to_solid)
 
     surface = solid.surface(surface_points, rng)
     signed = signed_distance(primitives, surface)
     gap = np.maximum(signed, 0.0)
-    # The distance of a triangle to a convex primitive is largest at a vertex. Vertices inside of
-    # the solid do no harm: a surface point near them is at least as far from all primitives.
-    farthest = [to_solid.max(), gap.max(), at_vertices.max()]
-    if (signed < 0).any():
-        farthest.append(_depth(primitives, surface[signed < 0], surface_points, rng).max())
+    # Distances of triangles to convex primitives are largest at vertices. Vertices inside of the
+    # solid do no harm: a surface point near them is at least as far from all primitives.
+    depth = Solid(union, "watertight").distance(surface[signed < 0])
+    hausdorff = np.concatenate(
+        [to_solid, solid.distance(np.asarray(union.vertices)), gap, at_vertices, depth]
+    ).max()
     return Quality(
         iou=float(intersection / np.count_nonzero(in_primitives | in_solid)),
         coverage=float(intersection / np.count_nonzero(in_solid)),
@@ -106,7 +101,7 @@ def quality(
         protrusion_p95=float(np.percentile(protrusion, 95)),
         gap_mean=float(gap.mean()),
         gap_p95=float(np.percentile(gap, 95)),
-        hausdorff=float(max(farthest)),
+        hausdorff=float(hausdorff),
     )
 
 
@@ -181,110 +176,29 @@ def _sobol(n: int, rng: np.random.Generator) -> Array:
     return np.asarray(sampler.random_base2(max(n - 1, 1).bit_length()))
 
 
-def _outer_surface(primitives: Sequence[Shape], n: int, rng: np.random.Generator) -> Array:
-    """Sample the outer surface of the union of primitives evenly."""
-    geometries = enumerate(map(_solid_primitive, primitives))
-    patches = [(owner, *patch) for owner, geometry in geometries for patch in _patches(geometry)]
-    ends = np.cumsum([area for _, area, _ in patches])
-    unit = _sobol(n, rng)
-    chosen = np.searchsorted(ends[:-1] / ends[-1], unit[:, 0], side="right")
-    parts = ((owner, at(unit[chosen == i, 1:])) for i, (owner, _, at) in enumerate(patches))
-    return np.concatenate([_outer(primitives, owner, *part) for owner, part in parts])
-
-
-def _outer(primitives: Sequence[Shape], owner: int, points: Array, normals: Array) -> Array:
-    """Return the surface points of a primitive that are outside of all others, in the link frame.
-
-    Of faces that coincide those of the first primitive are kept; of faces in contact, none.
-    """
-    T = primitives[owner].T_link_shape.matrix
-    points, normals = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
-    step = _test_offset(primitives) * normals
-    covered = np.zeros(len(points), dtype=bool)
-    for index, other in enumerate(primitives):
-        if index != owner:
-            covered |= _distance(other, points + step) < 0
-        if index < owner:
-            covered |= _distance(other, points - step) < 0
-    return points[~covered]
-
-
-def _test_offset(primitives: Sequence[Shape]) -> float:
-    """Return the offset from a surface at which other primitives are tested for [m]."""
-    return 1e-6 * math.pow(min(volume(_solid_primitive(shape)) for shape in primitives), 1 / 3)
-
-
-def _patches(geometry: SolidPrimitive) -> list[Patch]:
-    """Return the patches of a primitive's surface."""
-    match geometry:
-        case Box((a, b, c)):
-            sides = itertools.product(enumerate((b * c, c * a, a * b)), (-1, 1))
-            return [(area, partial(_on_face, geometry, axis, sign)) for (axis, area), sign in sides]
-        case Cylinder(radius):
-            ends = (math.tau * radius**2, partial(_on_caps, geometry))
-        case Capsule(radius):
-            ends = (4 * math.pi * radius**2, partial(_on_ball, geometry))
-    return [(math.tau * radius * geometry.length, partial(_on_tube, geometry)), ends]
-
-
-def _on_face(box: Box, axis: int, sign: int, unit: Array) -> SurfacePoints:
-    normals = np.zeros((len(unit), 3))
-    normals[:, axis] = sign
-    return np.insert(2 * unit - 1, axis, sign, axis=1) * box.size / 2, normals
-
-
-def _on_tube(tube: Cylinder | Capsule, unit: Array) -> SurfacePoints:
-    normals = _spun(np.ones(len(unit)), unit[:, 0], np.zeros(len(unit)))
-    return normals * tube.radius + np.outer(unit[:, 1] - 0.5, (0, 0, tube.length)), normals
-
-
-def _on_caps(cylinder: Cylinder, unit: Array) -> SurfacePoints:
-    side, distance = np.copysign(1.0, unit[:, 1] - 0.5), np.sqrt(abs(2 * unit[:, 1] - 1))
-    points = _spun(cylinder.radius * distance, unit[:, 0], side * cylinder.length / 2)
-    return points, np.outer(side, (0.0, 0.0, 1.0))
-
-
-def _on_ball(capsule: Capsule, unit: Array) -> SurfacePoints:
-    """Sample both caps: uniform along the axis is uniform over a sphere (Archimedes)."""
-    z = 2 * unit[:, 1] - 1
-    normals = _spun(np.sqrt(1 - z * z), unit[:, 0], z)
-    return normals * capsule.radius + np.outer(np.sign(z), (0, 0, capsule.length / 2)), normals
-
-
-def _spun(radius: Array, turns: Array, z: Array) -> Array:
-    """Return points from cylindrical coordinates, shape (n, 3)."""
-    angle = math.tau * turns
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
-def _corners(shape: Shape) -> SurfacePoints:
-    """Return a box's corners, 64 points on each rim of a cylinder, nothing of a capsule."""
-    points = np.zeros((0, 3))
-    match _solid_primitive(shape):
-        case Box(size):
-            points = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
+def _tessellated(shape: Shape) -> trimesh.Trimesh:
+    """Return the triangles of a primitive in the link frame."""
+    mesh: trimesh.Trimesh
+    match shape.geometry:
+        case Sphere(radius):
+            mesh = trimesh.creation.icosphere(_SUBDIVISIONS, radius)
         case Cylinder(radius, length):
-            turns = np.arange(128) / 64
-            z = np.where(turns < 1, -length / 2, length / 2)
-            points = _spun(np.full(len(z), radius), turns, z)
-    return points, points / np.linalg.norm(points, axis=1, keepdims=True)
+            mesh = trimesh.creation.cylinder(radius, length, _SECTIONS)
+        case Capsule(radius, length):
+            mesh = trimesh.creation.capsule(length, radius, (_SECTIONS, _SECTIONS))
+            # trimesh has one end of the axis at the origin.
+            mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        case geometry:
+            mesh = trimesh.creation.box(geometry.size)
+    return mesh.apply_transform(shape.T_link_shape.matrix)
 
 
-def _depth(primitives: Sequence[Shape], points: Array, n: int, rng: np.random.Generator) -> Array:
-    """Return the distances of points inside of the primitives to the outer surface, shape (m,).
-
-    The signed distance is a lower bound. It is exact where the path along its gradient leaves all
-    primitives at once; elsewhere the distance to a dense sample of the surface is used.
-    """
-    depth = -signed_distance(primitives, points)
-    if len(primitives) == 1:
-        return depth
-    step = _test_offset(primitives)
-    ahead = [signed_distance(primitives, points + step * axis) for axis in np.eye(3)]
-    gradient = (np.stack(ahead, axis=1) + depth[:, None]) / step
-    beyond = signed_distance(primitives, points + (depth + 10 * step)[:, None] * gradient)
-    unsure = beyond < 5 * step
-    if unsure.any():
-        surface = _outer_surface(primitives, 4 * n, rng)
-        depth[unsure] = np.maximum(cKDTree(surface).query(points[unsure])[0], depth[unsure])
-    return depth
+def _surface_points(mesh: trimesh.Trimesh, n: int, rng: np.random.Generator) -> Array:
+    """Sample a surface evenly: a Sobol point selects a triangle by its area and a point in it."""
+    area, along, across = _sobol(n, rng).T
+    ends = np.cumsum(mesh.area_faces)
+    faces = np.searchsorted(ends[:-1] / ends[-1], area, side="right")
+    # The square root makes the density even, as the triangle widens from its first corner.
+    along = np.sqrt(along)
+    weights = np.stack([1 - along, along * (1 - across), along * across], axis=1)
+    return np.asarray((weights[:, :, None] * mesh.triangles[faces]).sum(axis=1))

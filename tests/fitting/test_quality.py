@@ -31,7 +31,7 @@ def solid(*pieces: tuple[Box, Pose]) -> Solid:
 
 def assert_perfect(found: Quality) -> None:
     assert [getattr(found, name) for name in SHARES] == [1.0, 1.0, 1.0]
-    assert max(getattr(found, name) for name in DISTANCES) < 1e-9
+    assert max(getattr(found, name) for name in DISTANCES) < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,9 @@ def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
     area = 2 * (0.44 * 0.2 + 0.2 * 0.1 + 0.1 * 0.44)
     end, strips = 0.2 * 0.1 * 0.04, 2 * (0.2 + 0.1) * 0.04 * 0.02
     assert measures.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
-    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
+    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-7)
     assert measures.gap_mean == measures.gap_p95 == 0
-    assert measures.hausdorff == pytest.approx(0.04, abs=1e-9)
+    assert measures.hausdorff == pytest.approx(0.04, abs=1e-7)
 
 
 def test_a_sphere_in_a_cube_does_not_cover_the_corners():
@@ -132,14 +132,14 @@ def test_protrusion_of_a_thin_skin_equals_its_thickness():
     measures = quality(solid_of([BLOCK]), pair)
     assert measures.coverage == 1
     assert measures.protrusion_mean == pytest.approx(skin, rel=0.01)
-    assert measures.hausdorff == pytest.approx(math.sqrt(3) * skin, rel=1e-6)
+    assert measures.hausdorff == pytest.approx(math.sqrt(3) * skin, abs=1e-7)
 
 
 def test_disjoint_shapes_have_no_overlap():
     measures = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
     assert measures.iou == measures.coverage == 0
     assert measures.volume_ratio == pytest.approx(1, rel=1e-3)
-    assert measures.hausdorff == pytest.approx(0.5, abs=1e-9)
+    assert measures.hausdorff == pytest.approx(0.5, abs=1e-7)
     assert 0.3 < measures.gap_mean == pytest.approx(measures.protrusion_mean, rel=0.02)
 
 
@@ -155,7 +155,7 @@ def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
     )
     measures = quality(slotted, primitives)
     assert measures.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
-    assert measures.protrusion_p95 < 1e-9
+    assert measures.protrusion_p95 < 1e-7
     assert measures.protrusion_mean < 1e-4
     assert measures.hausdorff == pytest.approx(0.096, abs=2e-4)
 
@@ -188,7 +188,7 @@ def test_measures_are_invariant_under_rigid_motion():
     for name in SHARES:
         assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-3)
     for name in DISTANCES:
-        assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-3)
+        assert getattr(after, name) == pytest.approx(getattr(before, name), rel=5e-3)
 
 
 def test_measures_are_reproducible_and_sampling_errors_are_small():
