@@ -7,7 +7,7 @@ elements only, its includes inserted, and its meshes rewritten, in a private fol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from morphgen.formats.xml import parse_description
 from morphgen.model.geometry import Mesh
 from morphgen.model.mesh import require_bounded_meshes
 
-_CHILDREN = {
+_CHILDREN: Mapping[str, Collection[str]] = {
     **CHILDREN,
     "robot": ("link", "joint", "material", "mujoco"),
     "mujoco": ("compiler", "option"),

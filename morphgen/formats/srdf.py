@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from lxml import etree
 
 from morphgen.errors import FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes
-from morphgen.formats.xml import parse_xml
+from morphgen.formats.xml import parse_xml, read_schema
 from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3
 
@@ -38,44 +38,6 @@ def require_tool(robot: Robot) -> None:
 
 
 MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]
-
-
-class _Rule(NamedTuple):
-    """Attributes and tags that an element may have: names separated by spaces."""
-
-    required: str
-    optional: str = ""
-    children: str = ""
-    numbers: Mapping[str, int | None] = {}
-    """Counts of the numbers in an attribute; None for any count but zero."""
-
-
-_RULES = {
-    "": _Rule(
-        "name",
-        children="virtual_joint end_effector passive_joint joint_property "
-        "disable_default_collisions enable_collisions disable_collisions group group_state "
-        "link_sphere_approximation",
-    ),
-    "virtual_joint": _Rule("name type parent_frame child_link"),
-    "end_effector": _Rule("name parent_link group", "parent_group"),
-    "passive_joint": _Rule("name"),
-    "joint_property": _Rule("joint_name property_name value"),
-    "disable_default_collisions": _Rule("link"),
-    "enable_collisions": _Rule("link1 link2", "reason"),
-    "disable_collisions": _Rule("link1 link2", "reason"),
-    "group": _Rule("name", children="link joint chain group"),
-    "group/link": _Rule("name"),
-    "group/joint": _Rule("name"),
-    "group/chain": _Rule("base_link tip_link"),
-    "group/group": _Rule("name"),
-    "group_state": _Rule("name group", children="joint"),
-    "group_state/joint": _Rule("name value", numbers={"value": None}),
-    "link_sphere_approximation": _Rule("link", children="sphere"),
-    "link_sphere_approximation/sphere": _Rule("center radius", numbers={"center": 3, "radius": 1}),
-}
-"""Elements of SRDF by their path below ``<robot>``. morphgen reads the disabled pairs only, but an
-unknown name anywhere may be a slip in one of those."""
 
 
 def read_srdf(path: Path) -> etree._Element:
@@ -106,41 +68,38 @@ def parse_srdf(data: bytes, origin: str) -> etree._Element:
 
 
 def _require_valid(element: etree._Element, path: str, origin: str) -> None:
-    """Require that an element and those in it are as the rules say."""
-    rule, where = _RULES[path], _place(element, origin)
+    """Require that an element and those in it are as the schema says."""
+    schema, where = read_schema("srdf"), _place(element, origin)
     for child in element:
-        if child.tag not in rule.children.split():
-            hint = nearest(str(child.tag), rule.children.split())
+        if child.tag not in schema.children[path]:
+            hint = nearest(str(child.tag), schema.children[path])
             parent = shortened(str(element.tag))
             raise FormatError(f"{_place(child, origin)} is unknown in <{parent}>{hint}")
         _require_valid(child, f"{path}/{child.tag}".removeprefix("/"), origin)
-    for name in rule.required.split():
-        if not element.get(name):
-            raise FormatError(f"{where}: missing attribute {name!r}")
-    valid = f"{rule.required} {rule.optional}".split()
+    attributes = schema.attributes[path]
+    for attribute in attributes:
+        if attribute.required and not element.get(attribute.name):
+            raise FormatError(f"{where}: missing attribute {attribute.name!r}")
+    valid = [attribute.name for attribute in attributes]
     for name in map(str, element.attrib):
         if name not in valid:
             hint = nearest(name, valid)
             raise FormatError(f"{where}: unknown attribute {shortened(name)!r}{hint}")
-    _require_numbers(element, rule, where)
+    for name, counts, _, _ in attributes:
+        if counts:
+            _require_numbers(name, element.get(name, ""), counts[0], where)
 
 
-def _require_numbers(element: etree._Element, rule: _Rule, where: str) -> None:
-    for name, count in rule.numbers.items():
-        text = element.get(name, "")
-        try:
-            values = [float(word) for word in text.split()]
-        except ValueError:
-            values = [math.nan]
-        if (
-            not values
-            or len(values) != (count or len(values))
-            or not all(map(math.isfinite, values))
-        ):
-            wanted = {None: "finite numbers", 1: "a finite number"}.get(count, "3 finite numbers")
-            raise FormatError(f"{where}: {name} {shortened(text)!r}; expected {wanted}")
-        if name == "radius" and values[0] < 0:
-            raise FormatError(f"{where}: radius {values[0]:g}; expected 0 or more")
+def _require_numbers(name: str, text: str, count: int, where: str) -> None:
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = [math.nan]
+    if not values or len(values) != (count or len(values)) or not all(map(math.isfinite, values)):
+        wanted = {0: "finite numbers", 1: "a finite number"}.get(count, f"{count} finite numbers")
+        raise FormatError(f"{where}: {name} {shortened(text)!r}; expected {wanted}")
+    if name == "radius" and values[0] < 0:
+        raise FormatError(f"{where}: radius {values[0]:g}; expected 0 or more")
 
 
 def _place(element: etree._Element, origin: str) -> str:

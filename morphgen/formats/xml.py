@@ -1,4 +1,7 @@
-"""Parse XML from untrusted sources: without entities, with errors that name line and column."""
+"""Parse XML from untrusted sources, without entities, and the schemas of XML formats.
+
+Errors name line and column.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,16 @@ import codecs
 import re
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import NamedTuple
 
 from lxml import etree
+from msgspec import field
 
 from morphgen.errors import FormatError, shortened
+from morphgen.formats.data_files import parse_yaml
+from morphgen.formats.records import Record, read_record
 from morphgen.model.findings import Finding
 
 _LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
@@ -282,3 +291,52 @@ def _doctype_error(origin: str) -> FormatError:
 
 def _excerpt(text: str) -> str:
     return repr(shortened(" ".join(text.split())))
+
+
+class Attribute(NamedTuple):
+    """An attribute of an element."""
+
+    name: str
+    counts: tuple[int, ...]  # valid counts of numbers, 0 for any but none; empty for a text
+    required: bool
+    positive: bool  # whether its numbers are lengths
+
+
+class Schema(Record, frozen=True, dict=True):
+    """A format in ``schemas.yaml``, which says what its keys mean."""
+
+    elements: dict[str, str]
+    left_out: str = ""
+    counted: str = ""
+    refused: dict[str, str] = field(default_factory=dict)
+    expected: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    @cached_property
+    def attributes(self) -> dict[str, list[Attribute]]:
+        """Attributes that are read by element."""
+        found = {
+            tag: re.findall(r"(\w+)(=[\d,]*)?(!?)(\+?)", rule.partition(">")[0])
+            for tag, rule in self.elements.items()
+        }
+        return {
+            tag: [
+                Attribute(name, tuple(map(int, re.findall(r"\d+", counts))), bool(mark), bool(plus))
+                for name, counts, mark, plus in words
+            ]
+            for tag, words in found.items()
+        }
+
+    @cached_property
+    def children(self) -> dict[str, dict[str, str]]:
+        """Children by element, each with its mark."""
+        return {
+            tag: dict(re.findall(r"(\w+)([*?]?)", rule.partition(">")[2]))
+            for tag, rule in self.elements.items()
+        }
+
+
+@lru_cache(maxsize=8)
+def read_schema(name: str) -> Schema:
+    """Return the schema of a format."""
+    path = Path(__file__).with_name("schemas.yaml")
+    return read_record(parse_yaml(path.read_text("utf-8"), str(path))[name], Schema, str(path))

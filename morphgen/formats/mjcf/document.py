@@ -16,7 +16,7 @@ from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolv
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.formats.urdf.schema import MAX_LINKS, counted_elements
 from morphgen.formats.xacro.evaluator import RefusedError
-from morphgen.formats.xml import parse_description
+from morphgen.formats.xml import parse_description, read_schema
 from morphgen.model.findings import Finding, left_out
 from morphgen.model.mesh import require_bounded_files
 
@@ -30,58 +30,8 @@ grows with the square of it."""
 GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
 """Types of geoms that a robot can have, for errors."""
 
-_IGNORED = ("size", "visual", "statistic", "custom", "sensor", "deformable")
-"""Sections without a counterpart in ``Robot``. Some allocate memory as the file demands."""
-_ASSETS = ("mesh", "material", "hfield")
-"""Assets that are kept; textures, skins and models would be read from files."""
-_ELEMENTS = frozenset(
-    [
-        *("mujoco", "mujocoinclude", "include", "compiler", "option", "flag", "default", *_ASSETS),
-        *("asset", "worldbody", "body", "frame", "replicate", "inertial", "joint", "freejoint"),
-        *("geom", "site", "camera", "light", "contact", "pair", "exclude", "tendon", "spatial"),
-        *("fixed", "pulley", "equality", "connect", "weld", "keyframe", "key", "actuator"),
-        *("general", "motor", "position", "velocity", "intvelocity", "orientation", "pid"),
-        *("damper", "cylinder", "muscle", "adhesion", "dcmotor"),
-    ]
-)
-"""Elements that MuJoCo gets. All others are refused or left out."""
-_LEFT_OUT = frozenset([*_IGNORED, "texture", "skin", "model", "layer", "lengthrange"])
-"""Elements that are left out with everything in them, wherever they are."""
-_REFUSED = {
-    "plugin": "plugins are code",
-    "extension": "plugins are code",
-    "attach": "a robot is read from one model; put its bodies into this file",
-    "composite": "a robot has rigid links",
-    "flexcomp": "a robot has rigid links",
-    "flex": "a robot has rigid links",
-    "flexstrain": "a robot has rigid links",
-}
-"""Elements that are refused, and why."""
-_UNHELD = {
-    "geom": "friction condim priority solmix solref solimp margin gap fluidshape fluidcoef hfield",
-    "joint": (
-        "stiffness springref springdamper armature margin solreffriction solimpfriction "
-        "solreflimit solimplimit actuatorgravcomp"
-    ),
-    "freejoint": "group align",
-    "body": "gravcomp sleep",
-    "site": "type size fromto group material rgba",
-    "material": (
-        "texture texrepeat texuniform emission specular shininess reflectance metallic roughness"
-    ),
-    "mesh": "smoothnormal maxhullvert texcoord",
-    "connect": "solref solimp",
-    "weld": "solref solimp torquescale",
-    "spatial": "stiffness damping frictionloss springlength width material rgba",
-    "fixed": "stiffness damping frictionloss springlength",
-    **dict.fromkeys(
-        ("general", "motor", "position", "velocity", "intvelocity", "damper", "muscle"),
-        "kp kv dampratio timeconst inheritrange gainprm biasprm dynprm gaintype biastype dyntype",
-    ),
-}
-"""Attributes of elements that MuJoCo gets for which a ``Robot`` has no place."""
-_UNHELD_ELEMENTS = ("option", "flag", "light", "camera", "pair")
-"""Elements that MuJoCo gets for which a ``Robot`` has no place, besides ``_LEFT_OUT``."""
+_SCHEMA = read_schema("mjcf")
+_LEFT_OUT = _SCHEMA.left_out.split()
 _FILES = re.compile(r"file|file(back|down|front|left|right|up)|(asset|mesh|texture)dir")
 """Attributes that name files or folders."""
 _ALLOCATING = ("user", "act", "actdim", "nsample", "delay", "interp")
@@ -228,10 +178,10 @@ def _keep_known(root: etree._Element, path: Path) -> None:
     _require_plain(root, path)
     for element in [*root.iter()]:
         tag = str(element.tag)
-        if tag in _REFUSED:
+        if tag in _SCHEMA.refused:
             name = element.get("name") or element.get("plugin") or element.get("model")
             label = f"<{tag}>" if name is None else f"<{tag}> {name!r}"
-            raise FormatError(f"{path}: {label} is refused: {_REFUSED[tag]}")
+            raise FormatError(f"{path}: {label} is refused: {_SCHEMA.refused[tag]}")
         if tag == "mesh" and "builtin" in element.attrib:
             raise FormatError(
                 f"{path}: mesh {element.get('name')!r} is built in MuJoCo; give it a file, or use "
@@ -240,7 +190,7 @@ def _keep_known(root: etree._Element, path: Path) -> None:
     for element in [*root.iter(*_LEFT_OUT)]:
         remove_element(element)
     for element in root.iter():
-        if element.tag not in _ELEMENTS:
+        if element.tag not in _SCHEMA.elements:
             raise FormatError(
                 f"{path}:{element.sourceline}: <{element.tag}> is no element of MJCF that is read"
             )
@@ -250,12 +200,12 @@ def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
     """Count what is left out of a file: elements by their parent, attributes by their element."""
     elements: dict[tuple[str, str], list[etree._Element]] = {}
     attributes: dict[str, list[tuple[etree._Element, str]]] = {}
-    skipped = frozenset([*_LEFT_OUT, *_UNHELD_ELEMENTS])
+    skipped = frozenset([*_LEFT_OUT, *_SCHEMA.counted.split()])
     todo = [root]
     while todo:
         element = todo.pop()
         tag, names = str(element.tag), [str(name) for name in element.attrib]
-        unheld = (*_UNHELD.get(tag, "").split(), *_ALLOCATING)
+        unheld = (*_SCHEMA.elements.get(tag, "").split(), *_ALLOCATING)
         if found := [(element, name) for name in names if name in unheld]:
             attributes.setdefault(tag, []).extend(found)
         for child in element:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from typing import TypeAlias
 
 from lxml import etree
 
 from morphgen.errors import nearest, shortened
-from morphgen.formats.urdf.write import MUJOCO_BOUNDS
+from morphgen.formats.xml import Attribute, read_schema
 from morphgen.model.findings import Finding, left_out
 from morphgen.model.robot import JOINT_KINDS
 
@@ -24,98 +24,15 @@ MAX_LINKS = 1000  # largest number of links, and of joints, that is read
 MAX_SHAPES = 10_000  # largest number of visual and collision shapes that is read
 MAX_ERRORS = 50  # number of errors after which the check stops
 
-_SCHEMA = f"""
-robot      name! version             > link* joint* material* mujoco morphgen
-link       name!                     > inertial visual* collision*
-inertial                             > origin mass inertia
-visual     name                      > origin geometry material
-collision  name                      > origin geometry
-geometry                             > box capsule cylinder sphere mesh
-material   name                      > color
-joint      name! type!               > origin parent child axis limit mimic dynamics
-joint                                > calibration? safety_controller?
-parent     link!
-child      link!
-mimic      joint! multiplier=1 offset=1
-origin     xyz=3 rpy=3 quat_xyzw=4
-axis       xyz=3
-limit      lower=1 upper=1 effort=1 velocity=1
-dynamics   damping=1 friction=1
-calibration        rising=1 falling=1
-safety_controller  soft_lower_limit=1 soft_upper_limit=1 k_position=1 k_velocity=1
-mass       value=1!
-inertia    ixx=1! ixy=1! ixz=1! iyy=1! iyz=1! izz=1!
-box        size=3!+
-sphere     radius=1!+
-capsule    radius=1!+ length=1+ fromto=6
-cylinder   radius=1!+ length=1!+
-mesh       filename! scale=1,3
-color      rgba=4
-mujoco                               > compiler
-compiler   meshdir strippath fusestatic discardvisual {" ".join(MUJOCO_BOUNDS)}
-morphgen                             > home frame
-home       joint position
-frame      name
-"""
-"""Elements of URDF that are read: their attributes and, after ``>``, their children.
-
-An attribute that must be there has a ``!``, one of numbers their valid counts after ``=``, and one
-of lengths a ``+``. Children that may repeat have a ``*``. Those with a ``?`` are not read, but
-their numbers are checked: loaders refuse invalid ones.
-"""
-
-
-@dataclass(frozen=True)
-class _Attribute:
-    name: str
-    counts: tuple[int, ...]  # valid counts of numbers; empty for a text
-    required: bool
-    positive: bool
-
-
-def _parsed(
-    schema: str,
-) -> tuple[dict[str, list[_Attribute]], dict[str, list[str]], dict[tuple[str, str], str]]:
-    """Return attributes and children by tag, and marks by the tags of parent and child."""
-    attributes: dict[str, list[_Attribute]] = {}
-    children: dict[str, list[str]] = {}
-    marks: dict[tuple[str, str], str] = {}
-    for line in schema.strip().splitlines():
-        own, _, inside = line.partition(">")
-        tag, *words = own.split()
-        for name, counts, mark, plus in re.findall(r"(\w+)=?([\d,]*)(!?)(\+?)", " ".join(words)):
-            numbers = tuple(map(int, filter(None, counts.split(","))))
-            attribute = _Attribute(name, numbers, bool(mark), bool(plus))
-            attributes.setdefault(tag, []).append(attribute)
-        for name, mark in re.findall(r"(\w+)([*?]?)", inside):
-            children.setdefault(tag, []).append(name)
-            marks[tag, name] = mark
-    return attributes, children, marks
-
-
-_ATTRIBUTES, CHILDREN, _MARKS = _parsed(_SCHEMA)
-_READ_ATTRIBUTES = {tag: [each.name for each in rules] for tag, rules in _ATTRIBUTES.items()}
+_SCHEMA = read_schema("urdf")
+CHILDREN = _SCHEMA.children
+"""Children that are read or checked, by element."""
+_READ_ATTRIBUTES = {tag: [each.name for each in rules] for tag, rules in _SCHEMA.attributes.items()}
 _READ_CHILDREN = {
-    tag: [name for name in names if _MARKS[tag, name] != "?"] for tag, names in CHILDREN.items()
+    tag: [name for name, mark in children.items() if mark != "?"]
+    for tag, children in CHILDREN.items()
 }
-_EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
-    "joint": {"parent": "", "child": ""},
-    "inertial": {
-        "mass": "its <inertial> without <mass> was left out",
-        "inertia": "the missing <inertia> was read as zero",
-    },
-    "visual": {"geometry": "a <visual> without <geometry> was left out"},
-    "collision": {"geometry": "a <collision> without <geometry> was left out"},
-}
-"""Children that an element should have, with the repair if one is missing; empty: an error."""
 _WITH_COMMAS = ("size", "scale")  # attributes that MuJoCo alone refuses with commas
-_EXTENSIONS = (
-    "acceleration calibration collision_checking contact contact_coefficients controller_gains "
-    "deceleration deformable dont_collapse gazebo gravity inertial_frame jerk joint_properties "
-    "kinematic ros2_control safety_controller self_collision_checking self_filter sensor specular "
-    "surface texture transmission type verbose"
-)
-"""Names that robot software knows and that a robot has no place for; others may be slips."""
 
 
 def _finding(
@@ -169,7 +86,7 @@ def _unread_finding(tag: str, kind: str, name: str, found: list[etree._Element])
         prefix = f"{prefixes.get(etree.QName(name).namespace)}:" if local != name else ""
         what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _READ_ATTRIBUTES.get(tag, ())
     code, where = f"{kind}-unread", _finding(first, "", "", "").where
-    if name in _EXTENSIONS.split() or local != name:
+    if name in _SCHEMA.left_out.split() or local != name:
         return left_out(code, where, what)
     hint = nearest(shortened(name), valid) if valid else ""
     guess = f"{hint.partition('?')[0]}?" if "?" in hint else ""
@@ -189,16 +106,16 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
     tag = element.tag
     checks = [
         _number_faults(element, attribute) if attribute.counts else _text_faults(element, attribute)
-        for attribute in _ATTRIBUTES.get(tag, ())
+        for attribute in _SCHEMA.attributes.get(tag, ())
     ]
     for fault in chain(*checks, _missing_faults(element), _alternative_faults(element)):
         yield _finding(element, *fault)
     if tag == "geometry":
         yield from _geometry_findings(element)
     # `_robot_findings` checks the children of <robot>.
-    for name in () if tag == "robot" else CHILDREN.get(tag, ()):
+    for name, mark in () if tag == "robot" else CHILDREN.get(tag, {}).items():
         children = element.findall(name)
-        if len(children) > 1 and _MARKS[tag, name] != "*":
+        if len(children) > 1 and mark != "*":
             why = f"<{tag}> has {len(children)} <{name}>; the first one counts"
             repair = f"of {len(children)} <{name}> the first one was taken"
             yield _finding(children[1], "element-repeated", why, "keep one", repair)
@@ -210,7 +127,7 @@ _Fault: TypeAlias = tuple[str, ...]
 """Code, reason and advice of a finding about an element, and its repair if there is one."""
 
 
-def _text_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_Fault]:
+def _text_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
     tag, name = element.tag, attribute.name
     value = element.get(name, "")
     if not attribute.required:
@@ -227,7 +144,7 @@ def _text_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_Fa
 
 def _missing_faults(element: etree._Element) -> Iterator[_Fault]:
     tag = element.tag
-    for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
+    for name, repair in _SCHEMA.expected.get(tag, {}).items():
         if element.find(name) is None:
             why, fix = f"<{tag}> has no <{name}>", f"add <{name}> or drop <{tag}>"
             yield "element-missing", why, fix, repair
@@ -254,7 +171,7 @@ def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
         yield _finding(known[1], "element-repeated", why, fix, repair)
 
 
-def _number_faults(element: etree._Element, attribute: _Attribute) -> Iterator[_Fault]:
+def _number_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
     name, counts = attribute.name, attribute.counts
     text = element.get(name)
     if text is None:
