@@ -301,25 +301,18 @@ def _never_ending(grammar: Grammar) -> Iterator[str]:
 
 def _circular(grammar: Grammar) -> Iterator[str]:
     """Find symbols that can be rewritten to themselves and nothing else."""
-    import numpy as np
-    from scipy.sparse import coo_matrix  # `morphgen compose` does not need it
-    from scipy.sparse.csgraph import connected_components
-
-    index = {production.symbol: i for i, production in enumerate(grammar.productions)}
-    edges = [
-        (index[production.symbol], index[alternative.items[0].name])
-        for production, alternative in grammar.alternatives()
-        if len(alternative.items) == 1 and alternative.items[0].name in index
-    ]
-    graph = coo_matrix(
-        (np.ones(len(edges)), np.array(edges, dtype=int).reshape(-1, 2).T),
-        shape=(len(index), len(index)),
-    )
-    _, component = connected_components(graph, connection="strong")
-    sizes = np.bincount(component)
-    loops = {source for source, target in edges if source == target}
-    for i, production in enumerate(grammar.productions):
-        if sizes[component[i]] > 1 or i in loops:
+    targets: dict[str, set[str]] = {production.symbol: set() for production in grammar.productions}
+    for production, alternative in grammar.alternatives():
+        if len(alternative.items) == 1 and (name := alternative.items[0].name) in targets:
+            targets[production.symbol].add(name)
+    for production in grammar.productions:
+        reached: set[str] = set()
+        pending = [*targets[production.symbol]]
+        while pending:
+            if (symbol := pending.pop()) not in reached:
+                reached.add(symbol)
+                pending += targets[symbol]
+        if production.symbol in reached:
             yield f"{production.location}: {production.symbol!r} can be rewritten to itself alone"
 
 

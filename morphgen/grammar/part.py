@@ -27,7 +27,8 @@ from morphgen.formats.resolve import PackageFinder, distribution_file, file_stam
 from morphgen.formats.rounding import format_number
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.xacro.compile import CompiledXacro, compile_xacro
-from morphgen.formats.xacro.expand import evaluate, expand
+from morphgen.formats.xacro.evaluator import evaluate_number
+from morphgen.formats.xacro.expand import expand
 from morphgen.grammar.library import Library, shipped_folders
 from morphgen.grammar.manifest import (
     FrameSpec,
@@ -231,10 +232,11 @@ class _Loader:
     def _evaluate(self, entry: Number) -> float:
         if not isinstance(entry, str):
             return entry
-        if _EXPRESSION.fullmatch(entry.strip()) is None:
+        match = _EXPRESSION.fullmatch(entry.strip())
+        if match is None:
             raise self._error(f"{entry!r} is neither a number nor ${{...}}")
         try:
-            return evaluate(entry, self._values)
+            return evaluate_number(match[1], self._values)
         except MorphgenError as error:
             raise self._error(f"{entry}: {error}") from error
 

@@ -86,7 +86,7 @@ def test_a_dot_accesses_dictionary_entries():
 @pytest.mark.parametrize(
     ("text", "construct"),
     [
-        ("().__class__.__bases__", "Attribute '().__class__' is not allowed"),
+        ("().__class__.__bases__", "Attribute '().__class__.__bases__' is not allowed"),
         ("x.real", "Attribute 'x.real' is not allowed"),
         ("sin.call", "Attribute 'sin.call' is not allowed"),
         ("limits.__class__", "Attribute 'limits.__class__' is not allowed"),
@@ -169,7 +169,6 @@ def test_expressions_have_bounded_time_and_size(text):
 
 
 def test_no_text_of_a_document_is_executed_by_python():
-    """The only ``exec`` runs code of the package; ``eval`` and ``compile`` are never called."""
     folder = Path(morphgen.formats.__file__).parent
     calls = [
         f"{path.name}: {ast.unparse(node)}"
@@ -179,7 +178,7 @@ def test_no_text_of_a_document_is_executed_by_python():
         and isinstance(node.func, ast.Name)
         and node.func.id in ("eval", "exec", "compile", "__import__")
     ]
-    assert calls == ["expand.py: exec(_BODY, module.__dict__)"]
+    assert calls == []
 
 
 def test_the_page_documents_every_function_and_bound():
@@ -201,8 +200,8 @@ def test_the_page_documents_every_function_and_bound():
 
 def test_suspicious_expressions_print_no_python_warning():
     code = (
-        "from morphgen.formats.xacro.expand import evaluate; "
-        r"print(evaluate('${2if 1 else 3}', {}), evaluate('${len(\'\\d\')}', {}))"
+        "from morphgen.formats.xacro.evaluator import evaluate_number as evaluate; "
+        r"print(evaluate('2if 1 else 3', {}), evaluate('len(\'\\d\')', {}))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -165,9 +165,10 @@ def trace(
         The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.
     """
     objects = {name: Traced(_symbol(name)) for name in numbers}
-    expansion = Expansion(constants, path, finder, objects, installed_only=installed_only)
-    for name, function in _FUNCTIONS.items():
-        expansion.engine._global_symbols[name] = Function(name, _lifted(name, function))
+    functions = {name: Function(name, _lifted(name, call)) for name, call in _FUNCTIONS.items()}
+    expansion = Expansion(
+        constants, path, finder, objects, functions, installed_only=installed_only
+    )
     try:
         pieces = _MARK.split(expansion.run_file().decode())
         filled = _translated(pieces[::2], pieces[1::2]).fill(numbers)

@@ -1,4 +1,8 @@
-"""Evaluate the expressions of xacro files by an allow-list."""
+"""Evaluate the expressions of xacro files and part manifests by an allow-list.
+
+They are Python's syntax, but Python never runs them: ``_Evaluation`` walks the nodes that
+``Expression`` allows.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +13,13 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
 
+from morphgen.errors import MALFORMED, FormatError, nearest, shortened
+
+MAX_REASON = 400  # longest reason in an error [characters]; expressions can be long
 MAX_BITS = 1024  # largest whole number of an expression [bits]: what a float can hold
 MAX_SIZE = 200_000
 """Largest text, list or dictionary of an expression [characters and entries, nested ones too]."""
@@ -121,19 +128,19 @@ def _modulo(left: Value, right: Value) -> object:
     return left % right
 
 
-OPERATORS: Mapping[str, Callable[[Value, Value], object]] = {
-    "Add": operator.add,
-    "Sub": operator.sub,
-    "Mult": _multiply,
-    "Div": operator.truediv,
-    "FloorDiv": operator.floordiv,
-    "Mod": _modulo,
-    "Pow": _power,
-    "LShift": _shift,
-    "RShift": operator.rshift,
-    "BitAnd": operator.and_,
-    "BitOr": operator.or_,
-    "BitXor": operator.xor,
+OPERATORS: Mapping[type, Callable[[Value, Value], object]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: _multiply,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: _modulo,
+    ast.Pow: _power,
+    ast.LShift: _shift,
+    ast.RShift: operator.rshift,
+    ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
 }
 """Binary operators by the name of their node."""
 
@@ -311,300 +318,219 @@ _SIGNS: Mapping[type, Callable[[Value], Value]] = {
     ast.UAdd: operator.pos,
     ast.Invert: operator.invert,
 }
+_ALLOWED = (
+    *(ast.Constant, ast.Name, ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.IfExp, ast.Compare, ast.Call),
+    *(ast.Subscript, ast.Slice, ast.Attribute, ast.keyword, ast.Starred, ast.List, ast.Tuple),
+    *(ast.Dict, ast.ListComp, ast.GeneratorExp, ast.comprehension, ast.expr_context, ast.boolop),
+    *(*OPERATORS, *_COMPARISONS, *_SIGNS),
+)
+"""Kinds of nodes that an expression may have."""
 
 
-@dataclass
-class Scope:
-    """Names and remaining work of one evaluation."""
+class Namespace(dict[str, object]):
+    """Names that expressions write after a dot; unlike a dictionary it is no data."""
 
-    names: Mapping[str, object]
-    inner: dict[str, object] = field(default_factory=dict)
-    """Arguments and variables of comprehensions; they hide ``names``."""
-    work: int = MAX_WORK
 
-    def spend(self, work: int) -> None:
+NAMES: Mapping[str, object] = {
+    **MATH,
+    **BUILTINS,
+    "math": Namespace(MATH),
+    "python": Namespace(BUILTINS),
+}
+"""Names that every expression may use."""
+
+
+class _Evaluation:
+    """One evaluation of an expression."""
+
+    def __init__(
+        self, text: str, names: Mapping[str, object], inner: Mapping[str, object] | None
+    ) -> None:
+        self._text, self._names, self._work = text, names, MAX_WORK
+        self._inner = dict(inner or {})
+        """Arguments and variables of comprehensions; they hide ``names``."""
+
+    def value(self, node: ast.AST | None) -> Value:
+        """Return the value of a node."""
+        match node:
+            case ast.Constant(value):
+                return value
+            case ast.Name(name):
+                if name in self._inner:
+                    return self._inner[name]
+                return _entry(self._names, name)
+            case ast.BinOp(left, sign, right):
+                operands = _data(self.value(left)), _data(self.value(right))
+                return self._result(OPERATORS[type(sign)](*operands))
+            case ast.UnaryOp(sign, operand):
+                return _SIGNS[type(sign)](_data(self.value(operand)))
+            case ast.Call():
+                return self._call(node)
+            case ast.Attribute(owner, _):
+                return self._attribute(node, self.value(owner))
+            case ast.Subscript(container, index):
+                chosen = self.value(index)
+                value = self.value(container)[chosen]
+                return self._result(value) if isinstance(chosen, slice) else value
+        return self._composite(node)
+
+    def _composite(self, node: ast.AST | None) -> Value:
+        match node:
+            case ast.IfExp(test, then, other):
+                return self.value(then if self.value(test) else other)
+            case ast.BoolOp():
+                return self._decide(node)
+            case ast.Compare():
+                return self._compare(node)
+            case ast.Slice(low, high, step):
+                return slice(*map(self.value, (low, high, step)))
+            case ast.List(items):
+                return self._result(list(map(_data, self._items(items))))
+            case ast.Tuple(items):
+                return self._result(tuple(map(_data, self._items(items))))
+            case ast.Dict():
+                return self._dict(node)
+            case ast.ListComp() | ast.GeneratorExp():
+                return self._comprehension(node)
+        return None  # an end that a slice does not have
+
+    def _spend(self, work: int) -> None:
         """Subtract work from the remaining work."""
-        self.work -= work
-        if self.work < 0:
+        self._work -= work
+        if self._work < 0:
             raise RefusedError(f"it takes more than {MAX_WORK} steps")
 
-    def result(self, value: object) -> object:
+    def _result(self, value: object) -> object:
         """Return a new value after checking its size and counting it as work."""
         if type(value) is float:
             return value
         if type(value) in _NUMBERS:
             return checked(value)
-        self.spend(size_of(value))
+        self._spend(size_of(value))
         return value
 
+    def _charged(self, value: Value) -> Value:
+        """Return a value unchanged if it is data; reading all of it counts as work."""
+        if type(value) not in _NUMBERS:
+            self._spend(size_of(_data(value)))
+        return value
 
-Node: TypeAlias = Callable[[Scope], Value]
+    def _decide(self, node: ast.BoolOp) -> object:
+        value: object = None
+        for operand in node.values:
+            value = self.value(operand)
+            if bool(value) is isinstance(node.op, ast.Or):
+                break
+        return value
 
+    def _compare(self, node: ast.Compare) -> object:
+        left, value = self._charged(self.value(node.left)), True
+        for sign, operand in zip(node.ops, node.comparators, strict=True):
+            right = self._charged(self.value(operand))
+            value = _COMPARISONS[type(sign)](left, right)
+            if not value:
+                break
+            left = right
+        return value
 
-class Translation:
-    """Translates the nodes of one expression, with one method for each allowed kind of node."""
+    def _attribute(self, node: ast.Attribute, owner: Value) -> object:
+        """Return the entry after the dot of a dictionary or namespace."""
+        if not isinstance(owner, dict):
+            raise _refused(node, self._text)
+        return _entry(owner, node.attr)
 
-    def __init__(self, text: str) -> None:
-        self.text = text
+    def _call(self, node: ast.Call) -> object:
+        operands: list[Value] = []
+        if isinstance(node.func, ast.Attribute):
+            owner, name = self.value(node.func.value), node.func.attr
+            if method := METHODS.get(type(owner), {}).get(name):
+                function, operands = Function(name, method), [owner]
+            else:
+                function = self._attribute(node.func, owner)
+        else:
+            function = self.value(node.func)
+        if not isinstance(function, Function):
+            raise _refused(node, self._text)
+        operands += self._items(node.args)
+        named: dict[str, Value] = {}
+        for keyword in node.keywords:
+            value = self.value(keyword.value)
+            named |= self._charged(value) if keyword.arg is None else {keyword.arg: value}
+        return self._apply(function, operands, named)
 
-    def of(self, node: ast.AST) -> Node:
-        """Return the function that evaluates a node."""
-        translate = getattr(self, f"_{type(node).__name__.lower()}", None)
-        if translate is None:
-            raise self.refused(node)
-        function: Node = translate(node)
-        return function
+    def _apply(self, function: Function, operands: list[Value], named: dict[str, Value]) -> object:
+        """Call a function; its operands and its result count as work."""
+        self._spend(1)
+        for operand in (*operands, *named.values()):
+            if not (function.applies and isinstance(operand, Function)):
+                self._charged(operand)
+        if not function.applies:
+            return self._result(function.call(*operands, **named))
 
-    def refused(self, node: ast.AST) -> RefusedError:
-        """Return the error for a construct that is not allowed."""
-        source = ast.get_source_segment(self.text, node) or self.text
-        return RefusedError(f"{type(node).__name__} {source[:80]!r} is not allowed")
+        def apply(inner: object, *items: object) -> object:
+            if not isinstance(inner, Function) or inner.applies:
+                raise TypeError(f"{function} applies one of the listed functions")
+            return self._apply(inner, list(items), {})
 
-    def _constant(self, node: ast.Constant) -> Node:
-        value = node.value
-        if type(value) not in _SCALARS:
-            raise self.refused(node)
-        checked(value)
-        return lambda scope: value
+        return self._result(function.call(apply, *operands, **named))
 
-    def _name(self, node: ast.Name) -> Node:
-        name = node.id
+    def _dict(self, node: ast.Dict) -> object:
+        result: dict[object, object] = {}
+        for key, item in zip(node.keys, node.values, strict=True):
+            if key is None:
+                result.update(self._charged(self.value(item)))
+            else:
+                result[self.value(key)] = _data(self.value(item))
+        return self._result(result)
 
-        def look_up(scope: Scope) -> object:
-            if name in scope.inner:
-                return scope.inner[name]
-            try:
-                return scope.names[name]
-            except KeyError:
-                raise NameError(f"name {name!r} is not defined", name=name) from None
+    def _items(self, nodes: list[ast.expr]) -> Iterator[Value]:
+        """Yield the values of elements or arguments, some of them starred."""
+        for node in nodes:
+            if isinstance(node, ast.Starred):
+                yield from self._charged(self.value(node.value))
+            else:
+                yield self.value(node)
 
-        return look_up
+    def _comprehension(self, node: ast.ListComp | ast.GeneratorExp) -> object:
+        outer, self._inner = self._inner, dict(self._inner)
+        try:
+            return self._result(list(self._rounds(node, 0)))
+        finally:
+            self._inner = outer
 
-    def _binop(self, node: ast.BinOp) -> Node:
-        left, right = self.of(node.left), self.of(node.right)
-        apply = OPERATORS.get(type(node.op).__name__)
-        if apply is None:
-            raise self.refused(node)
-        return lambda scope: scope.result(apply(_data(left(scope)), _data(right(scope))))
-
-    def _unaryop(self, node: ast.UnaryOp) -> Node:
-        operand, apply = self.of(node.operand), _SIGNS[type(node.op)]
-        return lambda scope: apply(_data(operand(scope)))
-
-    def _boolop(self, node: ast.BoolOp) -> Node:
-        operands = [self.of(value) for value in node.values]
-        stops_at = isinstance(node.op, ast.Or)
-
-        def decide(scope: Scope) -> object:
-            value: object = None
-            for operand in operands:
-                value = operand(scope)
-                if bool(value) is stops_at:
-                    break
-            return value
-
-        return decide
-
-    def _ifexp(self, node: ast.IfExp) -> Node:
-        test, then, other = self.of(node.test), self.of(node.body), self.of(node.orelse)
-        return lambda scope: then(scope) if test(scope) else other(scope)
-
-    def _compare(self, node: ast.Compare) -> Node:
-        first = self.of(node.left)
-        rest = [
-            (_COMPARISONS[type(op)], self.of(operand))
-            for op, operand in zip(node.ops, node.comparators, strict=True)
-        ]
-
-        def compare(scope: Scope) -> object:
-            left = _charged(first(scope), scope)
-            value: object = True
-            for apply, operand in rest:
-                right = _charged(operand(scope), scope)
-                value = apply(left, right)
-                if not value:
-                    break
-                left = right
-            return value
-
-        return compare
-
-    def _subscript(self, node: ast.Subscript) -> Node:
-        container, index = self.of(node.value), self.of(node.slice)
-
-        def pick(scope: Scope) -> object:
-            chosen = index(scope)
-            value = container(scope)[chosen]
-            return scope.result(value) if isinstance(chosen, slice) else value
-
-        return pick
-
-    def _slice(self, node: ast.Slice) -> Node:
-        ends = [
-            None if end is None else self.of(end) for end in (node.lower, node.upper, node.step)
-        ]
-        return lambda scope: slice(*(None if end is None else end(scope) for end in ends))
-
-    def _attribute(self, node: ast.Attribute) -> Node:
-        owner, entry = self.of(node.value), self._entry(node)
-        return lambda scope: entry(owner(scope))
-
-    def _entry(self, node: ast.Attribute) -> Callable[[Value], Value]:
-        """Return a function for the entry after the dot of a dictionary or namespace."""
-        name = node.attr
-        if name.startswith("__"):
-            raise self.refused(node)
-
-        def entry(owner: Value) -> object:
-            if not isinstance(owner, dict):
-                raise self.refused(node)
-            try:
-                return owner[name]
-            except KeyError:
-                raise NameError(f"name {name!r} is not defined", name=name) from None
-
-        return entry
-
-    def _call(self, node: ast.Call) -> Node:
-        arguments = self._items(node.args)
-        keywords = [(keyword.arg, self.of(keyword.value)) for keyword in node.keywords]
-        find = self._callee(node.func)
-
-        def call(scope: Scope) -> object:
-            function, owners = find(scope)
-            if not isinstance(function, Function):
-                raise self.refused(node)
-            return _call_function(
-                scope, function, [*owners, *arguments(scope)], _keywords(keywords, scope)
-            )
-
-        return call
-
-    def _callee(self, node: ast.expr) -> Callable[[Scope], tuple[object, tuple[object, ...]]]:
-        """Return a function for the callee of a call, and for the owner if it is a method."""
-        if not isinstance(node, ast.Attribute):
-            function = self.of(node)
-            return lambda scope: (function(scope), ())
-        name, owner, entry = node.attr, self.of(node.value), self._entry(node)
-
-        def find(scope: Scope) -> tuple[object, tuple[object, ...]]:
-            target = owner(scope)
-            method = METHODS.get(type(target), {}).get(name)
-            return (entry(target), ()) if method is None else (Function(name, method), (target,))
-
-        return find
-
-    def _list(self, node: ast.List) -> Node:
-        items = self._items(node.elts)
-        return lambda scope: scope.result([_data(item) for item in items(scope)])
-
-    def _tuple(self, node: ast.Tuple) -> Node:
-        items = self._items(node.elts)
-        return lambda scope: scope.result(tuple(map(_data, items(scope))))
-
-    def _dict(self, node: ast.Dict) -> Node:
-        entries = [
-            (None if key is None else self.of(key), self.of(value))
-            for key, value in zip(node.keys, node.values, strict=True)
-        ]
-
-        def build(scope: Scope) -> object:
-            result: dict[object, object] = {}
-            for key, value in entries:
-                if key is None:
-                    result.update(_charged(value(scope), scope))
-                else:
-                    result[key(scope)] = _data(value(scope))
-            return scope.result(result)
-
-        return build
-
-    def _listcomp(self, node: ast.ListComp | ast.GeneratorExp) -> Node:
-        element = self.of(node.elt)
-        rounds = [self._round(generator) for generator in node.generators]
-
-        def walk(scope: Scope, depth: int) -> Iterator[object]:
-            if depth == len(rounds):
-                yield _data(element(scope))
-                return
-            names, items, tests = rounds[depth]
-            for item in _charged(items(scope), scope):
-                scope.spend(1)
-                scope.inner.update(names(item))
-                if all(test(scope) for test in tests):
-                    yield from walk(scope, depth + 1)
-
-        def build(scope: Scope) -> object:
-            outer = scope.inner
-            scope.inner = dict(outer)
-            try:
-                return scope.result(list(walk(scope, 0)))
-            finally:
-                scope.inner = outer
-
-        return build
-
-    _generatorexp = _listcomp
-
-    def _round(
-        self, generator: ast.comprehension
-    ) -> tuple[Callable[[Value], dict[str, object]], Node, list[Node]]:
-        """Translate ``for ... in ... if ...``: variables of an item, the items, the conditions."""
-        target = generator.target
-        targets = target.elts if isinstance(target, ast.Tuple) else [target]
-        names = [name.id for name in targets if isinstance(name, ast.Name)]
-        if len(names) != len(targets) or generator.is_async:
-            raise self.refused(target)
-
-        def named(item: Value) -> dict[str, object]:
-            values = (item,) if isinstance(target, ast.Name) else tuple(item)
-            if len(values) != len(names):
-                raise ValueError(f"{len(names)} names for {len(values)} values")
-            return dict(zip(names, values, strict=True))
-
-        return named, self.of(generator.iter), [self.of(test) for test in generator.ifs]
-
-    def _items(self, nodes: list[ast.expr]) -> Callable[[Scope], Iterator[Value]]:
-        """Translate elements or arguments, some of them starred."""
-        items = [
-            (self.of(node.value), True) if isinstance(node, ast.Starred) else (self.of(node), False)
-            for node in nodes
-        ]
-
-        def values(scope: Scope) -> Iterator[Value]:
-            for item, starred in items:
-                if starred:
-                    yield from _charged(item(scope), scope)
-                else:
-                    yield item(scope)
-
-        return values
+    def _rounds(self, node: ast.ListComp | ast.GeneratorExp, depth: int) -> Iterator[object]:
+        if depth == len(node.generators):
+            yield _data(self.value(node.elt))
+            return
+        generator = node.generators[depth]
+        for item in self._charged(self.value(generator.iter)):
+            self._spend(1)
+            self._inner.update(_variables(generator.target, item))
+            if all(self.value(test) for test in generator.ifs):
+                yield from self._rounds(node, depth + 1)
 
 
-def _keywords(keywords: list[tuple[str | None, Node]], scope: Scope) -> dict[str, object]:
-    named: dict[str, object] = {}
-    for name, value in keywords:
-        named.update(_charged(value(scope), scope) if name is None else {name: value(scope)})
-    return named
+def _entry(names: Mapping[str, object], name: str) -> object:
+    try:
+        return names[name]
+    except KeyError:
+        raise NameError(f"name {name!r} is not defined", name=name) from None
 
 
-def _call_function(
-    scope: Scope, function: Function, operands: list[Value], named: dict[str, Value]
-) -> object:
-    """Call a function; its operands and its result count as work."""
-    scope.spend(1)
-    for operand in (*operands, *named.values()):
-        if not (function.applies and isinstance(operand, Function)):
-            _charged(operand, scope)
-    if not function.applies:
-        return scope.result(function.call(*operands, **named))
+def _variables(target: ast.expr, item: Value) -> dict[str, object]:
+    """Return the variables of a comprehension for an item."""
+    if isinstance(target, ast.Name):
+        return {target.id: item}
+    names, values = _targets(target), tuple(item)
+    if len(values) != len(names):
+        raise ValueError(f"{len(names)} names for {len(values)} values")
+    return dict(zip(names, values, strict=True))
 
-    def apply(inner: object, *items: object) -> object:
-        if not isinstance(inner, Function) or inner.applies:
-            raise TypeError(f"{function} applies one of the listed functions")
-        return _call_function(scope, inner, list(items), {})
 
-    return scope.result(function.call(apply, *operands, **named))
+def _targets(target: ast.expr) -> list[str | None]:
+    """Return the names of a comprehension's variables; None for anything else."""
+    targets = target.elts if isinstance(target, ast.Tuple) else [target]
+    return [name.id if isinstance(name, ast.Name) else None for name in targets]
 
 
 def _data(value: Value) -> Value:
@@ -616,47 +542,82 @@ def _data(value: Value) -> Value:
     return value
 
 
-def _charged(value: Value, scope: Scope) -> Value:
-    """Return a value unchanged if it is data; reading all of it counts as work."""
-    if type(value) not in _NUMBERS:
-        scope.spend(size_of(_data(value)))
-    return value
-
-
 MAX_LENGTH = 10_000  # longest expression [characters]
+MAX_DEPTH = 200  # deepest nesting of an expression; a sum of 200 terms has it
 
 _ORIGIN = "<expression>"
 _PARSING = threading.Lock()  # held while Python's warnings are off: they are those of all threads
 
 
 class Expression:
-    """A translated expression; it can be evaluated for any values of its names."""
+    """A parsed expression; it can be evaluated for any values of its names."""
 
     def __init__(self, text: str) -> None:
-        """Translate."""
+        """Parse, and require that every node is allowed."""
         if len(text) > MAX_LENGTH:
             raise RefusedError(f"an expression is longer than {MAX_LENGTH} characters")
         try:
             with _PARSING, warnings.catch_warnings():  # of texts such as ``2if x else 3``
                 warnings.simplefilter("ignore")
-                tree = ast.parse(text, _ORIGIN, "eval")
-            self._node = Translation(text).of(tree.body)
+                self._tree = ast.parse(text, _ORIGIN, "eval").body
         except (MemoryError, RecursionError) as error:
             raise RefusedError("an expression is nested too deeply") from error
         except ValueError as error:
             raise RefusedError(str(error)) from error
+        self._text = text
+        level: list[ast.AST] = [self._tree]
+        for _ in range(MAX_DEPTH):
+            for node in level:
+                _require_allowed(node, text)
+            level = [child for node in level for child in ast.iter_child_nodes(node)]
+        if level:
+            raise RefusedError("an expression is nested too deeply")
 
     def evaluate(
         self, names: Mapping[str, object], inner: Mapping[str, object] | None = None
     ) -> object:
         """Return the value of the expression."""
-        value = self._node(Scope(names, dict(inner or {})))
+        value = _Evaluation(self._text, names, inner).value(self._tree)
         if isinstance(value, Function) or (isinstance(value, dict) and type(value) is not dict):
             raise RefusedError("its value is a function or namespace, not data")
         return value
 
 
+def _require_allowed(node: ast.AST, text: str) -> None:
+    is_allowed = isinstance(node, _ALLOWED)
+    if isinstance(node, ast.Constant):
+        is_allowed = type(node.value) in _SCALARS and checked(node.value) == node.value
+    elif isinstance(node, ast.Attribute):
+        is_allowed = not node.attr.startswith("__")
+    elif isinstance(node, ast.comprehension) and (node.is_async or None in _targets(node.target)):
+        node, is_allowed = node.target, False
+    if not is_allowed:
+        raise _refused(node, text)
+
+
+def _refused(node: ast.AST, text: str) -> RefusedError:
+    """Return the error for a construct that is not allowed."""
+    source = ast.get_source_segment(text, node) or text
+    return RefusedError(f"{type(node).__name__} {source[:80]!r} is not allowed")
+
+
 @lru_cache(maxsize=4096)
 def expression(text: str) -> Expression:
-    """Return a translated expression; memoised."""
+    """Return a parsed expression; memoised."""
     return Expression(text)
+
+
+def evaluate_number(text: str, values: Mapping[str, float]) -> float:
+    """Return the number that an expression is, such as ``length / 2``.
+
+    It may use xacro's functions (``pi``, ``sin``, ``max``, ``radians``, ...).
+    """
+    try:
+        result = expression(text.strip()).evaluate({**NAMES, **values})
+    except MALFORMED as error:
+        reason = shortened(" ".join(f"{error or type(error).__name__}".split()), MAX_REASON)
+        hint = nearest(error.name, values) if isinstance(error, NameError) and error.name else ""
+        raise FormatError(f"{text!r}: {reason}{hint}") from error
+    if isinstance(result, bool) or not isinstance(result, int | float) or not math.isfinite(result):
+        raise FormatError(f"{text!r} is {result!r}, not a finite number")
+    return float(result)

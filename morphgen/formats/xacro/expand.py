@@ -6,7 +6,6 @@ import contextlib
 import importlib.util
 import json
 import logging
-import math
 import re
 import signal
 import subprocess
@@ -16,9 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from glob import glob
 from importlib import import_module
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 from xml.dom import expatbuilder, minidom
 from xml.parsers.expat import ExpatError
@@ -30,10 +28,11 @@ from morphgen.errors import MALFORMED, FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes, yaml_problem
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro.evaluator import (
-    BUILTINS,
-    MATH,
+    MAX_REASON,
     MAX_SIZE,
+    NAMES,
     Function,
+    Namespace,
     RefusedError,
     expression,
     size_of,
@@ -155,47 +154,8 @@ MAX_ELEMENTS = 50_000  # largest number of elements that an expansion may proces
 MAX_TEXT = 20_000_000  # largest text that the substitutions of an expansion may create [characters]
 
 _NAME = "morphgen.formats._xacro"
-_READERS = ("parse", "load_yaml", "list_files", "eval_extension")
-"""Functions of the module through which a document accesses files; the caller sets them."""
 _log = logging.getLogger("morphgen.formats.xacro.expand")
-_per_thread = threading.local()
-
-
-def thread_engine() -> Engine:
-    """Return this thread's copy of the ``xacro`` module, reset to its initial state.
-
-    Differences from the package: an allow-list evaluates expressions, the number of elements and
-    the size of text are bounded, ``node`` is the element being processed, and warnings go to the
-    logger ``morphgen.formats.xacro.expand`` (level INFO) instead of the terminal.
-    """
-    if not hasattr(_per_thread, "engine"):
-        _per_thread.engine = _fresh_module()
-    engine = _per_thread.engine
-    engine.init_stacks(None)
-    engine.all_includes = []
-    engine.substitution_args_context = {}
-    engine.verbosity = 0
-    engine.node = None
-    for name in _READERS:  # the readers of the last expansion must not remain
-        setattr(engine, name, _refuse_access)
-    engine.elements = engine.text = 0
-    engine._global_symbols = _symbols(engine)
-    return engine
-
-
-def _fresh_module() -> Engine:
-    module: Engine = ModuleType(_NAME)
-    module.__package__ = _NAME
-    module.__path__ = sys.modules[_NAME].__path__
-    module.print = _record
-    exec(_BODY, module.__dict__)
-    module.eval_text = _shortcut(module)
-    module.safe_eval = _safe_eval
-    module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
-    module.eval_all = _counting(module)
-    for name in ("handle_macro_call", "process_include", "check_attrs", "reqd_attrs"):
-        setattr(module, name, _returning(module, getattr(module, name)))
-    return module
+_LOCK = threading.RLock()  # held by an expansion: the state of xacro is that of its module
 
 
 def _safe_eval(
@@ -253,11 +213,6 @@ def _returning(engine: Engine, function: Callable[..., object]) -> Callable[...,
 def _symbols(engine: Engine) -> dict[str, object]:
     """Return the names that every document may use, with and without a namespace."""
 
-    def space(members: Mapping[str, object]) -> object:
-        names = engine.NameSpace()
-        dict.update(names, members)
-        return names
-
     def fatal(*words: object) -> None:
         raise engine.XacroException(" ".join(map(str, words)))
 
@@ -280,12 +235,9 @@ def _symbols(engine: Engine) -> dict[str, object]:
     }
     functions = {name: Function(name, call) for name, call in calls.items()}
     return {
-        **MATH,
-        **BUILTINS,
+        **NAMES,
         **{name: functions[name] for name in files},
-        "math": space(MATH),
-        "python": space(BUILTINS),
-        "xacro": space(functions),
+        "xacro": Namespace(functions),
     }
 
 
@@ -296,38 +248,44 @@ def _same(dictionary: dict[str, object]) -> dict[str, object]:
     return dictionary
 
 
-def _refuse_access(*_: object) -> object:
-    raise RefusedError("files and substitutions are not available here")
-
-
 def _record(*words: object, **_: object) -> str:
     _log.info(" ".join(map(str, words)))
     return ""
 
 
-def _load_package() -> CodeType:
-    """Import the package's modules under the private name and return its compiled body."""
+def _load_engine() -> Engine:
+    """Import a copy of the ``xacro`` module under a private name.
+
+    Differences from the package: an allow-list evaluates expressions, the number of elements and
+    the size of text are bounded, ``node`` is the element being processed, and warnings go to the
+    logger ``morphgen.formats.xacro.expand`` (level INFO) instead of the terminal.
+    """
     spec = importlib.util.find_spec("xacro")
-    if spec is None or not isinstance(spec.loader, SourceFileLoader):
+    if spec is None or spec.origin is None:
         raise ModuleNotFoundError("morphgen needs the package xacro: pip install xacro")
     private = importlib.util.spec_from_file_location(
         _NAME, spec.origin, submodule_search_locations=list(spec.submodule_search_locations or ())
     )
     assert private is not None
     assert private.loader is not None
-    module = importlib.util.module_from_spec(private)
+    module: Engine = importlib.util.module_from_spec(private)
     sys.modules[_NAME] = module
+    module.print = _record
     writer = minidom.Element.writexml
     private.loader.exec_module(module)
     # The import of xacro 2.1.1 replaces minidom's writer for the whole process.
     minidom.Element.writexml = writer  # type: ignore[method-assign]
     sys.modules[f"{_NAME}.color"].print = _record  # type: ignore[attr-defined]
-    body = spec.loader.get_code("xacro")
-    assert body is not None
-    return body
+    module.eval_text = _shortcut(module)
+    module.safe_eval = _safe_eval
+    module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
+    module.eval_all = _counting(module)
+    for name in ("handle_macro_call", "process_include", "check_attrs", "reqd_attrs"):
+        setattr(module, name, _returning(module, getattr(module, name)))
+    return module
 
 
-_BODY = _load_package()
+_ENGINE = _load_engine()
 
 
 CPU_LIMIT = 8  # longest computation of an expansion [s of CPU time]
@@ -456,7 +414,6 @@ def limit_process(cpu: int, memory: int) -> None:
 
 
 MAX_INCLUDE_DEPTH = 40  # deepest nesting of includes; deeper ones are taken for a loop
-MAX_REASON = 400  # longest reason in an error [characters]; expressions can be long
 
 _COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
 _FAULTS = (*MALFORMED, ExpatError)
@@ -497,26 +454,6 @@ def expand_here(path: Path, finder: PackageFinder, args: Mapping[str, str]) -> s
     return Expansion(args, path, finder).run_file().decode()
 
 
-def evaluate(expression: str, values: Mapping[str, float]) -> float:
-    """Evaluate a text with ``${...}`` to a number.
-
-    expression: Such as ``"0.5"`` or ``"${length / 2}"``, with xacro's functions (``pi``,
-        ``sin``, ``max``, ``radians``, ...).
-    """
-    engine = thread_engine()
-    engine.eval_extension = _no_substitution
-    symbols = engine.Table(engine._global_symbols)
-    dict.update(symbols, values)
-    try:
-        result = symbols._eval_literal(engine.eval_text(expression, symbols))
-    except (engine.XacroException, *_FAULTS) as error:
-        hint = _unknown_name_hint(error, values)
-        raise FormatError(f"{expression!r}: {_reason(error)}{hint}") from error
-    if isinstance(result, bool) or not isinstance(result, int | float) or not math.isfinite(result):
-        raise FormatError(f"{expression!r} is {result!r}, not a finite number")
-    return float(result)
-
-
 class Expansion:
     """State of one expansion: its arguments, and the arguments that the files read declare."""
 
@@ -526,16 +463,13 @@ class Expansion:
         origin: Path,
         finder: PackageFinder,
         objects: Mapping[str, object] | None = None,
+        functions: Mapping[str, Function] | None = None,
         *,
         installed_only: bool = False,
     ) -> None:
-        """Prepare."""
-        self.engine = thread_engine()
-        self.engine.parse = self._parse_include
-        self.engine.load_yaml = self._load_yaml
-        self.engine.list_files = self._list_files
-        self.engine.eval_extension = self._substitute
-        self.objects = dict(objects or {})
+        """Prepare; objects stand for arguments, and functions replace those of expressions."""
+        self.engine = _ENGINE
+        self.objects, self.functions = dict(objects or {}), dict(functions or {})
         self.given = {name: str(value) for name, value in args.items()}
         self.arguments = _Arguments(self.engine.XacroException, self.given)
         self.declared: set[str] = set()
@@ -551,8 +485,8 @@ class Expansion:
 
     def run(self, data: bytes) -> bytes:
         """Expand a document in place of the file's content."""
-        self.engine.init_stacks(str(self.origin))
-        with self._located():
+        with _LOCK, self._located():
+            self._reset_engine()
             document = self._parse(data, str(self.origin))
             self.engine.process_doc(document, mappings=self.arguments)
             known = self.declared | self.arguments.used
@@ -560,6 +494,16 @@ class Expansion:
                 if name not in known:
                     raise FormatError(f"{self.origin}: no argument {name!r}{nearest(name, known)}")
             return document_text(document).encode()
+
+    def _reset_engine(self) -> None:
+        engine = self.engine
+        engine.parse, engine.load_yaml = self._parse_include, self._load_yaml
+        engine.list_files, engine.eval_extension = self._list_files, self._substitute
+        engine.all_includes, engine.substitution_args_context = [], {}
+        engine.verbosity = engine.elements = engine.text = 0
+        engine.node = None
+        engine._global_symbols = _symbols(engine) | self.functions
+        engine.init_stacks(str(self.origin))
 
     @contextmanager
     def _located(self) -> Iterator[None]:
@@ -660,10 +604,6 @@ class _Arguments(dict[str, str]):
         return super().__getitem__(name)
 
 
-def _no_substitution(text: str) -> str:
-    raise ValueError(f"{text} is not valid here")
-
-
 def _reason(error: BaseException) -> str:
     """Return the innermost error in one line; xacro wraps it once for each expression."""
     suffix = ""
@@ -675,11 +615,3 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
     return shortened(" ".join(f"{error or type(error).__name__} {suffix}".split()), MAX_REASON)
-
-
-def _unknown_name_hint(error: BaseException | None, values: Mapping[str, float]) -> str:
-    while error is not None:
-        if isinstance(error, NameError) and error.name:
-            return nearest(error.name, values)
-        error = error.__context__
-    return ""
