@@ -15,7 +15,6 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -261,27 +260,24 @@ def _is_barely_begun(config: SetConfig) -> bool:
     return config.folder.is_dir() and first_files >= set(config.folder.iterdir())
 
 
-def _finished(config: SetConfig) -> dict[int, tuple[Path, int]]:
-    """Return the location (file, offset) of each finished robot's record, by index.
+def _finished(config: SetConfig) -> dict[int, bytes]:
+    """Return the line of the record of each finished robot, by index.
 
-    A line cut short by an interruption is ignored. Records stay on disk, so that the size of a set
-    is not limited by memory. Partial folders of interrupted robots are deleted.
+    A line cut short by an interruption is ignored. Partial folders of interrupted robots are
+    deleted.
     """
-    locations = {}
+    finished = {}
     for path in (config.folder / INDEX, config.folder / JOURNAL):
-        if not path.is_file():
-            continue
-        offset = 0
-        with path.open("rb") as lines:
-            for line in lines:
-                record = _parse_record(line)
-                if record and (config.folder / record["name"] / URDF).is_file():
-                    locations[record["index"]] = (path, offset)
-                offset += len(line)
+        if path.is_file():
+            with path.open("rb") as lines:
+                for line in lines:
+                    record = _parse_record(line)
+                    if record and (config.folder / record["name"] / URDF).is_file():
+                        finished[record["index"]] = line
     for leftover in config.folder.glob(".*.*"):
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
-    return locations
+    return finished
 
 
 def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
@@ -289,24 +285,13 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     rejected: Counter[str] = Counter()
     first_names: dict[str, str] = {}  # name of the first robot of each derivation, by hash
     duplicates = []
-    partial = partial_path(config.folder / INDEX)
-    locations = _finished(config)
-    with ExitStack() as stack:
-        sources = {path for path, _ in locations.values()}
-        files = {path: stack.enter_context(path.open("rb")) for path in sources}
-        stack.enter_context(naming(config.folder / INDEX))
-        index = stack.enter_context(partial.open("wb"))
-        for number in sorted(locations):
-            path, offset = locations[number]
-            files[path].seek(offset)
-            line = files[path].readline()
-            index.write(line)
-            record = json.loads(line)
-            rejected.update(record["rejected"])
-            first = first_names.setdefault(record["hash"], record["name"])
-            if first != record["name"]:
-                duplicates.append((record["name"], first))
-    partial.replace(config.folder / INDEX)
+    lines = [line for _, line in sorted(_finished(config).items())]
+    write_atomic(config.folder / INDEX, b"".join(lines))
+    for record in map(json.loads, lines):
+        rejected.update(record["rejected"])
+        first = first_names.setdefault(record["hash"], record["name"])
+        if first != record["name"]:
+            duplicates.append((record["name"], first))
     return SetReport(made, kept, dict(rejected), duplicates)
 
 
