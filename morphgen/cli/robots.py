@@ -58,7 +58,7 @@ def compose(args: argparse.Namespace) -> int:
         derivation, name = parse_words(args.words, library)
         robot = compose(derivation, library, name if args.name is None else args.name)
     if args.geometry != "mesh":
-        from morphgen.fitting.replace_collision import with_geometry
+        from morphgen.fitting.collision_geometry import with_geometry
 
         with bar(args, "replacing collision meshes", "shape"):
             robot = with_geometry(robot, args.geometry, library.folders)

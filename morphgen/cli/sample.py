@@ -285,7 +285,7 @@ def mutate(args: argparse.Namespace) -> None:
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
     """Return the URDF that a derivation gives, as in a bundle or in a light set."""
-    from morphgen.fitting.replace_collision import with_geometry
+    from morphgen.fitting.collision_geometry import with_geometry
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
     from morphgen.grammar.robot_set import light_urdf

@@ -1,4 +1,4 @@
-"""Replace the collision shapes of a robot: by fitted primitives, convex pieces or spheres."""
+"""Replace the collision shapes of a robot: by fitted primitives, or by spheres alone."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 from platformdirs import user_cache_path
 
 from morphgen.checks.self_collision import survey_collisions
-from morphgen.errors import FitError, FormatError, nearest
+from morphgen.errors import FitError, FormatError
 from morphgen.formats.fits import (
     FITTER_VERSION,
     find_fit,
@@ -31,30 +31,12 @@ from morphgen.model.robot import Link, Robot
 if TYPE_CHECKING:
     from morphgen.fitting.link_fit import FitOptions
 
-Geometry = Literal["mesh", "primitive", "convex", "sphere"]
-"""Collision shapes of a robot. ``mesh``: those of its parts, with meshes whose hulls simulators
-collide. In place of meshes, ``primitive``: fitted boxes, cylinders and spheres; ``convex``: convex
-pieces. ``sphere``: spheres in place of all shapes."""
-GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
 SPHERES = 8
 """Default number of spheres per link."""
 _SPHERE_CACHE = "spheres-1"
 """Folders in the cache begin so; the number rises when the same shapes get other spheres."""
 _CACHE = f"fits-{FITTER_VERSION}"  # folder of the fits in the user's cache
 _LOGGER = logging.getLogger(__name__)
-
-
-def with_geometry(robot: Robot, geometry: str, folders: Sequence[Path]) -> Robot:
-    """Return the robot with the collision shapes of a geometry."""
-    if geometry not in GEOMETRIES:
-        raise FitError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
-    if geometry == "primitive":
-        return as_primitives(robot, folders)
-    if geometry == "convex":
-        from morphgen.fitting.convex_pieces import as_convex  # which imports this module
-
-        return as_convex(robot, folders)
-    return as_spheres(robot, folders) if geometry == "sphere" else robot
 
 
 def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
