@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,20 +109,34 @@ def audit_survey(
         *_regime_findings(survey, library),
         *_bound_findings(survey),
     ]
-    remaining = tuple(finding for finding in findings if finding.code not in split.accepted)
-    accepted = tuple(
-        (finding, split.accepted[finding.code])
-        for finding in findings
-        if finding.code in split.accepted
-    )
+    return conclude(split, findings, tuple(_neighbours(survey)))
+
+
+def conclude(
+    split: Split,
+    findings: Sequence[Finding],
+    neighbours: tuple[Neighbour, ...],
+    not_audited: Collection[str] = (),
+) -> Audit:
+    """Return an audit from all findings: those that the split accepts are set apart.
+
+    not_audited: Codes that may be accepted although nothing looked for them.
+    """
     codes = {finding.code for finding in findings}
     why = "the split accepts it, but nothing of that code is found"
-    unused = tuple(
+    unused = (
         Finding("accepted-unused", "warning", f"accepted {code}", why, "delete the entry")
         for code in split.accepted
-        if code not in codes
+        if code not in codes and code not in not_audited
     )
-    return Audit(split.name, (*remaining, *unused), accepted, tuple(_neighbours(survey)))
+    remaining = (finding for finding in findings if finding.code not in split.accepted)
+    accepted = (finding for finding in findings if finding.code in split.accepted)
+    return Audit(
+        split.name,
+        (*remaining, *unused),
+        tuple((finding, split.accepted[finding.code]) for finding in accepted),
+        neighbours,
+    )
 
 
 def _robot_findings(survey: SplitSurvey) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.audit import Audit
+from morphgen.benchmark.audit import Audit, conclude
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
@@ -56,7 +56,6 @@ _FIXES = {
     "goals-shared": "leave the robot out of one side, or accept it with a reason",
     "goals-repeated": "take another --goal-seed, or accept it with a reason",
 }
-CODES = frozenset(_FIXES)
 
 EXACT = 1e-6  # largest difference between numbers of a set and those of the same set sampled anew
 NEAR = 1e-3  # distance below which positions of goals or blocks are the same [m]
@@ -107,22 +106,14 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
 
     A task that is unknown here is found, too: error ``task-unknown``.
     """
-    codes = CODES if findings is None else {finding.code for finding in findings}
-    more: list[Finding] = []
+    found = [finding for finding in audit.findings if finding.code != "accepted-unused"]
+    found += [finding for finding, _ in audit.accepted]
     for side, member in sided_members(split):
         if member.task not in TASKS:
             reason = f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}"
-            more.append(_finding("task-unknown", side, member.name, reason))
-    more += findings or ()
-    used_acceptances = {f"accepted {code}" for code in codes}
-    remaining = [
-        finding
-        for finding in audit.findings
-        if not (finding.code == "accepted-unused" and finding.where in used_acceptances)
-    ]
-    remaining += [finding for finding in more if finding.code not in split.accepted]
-    accepted = [(each, split.accepted[each.code]) for each in more if each.code in split.accepted]
-    return replace(audit, findings=tuple(remaining), accepted=(*audit.accepted, *accepted))
+            found.append(_finding("task-unknown", side, member.name, reason))
+    not_audited = _FIXES if findings is None else ()
+    return conclude(split, [*found, *(findings or ())], audit.neighbours, not_audited)
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+import yaml
+
 from morphgen.benchmark.regimes import NOTHING
+from morphgen.benchmark.texts import read_text
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.splits.split import SIDES, Split
 
-NON_COMMERCIAL, NO_DERIVATIVES, UNKNOWN = "non-commercial", "no derivatives", "unknown"
-SHARE_ALIKE = "share-alike"
+UNKNOWN = "unknown"  # restriction of a licence that is not listed
 _SPDX = "https://spdx.org/licenses/{}.html"
 
 
@@ -24,8 +27,12 @@ class Licence:
     id: str
     """Identifier in part manifests: SPDX, or ``LicenseRef-...`` for one that SPDX does not list."""
     restrictions: tuple[str, ...] = ()
-    """Restrictions that a release needs permission for: ``NON_COMMERCIAL`` and so on."""
-    is_spdx: bool = True  # whether SPDX lists the identifier
+    """Restrictions that a release needs permission for, such as ``non-commercial``."""
+
+    @property
+    def is_spdx(self) -> bool:
+        """Whether SPDX lists the identifier."""
+        return self.id in known_licences() and not self.id.startswith("LicenseRef-")
 
     @property
     def url(self) -> str:
@@ -40,24 +47,6 @@ class Licence:
         if UNKNOWN in self.restrictions:
             return "unknown"
         return self.id.lower().removesuffix("-only").removesuffix("-or-later")
-
-
-_PERMISSIVE = ("MIT", "BSD-2-Clause", "BSD-3-Clause", "Apache-2.0", "MPL-2.0", "CC0-1.0")
-_SHARED = ("CC-BY-4.0", "CC-BY-SA-4.0", "ISC", "GPL-3.0-only", "GPL-3.0-or-later")
-LICENCES: Mapping[str, Licence] = {
-    licence.id: licence
-    for licence in (
-        *map(Licence, (*_PERMISSIVE, *_SHARED)),
-        Licence("LicenseRef-BSD", is_spdx=False),  # BSD; the source does not say which version
-        Licence("CC-BY-NC-4.0", (NON_COMMERCIAL,)),
-        # A release may hold parts that are share-alike only: it keeps each part's licence.
-        Licence("CC-BY-NC-SA-4.0", (NON_COMMERCIAL, SHARE_ALIKE)),
-        Licence("CC-BY-ND-4.0", (NO_DERIVATIVES,)),
-        Licence("CC-BY-NC-ND-4.0", (NON_COMMERCIAL, NO_DERIVATIVES)),
-        Licence("LicenseRef-unknown", (UNKNOWN,), is_spdx=False),
-    )
-}
-"""Known licences by identifier: those of the library, and others that parts often have."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +71,16 @@ class LicencedPart:
         }
 
 
+@cache
+def known_licences() -> Mapping[str, tuple[str, ...]]:
+    """Return the restrictions of the licences in ``licences.yaml`` by identifier."""
+    table = yaml.safe_load(read_text("licences.yaml"))
+    return {identifier: tuple(restrictions) for identifier, restrictions in table.items()}
+
+
 def find_licence(identifier: str) -> Licence:
-    """Return a licence by its identifier; one that is not in ``LICENCES`` counts as unknown."""
-    return LICENCES.get(identifier, Licence(identifier, (UNKNOWN,), is_spdx=False))
+    """Return a licence by its identifier; one that is not known counts as restricted."""
+    return Licence(identifier, known_licences().get(identifier, (UNKNOWN,)))
 
 
 def licenced_parts(split: Split, library: Library) -> tuple[LicencedPart, ...]:

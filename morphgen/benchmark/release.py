@@ -32,10 +32,10 @@ from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids,
 from morphgen.benchmark.split_folder import (
     ROBOTS_FILE,
     is_archive,
-    read_template,
     require_split_folder,
 )
 from morphgen.benchmark.survey import RobotDifficulty, difficulty_table
+from morphgen.benchmark.texts import read_text
 from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.records import Record, read_record
@@ -158,7 +158,7 @@ def croissant_text(
     split: Split, release: Release, licences: Sequence[str], sums: Mapping[str, str]
 ) -> str:
     """Return the text of ``croissant.json``, whose template describes all files that may exist."""
-    data: dict[str, Any] = json.loads(read_template(CROISSANT_FILE))
+    data: dict[str, Any] = json.loads(read_text(CROISSANT_FILE))
     distribution, records = data.pop("distribution"), data.pop("recordSet")
     data |= {
         "name": release.stem,
@@ -219,7 +219,7 @@ def card_text(
     absent = {"goals", SCORES_FILE, SUBMISSIONS_DIR} - present
     template = "".join(
         line
-        for line in read_template("release_card.md").splitlines(keepends=True)
+        for line in read_text("release_card.md").splitlines(keepends=True)
         if not line.startswith(tuple(f"| `{name}` |" for name in absent))
     )
     text = Template(template).substitute(

@@ -22,7 +22,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
-from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from string import Template
@@ -33,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.survey import robot_stats
+from morphgen.benchmark.texts import read_text as package_text
 from morphgen.checks import check
 from morphgen.encoding.tokens import (
     LAYOUT_ARRAYS,
@@ -304,7 +304,7 @@ def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
 
 def readme_text(split: Split, settings: BuildSettings) -> str:
     """Return the text of ``README.md``."""
-    return Template(read_template("split_readme.md")).substitute(
+    return Template(package_text("split_readme.md")).substitute(
         name=split.name,
         summary=split.summary or "(no summary)",
         regime=split.regime,
@@ -314,11 +314,6 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
         bundle=_LIGHT if settings.light else _BUNDLE,
         sums=SUMS_FILE,
     )
-
-
-def read_template(name: str) -> str:
-    """Return a template of a file that a split folder or a release has."""
-    return (files("morphgen.benchmark") / "texts" / name).read_text(encoding="utf-8")
 
 
 def sums_text(sums: Mapping[str, str]) -> str:

@@ -9,14 +9,15 @@ import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from types import MappingProxyType
+from functools import cache, partial
 from typing import Literal, TypeAlias
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from tabulate import tabulate
 
+from morphgen.benchmark.texts import read_text
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import MEASURES, Features, features, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError, nearest
@@ -250,22 +251,15 @@ class PaperRow:
     cosine: float  # cosine similarity, over pairs of a test and a train robot
 
 
-PAPER: Mapping[str, PaperRow] = MappingProxyType(
-    {
-        "interpolation/arm3": PaperRow("Arm-3", 10, 9, 4, 0.80),
-        "interpolation/panda": PaperRow("Panda", 11, 9, 7, 0.76),
-        "composition/ee-arm": PaperRow("EE Arm", 8.5, 5.9, 5.6, 0.47),
-        "composition/ee-task": PaperRow("EE-Task", 7.75, 5.25, None, 0.49),
-        "extrapolation/primitives": PaperRow("Primitives", 6.60, 4.60, 4.60, 0.45),
-        "extrapolation/arms": PaperRow("Robot Arms", 14.70, 8.5, 6.6, 0.42),
-    }
-)
-"""Rows of the paper's table by set of robots, which is a scenario's name without its task."""
-
-
 def paper_row(split: str) -> PaperRow | None:
     """Return the paper's row for a scenario such as ``extrapolation/arms/reach``, if it has one."""
-    return PAPER.get("/".join(split.split("/")[:2]))
+    return paper_rows().get("/".join(split.split("/")[:2]))
+
+
+@cache
+def paper_rows() -> Mapping[str, PaperRow]:
+    """Return the paper's rows by set of robots, which is a scenario's name without its task."""
+    return {key: PaperRow(**row) for key, row in yaml.safe_load(read_text("paper.yaml")).items()}
 
 
 DIFFICULTY_DIGITS = 6
@@ -415,25 +409,24 @@ def difficulty_csv(rows: Sequence[RobotDifficulty], baselines: Sequence[str] = (
     The same rows give the same text. Cells without a value are empty.
     """
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     results = (f"{name}_{key}" for name in baselines for key in ("score", "success"))
-    writer.writerow((*STRUCTURAL, *results))
-    for row in rows:
-        cells = [*structural_cells(row)]
-        for name in baselines:
-            result = row.baselines.get(name)
-            cells += ["", ""] if result is None else map(_number, (result.score, result.success))
-        writer.writerow(cells)
+    columns = (*STRUCTURAL, *results)
+    writer = csv.DictWriter(text, columns, "", extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(map(difficulty_cells, rows))
     return text.getvalue()
 
 
-def structural_cells(row: RobotDifficulty) -> Iterator[str]:
-    """Yield the cells of ``STRUCTURAL`` as they are in the CSV table."""
-    yield from (row.split, row.side, row.robot, row.task, str(row.obstacles).lower())
-    yield from (str(row.movable_to_tool), str(row.links), _number(row.reach))
-    for measure in MEASURES:
-        nearest = row.nearest.get(measure)
-        yield from ("", "") if nearest is None else (nearest.train, _number(nearest.value))
+def difficulty_cells(row: RobotDifficulty) -> dict[str, str]:
+    """Return the cells of a robot in the CSV table by column, without empty ones."""
+    cells = {key: str(getattr(row, key)) for key in ("split", "side", "robot", "task")}
+    cells |= {"obstacles": str(row.obstacles).lower(), "reach": _number(row.reach)}
+    cells |= {key: str(getattr(row, key)) for key in ("movable_to_tool", "links")}
+    for measure, found in row.nearest.items():
+        cells |= {nearest_column(measure): found.train, measure: _number(found.value)}
+    for name, result in row.baselines.items():
+        cells |= {f"{name}_{key}": _number(value) for key, value in vars(result).items()}
+    return cells
 
 
 def _number(value: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -47,8 +47,8 @@ from morphgen.benchmark.survey import (
     Fault,
     RobotDifficulty,
     SplitSurvey,
+    difficulty_cells,
     nearest_column,
-    structural_cells,
     survey_difficulty,
     survey_split,
     train_similarity,
@@ -117,21 +117,22 @@ def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
     if any(isinstance(each, Fault) or each.robot_hash != m.robot_hash for m, each in pairs):
         return  # robots differ from the split: the caller of this module lists them
     try:
-        header, *lines = csv.reader(read_text(path).splitlines() or [""])
+        lines = csv.DictReader(read_text(path).splitlines())
+        columns, found = tuple(lines.fieldnames or ()), list(lines)
     except (MorphgenError, OSError, csv.Error) as error:
         yield f"cannot be read: {error}"
         return
-    if tuple(header[: len(STRUCTURAL)]) != STRUCTURAL:
+    if columns[: len(STRUCTURAL)] != STRUCTURAL:
         yield f"it has other columns; expected {', '.join(STRUCTURAL)}"
         return
     rows = survey_difficulty(survey)
-    if len(lines) != len(rows):
-        yield f"it has {len(lines)} robots, not {len(rows)}"
+    if len(found) != len(rows):
+        yield f"it has {len(found)} robots, not {len(rows)}"
         return
     names = [member.name for member in split.train]
-    for i, (line, row) in enumerate(zip(lines, rows, strict=True)):
-        if len(line) != len(header):
-            yield f"line {i + 2} has {len(line)} cells, not {len(header)}"
+    for i, (line, row) in enumerate(zip(found, rows, strict=True)):
+        if None in line or None in line.values():  # what `DictReader` has for too many or few
+            yield f"line {i + 2} has not {len(columns)} cells"
             continue
         similarity = dict(zip(names, train_similarity(survey, i), strict=True))
         for why in _row_differences(line, row, similarity):
@@ -139,10 +140,12 @@ def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
 
 
 def _row_differences(
-    line: Sequence[str], row: RobotDifficulty, similarity: Mapping[str, Array]
+    line: Mapping[str, str], row: RobotDifficulty, similarity: Mapping[str, Array]
 ) -> Iterator[str]:
     """Yield how a line differs from a robot's row, given its similarity to every train robot."""
-    for column, found, expected in zip(STRUCTURAL, line, structural_cells(row), strict=False):
+    cells = difficulty_cells(row)
+    for column in STRUCTURAL:
+        found, expected = line[column], cells.get(column, "")
         if found == expected:
             continue
         with suppress(ValueError):  # of a cell that is no number
