@@ -1,9 +1,11 @@
 """Fixtures shared by the tests of splits."""
 
+import shutil
+
 import pytest
 
 from helpers.splits import LIBRARY, combined
-from morphgen.benchmark.split_folder import build_split
+from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split
 
 
 @pytest.fixture
@@ -12,7 +14,37 @@ def example_split():
     return combined()
 
 
+@pytest.fixture(scope="session")
+def built(tmp_path_factory):
+    """Function that builds the split of four robots once with each of the settings."""
+    folders = {}
+
+    def build(settings):
+        if settings not in folders:
+            home = tmp_path_factory.mktemp("built")
+            folders[settings] = build_split(combined(), home, LIBRARY, settings=settings).folder
+        return folders[settings]
+
+    return build
+
+
 @pytest.fixture
-def whole(tmp_path, example_split):
-    """A built split."""
-    return build_split(example_split, tmp_path / "whole", LIBRARY).folder
+def copy_of(built, tmp_path):
+    """Function that returns a copy of the built split."""
+
+    def copied(settings):
+        return shutil.copytree(built(settings), tmp_path / "whole" / "mine" / "some")
+
+    return copied
+
+
+@pytest.fixture
+def bundles(copy_of):
+    """A built split with bundles."""
+    return copy_of(BUNDLED)
+
+
+@pytest.fixture(params=[BUNDLED, BuildSettings(light=True)], ids=["bundles", "light"])
+def either(copy_of, request):
+    """A built split with bundles, and a light one."""
+    return copy_of(request.param)

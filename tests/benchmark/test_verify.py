@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
-from morphgen.benchmark.split_folder import BuildSettings, build_split
+from morphgen.benchmark.split_folder import build_split
 from morphgen.benchmark.verify import verify
 from morphgen.encoding.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.progress import show_progress
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import split_text
-
-LIGHT = BuildSettings(light=True)
 
 
 def difference_keys(path, **options):
@@ -29,16 +27,6 @@ def written(folder, example_split):
     path = folder / "some.yaml"
     path.write_text(split_text(example_split))
     return path
-
-
-@pytest.fixture(params=[BuildSettings(), LIGHT], ids=["bundles", "light"])
-def whole(tmp_path, request):
-    return build_split(combined(), tmp_path / "whole", LIBRARY, settings=request.param).folder
-
-
-@pytest.fixture
-def bundles(tmp_path):
-    return build_split(combined(), tmp_path / "whole", LIBRARY).folder
 
 
 def rewrite_checksums(folder):
@@ -85,8 +73,8 @@ def test_every_member_with_a_wrong_derivation_is_reported(tmp_path):
     assert [where for where, _ in difference_keys(path)] == ["gantry-plane", "again"]
 
 
-def test_a_moved_split_folder_passes(whole, tmp_path):
-    whole.rename(tmp_path / "elsewhere")
+def test_a_moved_split_folder_passes(either, tmp_path):
+    either.rename(tmp_path / "elsewhere")
     seen = []
     with show_progress(lambda *counts: seen.append(counts)):
         assert difference_keys(tmp_path / "elsewhere") == []
@@ -103,38 +91,38 @@ def test_a_moved_split_folder_passes(whole, tmp_path):
     ],
 )
 @pytest.mark.parametrize("change", ["cut", "longer", "gone"])
-def test_a_damaged_file_is_reported(whole, path, where, change):
-    data = (whole / path).read_bytes()
-    (whole / path).write_bytes(data + b"\n" if change == "longer" else data[: len(data) // 2])
+def test_a_damaged_file_is_reported(either, path, where, change):
+    data = (either / path).read_bytes()
+    (either / path).write_bytes(data + b"\n" if change == "longer" else data[: len(data) // 2])
     if change == "gone":
-        (whole / path).unlink()
-    findings = difference_keys(whole)
+        (either / path).unlink()
+    findings = difference_keys(either)
     why = "is missing, but SHA256SUMS names it" if change == "gone" else "is not what SHA256SUMS"
     file = path.rpartition("/")[2]
     assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in findings]
     assert {place for place, _ in findings} <= {where, "gantry-plane"}
 
 
-def test_an_extra_file_is_reported(whole):
-    (whole / "robots" / "planar-cube" / "notes.txt").write_text("mine")
-    (whole / "robots" / "stranger").mkdir()
-    (whole / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
-    assert difference_keys(whole) == [
+def test_an_extra_file_is_reported(either):
+    (either / "robots" / "planar-cube" / "notes.txt").write_text("mine")
+    (either / "robots" / "stranger").mkdir()
+    (either / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
+    assert difference_keys(either) == [
         ("planar-cube", "file notes.txt is not named by SHA256SUMS"),
         ("stranger", "file robot.urdf is not named by SHA256SUMS"),
     ]
 
 
-def test_a_urdf_changed_with_its_checksum_is_reported(whole):
-    path = whole / "robots" / "planar-cube" / "robot.urdf"
+def test_a_urdf_changed_with_its_checksum_is_reported(either):
+    path = either / "robots" / "planar-cube" / "robot.urdf"
     path.write_text(path.read_text().replace('effort="', 'effort="1', 1))
     card = path.with_name("card.json")
     if card.is_file():
         data = json.loads(card.read_text())
         data["hashes"]["robot.urdf"] = hashlib.sha256(path.read_bytes()).hexdigest()
         card.write_text(json.dumps(data))
-    rewrite_checksums(whole)
-    assert difference_keys(whole) == [("planar-cube", "file robot.urdf is not the robot's")]
+    rewrite_checksums(either)
+    assert difference_keys(either) == [("planar-cube", "file robot.urdf is not the robot's")]
 
 
 @pytest.mark.parametrize(
@@ -182,13 +170,13 @@ def test_meshes_are_verified(tmp_path):
         (lambda lines: lines.pop(), "robots.jsonl it has 3 robots, not 4"),
     ],
 )
-def test_a_record_changed_with_its_checksum_is_reported(whole, change, expected):
-    path = whole / "robots.jsonl"
+def test_a_record_changed_with_its_checksum_is_reported(either, change, expected):
+    path = either / "robots.jsonl"
     records = [json.loads(line) for line in path.read_text().splitlines()]
     change(records)
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
-    rewrite_checksums(whole)
-    ((where, why),) = difference_keys(whole)
+    rewrite_checksums(either)
+    ((where, why),) = difference_keys(either)
     assert f"{where} {why}".startswith(expected)
 
 
@@ -203,32 +191,32 @@ def changed_tokens(folder, change):
 
 
 @pytest.mark.parametrize("field", [PARENT, ORIGIN, GEOMETRY])
-def test_tokens_changed_with_their_checksum_are_reported(whole, field):
+def test_tokens_changed_with_their_checksum_are_reported(either, field):
     def change(arrays):
         arrays["tokens"][1, 2, field.start] += 0.01
 
-    changed_tokens(whole, change)
+    changed_tokens(either, change)
     why = f"tokens.npz: {field.name} of link 2 is not the robot's"
-    assert difference_keys(whole) == [("planar-cube", why)]
+    assert difference_keys(either) == [("planar-cube", why)]
 
 
-def test_changed_masks_names_and_missing_numbers_of_tokens_are_reported(whole):
-    changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), np.nan))
-    assert [where for where, _ in difference_keys(whole)] == ["gantry-cylinder"]
-    changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), 0))
-    changed_tokens(whole, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
-    assert difference_keys(whole) == [
+def test_changed_masks_names_and_missing_numbers_of_tokens_are_reported(either):
+    changed_tokens(either, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), np.nan))
+    assert [where for where, _ in difference_keys(either)] == ["gantry-cylinder"]
+    changed_tokens(either, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), 0))
+    changed_tokens(either, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
+    assert difference_keys(either) == [
         ("gantry-cylinder", "tokens.npz: its mask is not that of its links")
     ]
-    changed_tokens(whole, lambda arrays: arrays["names"].__setitem__(0, "other"))
-    assert difference_keys(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
+    changed_tokens(either, lambda arrays: arrays["names"].__setitem__(0, "other"))
+    assert difference_keys(either) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
 
 
-def test_an_exchanged_split_file_is_reported(whole):
+def test_an_exchanged_split_file_is_reported(either):
     other = combined(test=["base=planar ee=cylinder"])
-    (whole / "split.yaml").write_text(split_text(other))
-    rewrite_checksums(whole)
-    findings = difference_keys(whole)
+    (either / "split.yaml").write_text(split_text(other))
+    rewrite_checksums(either)
+    findings = difference_keys(either)
     assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in findings
     assert ("planar-cylinder", "its folder is missing") in findings
 
