@@ -16,8 +16,8 @@ from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
+from morphgen.benchmark.release import build_with_goals
 from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
-from morphgen.benchmark.split_release import build_with_goals
 from morphgen.benchmark.survey import statistics
 from morphgen.benchmark.verify import Difference, compare_robots, verify
 from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds

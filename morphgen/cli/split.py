@@ -297,8 +297,8 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
     from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
+    from morphgen.benchmark.release import build_with_goals
     from morphgen.benchmark.split_folder import BuildSettings
-    from morphgen.benchmark.split_release import build_with_goals
     from morphgen.splits.split_file import read_split
     from morphgen.tasks.scenes.env_specs import GoalConfig
 

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 def release(args: argparse.Namespace) -> None:
     """Make a release and print where it is."""
     from morphgen.benchmark.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
+    from morphgen.benchmark.release import ReleaseRequest, release_split
     from morphgen.benchmark.split_folder import BuildSettings
-    from morphgen.benchmark.split_release import ReleaseRequest, release_split
     from morphgen.formats.files import require_writable_folder
     from morphgen.splits.split_file import read_split
 

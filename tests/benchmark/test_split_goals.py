@@ -15,9 +15,9 @@ import pytest
 from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark import split_release
+from morphgen.benchmark import release
+from morphgen.benchmark.release import write_goals
 from morphgen.benchmark.split_folder import BuildSettings, build_split, load_split_folder
-from morphgen.benchmark.split_release import write_goals
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
@@ -267,7 +267,7 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(split_release, "sums_text", interrupted)
+        patched.setattr(release, "sums_text", interrupted)
         with pytest.raises(KeyboardInterrupt):
             write_goals(home, member_sets, RECIPE)
     with pytest.raises(BenchmarkError, match="is not finished"):

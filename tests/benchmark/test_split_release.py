@@ -19,8 +19,10 @@ from morphgen.benchmark.release import (
     DIFFICULTY_FILE,
     LICENCES_FILE,
     RELEASE_FILE,
+    ReleaseRequest,
     opened_folder,
     read_release,
+    release_split,
 )
 from morphgen.benchmark.split_folder import (
     SUMS_FILE,
@@ -29,7 +31,6 @@ from morphgen.benchmark.split_folder import (
     read_sums,
     sums_text,
 )
-from morphgen.benchmark.split_release import ReleaseRequest, release_split
 from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
