@@ -5,6 +5,7 @@ import io
 import json
 import struct
 import warnings
+import zlib
 from typing import Any
 
 import numpy as np
@@ -94,10 +95,15 @@ def accessor(index: int, **changes: Any) -> dict[str, Any]:
     return document
 
 
-def picture(size=(2, 2), colour="lime"):
+def picture(size=(2, 2), claimed=None):
+    """Return a green PNG, whose header may claim another size."""
     stream = io.BytesIO()
-    Image.new("RGB", size, colour).save(stream, "PNG")
-    return stream.getvalue()
+    Image.new("RGB", size, "lime").save(stream, "PNG")
+    data = stream.getvalue()
+    if claimed is None:
+        return data
+    header = data[12:16] + struct.pack(">II", *claimed) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
 
 
 def dae(**changes: str) -> str:
@@ -303,7 +309,7 @@ def test_all_material_files_are_read(libraries, tmp_path):
         ("none.png", None, "no such file"),
         ("junk.png", b"junk", "not a picture"),
         ("cut.png", picture((90, 90))[:70], "a broken picture"),
-        ("bomb.png", picture((8192, 4097)), f"8192 x 4097 pixels; at most {MAX_PIXELS}"),
+        ("bomb.png", picture(claimed=(8192, 4097)), f"8192 x 4097 pixels; at most {MAX_PIXELS}"),
         ("../out.png", picture(), "is outside the mesh's folder"),
         ("post.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n",
          "not a picture"),
@@ -337,7 +343,7 @@ def test_without_its_texture_a_material_has_its_own_colour(name, content, reason
 
 def test_a_texture_of_65_megapixels_is_refused_without_a_warning(tmp_path):
     path = tmp_path / "a.png"
-    path.write_bytes(picture((13000, 13000)))
+    path.write_bytes(picture(claimed=(13000, 13000)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match=r"13000 x 13000 pixels"):
