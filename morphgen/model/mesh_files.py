@@ -376,16 +376,14 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
     if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
         raise ValueError(f"more than {_MAX_TOKENS} words")
     text = data.decode("utf-8", "replace").replace("\r\n", "\n").replace("\\\n", " ")
-    require_faces(len(re.findall(r"^[ \t]*f[ \t]", text, re.M)))
+    faces = re.finditer(r"^[ \t]*f[ \t]([^#\n]*)", text, re.M)
+    triangles = sum(max(len(face[1].split()) - 2, 0) for face in faces)
+    require_faces(triangles)
     _require_short_lines(text)
     mixes_corners = re.search(r"^f[^\n]*//", text, re.M) and re.search(r"^f[^\n]*\d/\d", text, re.M)
     if mixes_corners or _OBJ_ODD.search(text):
         text = "\n".join(_plain_obj(text))
-    triangles = 0
     vertices = text.count("\nv ") + text.startswith("v ")
-    for face in re.finditer(r"^f (.*)$", text, re.M):
-        triangles += max(len(face[1].split()) - 2, 0)
-    require_faces(triangles)
     if not triangles:
         raise ValueError(f"holds {vertices} vertices and no triangle")
     for keyword, meaning in _OBJ_LEFT_OUT.items():

@@ -396,7 +396,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "sixteen.dae": (dae().encode("utf-16"), "expected UTF-8"),
     "seven.dae": ('<?xml version="1.0" encoding="UTF-7"?>' + dae()[38:], "encoding 'utf-7'"),
     "instances.dae": (
-        dae(n=("</visual_scene>", '<node><instance_geometry url="#g"/></node>' * 90_000
+        dae(n=("</visual_scene>", '<node><instance_geometry url="#g"/></node>' * 20_001
                + "</visual_scene>")),
         "nodes; at most 20000 are read",
     ),
