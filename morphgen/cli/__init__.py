@@ -20,36 +20,13 @@ if TYPE_CHECKING:  # imported when a command runs, so that Ctrl-C meanwhile is c
 
 def build_parser() -> Parser:
     """Return the parser of every command; each sets ``run``, which may return an exit code."""
-    from morphgen.cli import (
-        check,
-        doctor,
-        evaluate,
-        export,
-        fit,
-        play,
-        robots,
-        sample,
-        similarity,
-        split,
-        study,
-        train,
-        view,
-    )
-    from morphgen.cli.command import Parser, add_commands
+    from morphgen.cli.command import Parser, add_commands, read_commands
 
-    commands = (  # in the order of the help
-        *(doctor.demo, robots.compose, sample.sample, robots.list_parts, robots.show),
-        *(check.check, check.conform, robots.import_robots, export.export, fit.fit),
-        *(similarity.tokens, sample.grammar, sample.derive, sample.mutate, similarity.similarity),
-        *(split.split, split.goals, play.zeroshot, train.train, evaluate.evaluate),
-        *(train.finetune, study.study, study.score, play.play, play.speed, view.view),
-        doctor.doctor,
-    )
     parser = Parser(
         prog="morphgen", description="Create robot morphologies, train policies on them, view them."
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    add_commands(parser, commands)
+    add_commands(parser, read_commands())
     return parser
 
 

@@ -6,33 +6,24 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from tabulate import tabulate
+
+from morphgen import checks
+from morphgen.api.checks import bundle_of, check_source, conform_source
+from morphgen.checks.conformance import ConformanceReport
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option
 from morphgen.cli.progress import note
 from morphgen.errors import FormatError, one_line
-
-if TYPE_CHECKING:
-    from morphgen.checks.conformance import ConformanceReport
-    from morphgen.grammar.library import Library
-    from morphgen.grammar.robot_source import RobotSource
-    from morphgen.model.findings import Finding
+from morphgen.formats.bundle import bundle_folder, write_bundle
+from morphgen.formats.urdf.read import UnsoundError
+from morphgen.grammar.library import Library
+from morphgen.grammar.robot_source import RobotSource, read_source
+from morphgen.model.findings import Finding
 
 SEVERITIES = ("error", "warning", "info")
 
 
-@command(
-    "check",
-    "find faults of robots and say how to repair them",
-    opt.ROBOTS,
-    flag("--strict", "fail on warnings, too"),
-    option("--fix DIR", "make the safe repairs and write bundles to DIR", Path),
-    *opt.ROOT_LIBRARY_JSON,
-    details="The exit code is 1 if there is an error, or a warning with --strict; and 2 if a robot "
-    "cannot be read, which does not stop the others.",
-    examples=("check my_arm.urdf", "check robots/ --strict", "check my_arm.urdf --fix repaired"),
-)
 def check(args: argparse.Namespace) -> int:
     """Check every robot and print the findings."""
     written: dict[Path, str] = {}
@@ -62,22 +53,16 @@ def _findings(
     source: RobotSource, library: Library, args: argparse.Namespace, written: dict[Path, str]
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
     """Return a robot's findings, and those that its repair into ``--fix`` removed."""
-    from morphgen.api.checks import bundle_of, check_source
-    from morphgen.checks import check, fix
-    from morphgen.formats.bundle import bundle_folder, write_bundle
-    from morphgen.formats.urdf.read import UnsoundError
-    from morphgen.grammar.robot_source import read_source
-
     if args.fix is None:
         return check_source(source, library, args.root), ()
     try:
         robot = read_source(source, library, args.root)
     except UnsoundError as error:
         return error.findings, ()
-    robot, repaired = fix(robot)
+    robot, repaired = checks.fix(robot)
     # A lone URDF need not have a tool.
     is_robot = source.path is None or bundle_of(source) is not None
-    findings = check(robot, tool_required=is_robot)
+    findings = checks.check(robot, tool_required=is_robot)
     folder = bundle_folder(args.fix, robot.name)
     if folder in written:
         raise FormatError(
@@ -95,37 +80,17 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
         f"{label}: repaired {finding.code} at {finding.where}: {finding.repair}"
         for finding in repaired
     ]
-    counts = {name: sum(finding.severity == name for finding in findings) for name in SEVERITIES}
-    lines.append(f"{label}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
+    lines.append(f"{label}: {opt.severity_counts(findings, SEVERITIES)}")
     lines = [one_line(line) for line in lines]
     for finding in findings:
-        where = one_line(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
         hint = " (check --fix does it)" if finding.fixable else ""
-        lines += [f"  {where}", f"    {one_line(f'fix: {finding.fix}{hint}')}"]
+        lines += [f"  {one_line(opt.finding_line(finding))}"]
+        lines += [f"    {one_line(f'fix: {finding.fix}{hint}')}"]
     return "\n".join(lines)
 
 
-@command(
-    "conform",
-    "compare robots in every loader and simulator, and measure how they hold and move",
-    opt.ROBOTS,
-    number("--samples", "number of random configurations", most=100_000, default=100),
-    opt.SEED,
-    *opt.ROOT_LIBRARY_JSON,
-    details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio; they are "
-    "compared in joints, limits, mimic joints, damping, gains, mass, tool pose, gravity torque "
-    "and inertia. A URDF, xacro or MJCF has rows for the file as it is, and for the bundle that "
-    "morphgen makes of it. A robot then holds its home for 5 s and steps each joint by 0.2 rad or "
-    "2 cm, with its files and in environments of MuJoCo and PyBullet. The exit code is 1 if a "
-    "loader disagrees about a bundle, or about a file without a known cause, if a joint drifts "
-    "more than 0.02 rad or m, or a step does not settle; and 2 if a robot cannot be read, which "
-    "does not stop the others.",
-    examples=("conform ur5-plane", "conform my_arm.urdf", "conform robots/ --samples 1000"),
-)
 def conform(args: argparse.Namespace) -> int:
     """Print a row per robot and loader, one per simulator, and the pairs that penetrate at home."""
-    from morphgen.api.checks import conform_source
-
     reports, refused = opt.for_each_robot(
         args,
         "loading",
@@ -203,7 +168,7 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
     # As headers, the titles would be padded to more than 120 columns.
     lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
-    return opt.table(lines, tablefmt="plain", disable_numparse=True)
+    return tabulate(lines, tablefmt="plain", disable_numparse=True)
 
 
 def _cell(value: str | bool | float | None) -> str:

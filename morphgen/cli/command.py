@@ -1,91 +1,250 @@
-"""Commands and their options as data, and the parser that is made of them."""
+"""Commands as the text ``commands.txt`` defines them, and the parser that is made of them."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import re
 import shutil
 import textwrap
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import Any, NoReturn, TypeAlias
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from string import Template
+from typing import Any, NoReturn
 
 from morphgen.errors import MorphgenError, nearest
+from morphgen.rl.agents import AGENTS, PRESETS
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.shipped_policies import POLICIES
+from morphgen.tasks.registry import CHANNELS, COLLISION_GEOMETRIES, SIMULATORS, TASKS
 
+COMMANDS = Path(__file__).with_name("commands.txt")
+"""Definition of all commands; its head explains the notation."""
 _MIN_HELP_WIDTH = 11
 """Least width of a line of a help, however narrow the terminal is; that of argparse."""
-Run: TypeAlias = Callable[[argparse.Namespace], "int | None"]
+_ENTRY = re.compile(
+    r"(?P<name>(?:--\[no-\]|-{1,2})?[\w-]+)(?P<required>!)?(?: (?P<value>\S.*?))??"
+    r"(?: -> (?P<dest>\w+))?(?: = (?P<default>\S.*))?"
+)
+_VALUE = re.compile(
+    r"(?P<metavar>[^({]*?)(?:\((?P<type>[^)]+)\))?(?:\{(?P<choices>[^}]+)\})?(?P<many> \.\.\.|\*)?"
+)
+_RULE = re.compile(r"(--[^:]+): only (with|without) (--[\w-]+)(?:=(\S+))?")
+_PATHS = re.compile(r"DIR|FOLDER|PATH|FILE\b.*")
+"""Words for a value that is a path."""
 
 
 class UsageError(MorphgenError):
     """The arguments of the command line are invalid."""
 
 
-@dataclass(frozen=True)
-class Option:
-    """An option or a positional argument; several commands may share one."""
+@dataclass
+class Command:
+    """A command, or a group of commands such as ``morphgen split``."""
 
-    names: tuple[str, ...]
-    """Flags such as ``--seed``, or the name of a positional argument."""
-    settings: Mapping[str, Any]
-    """Keyword arguments of ``ArgumentParser.add_argument``."""
-    needs: str = ""
-    """Flag without which the option has no effect, and is refused."""
-    excludes: tuple[str, ...] = ()
-    """Flags with which the option has no effect, and is refused."""
+    path: str
+    """Words of the command line, such as ``split new``."""
+    function: str = ""
+    """Module of ``morphgen.cli`` and its function that runs the command, which gets the arguments
+    and may return an exit code; empty for a group that needs one of its commands."""
+    extra: str = ""
+    """Extra of morphgen that the command needs, which errors name if a package is missing."""
+    summary: str = ""
+    """Purpose of the command: a verb and its object, without a full stop."""
+    details: str = ""
+    """Sentences that follow the summary in the command's own help."""
+    examples: list[str] = field(default_factory=list)
+    """Command lines that the help shows."""
+    options: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Keyword arguments of ``ArgumentParser.add_argument`` by flag, or name of a position."""
+    basic: Sequence[str] = ()
+    """Options that ``--help`` shows if ``--help-all`` shows more; empty if there are no others."""
+    alternatives: list[list[str]] = field(default_factory=list)
+    """Flags that exclude each other."""
+    rules: list[tuple[list[str], str, str, list[str]]] = field(default_factory=list)
+    """Flags that have an effect ``with`` or ``without`` another only, the other, and those of its
+    values that count, all if there are none."""
 
-    def needing(self, flag: str) -> Option:
-        """Return the option for a command where it has an effect with another one only."""
-        return replace(self, needs=flag)
+    def start(self, args: argparse.Namespace) -> int | None:
+        """Refuse options that have no effect, then run the command."""
+        values = {
+            name: getattr(args, settings.get("dest") or name.lstrip("-").replace("-", "_"))
+            for name, settings in self.options.items()
+        }
+        # Argparse does not say which options were given.
+        given = [name for name in values if values[name] != self.options[name].get("default")]
+        for flags, preposition, name, valid in self.rules:
+            holds = values[name] in valid if valid else name in given
+            idle = [flag for flag in given if flag in flags]
+            if idle and holds != (preposition == "with"):
+                *others, last = valid or [""]
+                choices = " or ".join(filter(None, [", ".join(others), last]))
+                condition = f"{preposition} {name} {choices}".rstrip()
+                raise MorphgenError(f"{' '.join(idle)}: only {condition}")
+        module, _, function = self.function.rpartition(".")
+        from morphgen.cli.progress import status  # loads tqdm, which a help does not need
 
-    def without(self, *flags: str) -> Option:
-        """Return the option for a command where it has no effect with others."""
-        return replace(self, excludes=flags)
-
-    def fault(self, given: Collection[str]) -> str:
-        """Return why the option has no effect beside the flags that are given, if so."""
-        idle = next((flag for flag in self.excludes if flag in given), "")
-        if idle:
-            return f"only without {idle}"
-        return f"only with {self.needs}" if self.needs and self.needs not in given else ""
-
-
-def option(
-    name: str, help: str = "", type: Callable[[str], object] | None = None, **settings: object
-) -> Option:
-    """Return an option, or an argument by position.
-
-    name: Name, and the word for its value in the help, such as ``--out DIR``.
-    help: Its text; it ends with the default, if there is one to show.
-    """
-    name, _, metavar = name.partition(" ")
-    # An empty list or text is no default that a reader could type.
-    default = settings.get("default")
-    if default not in (None, [], "") and "default" not in help:
-        shown = f"{default:,}" if isinstance(default, int) else f"{default}"
-        help += f" (default: {shown})" if help else f"default: {shown}"
-    return Option((name,), {**settings, "help": help, "type": type, "metavar": metavar or None})
-
-
-def flag(name: str, help: str) -> Option:
-    """Return an option that is on if it is given."""
-    return Option((name,), {"action": "store_true", "help": help})
-
-
-def number(
-    name: str, help: str, *, default: int | None = None, least: int = 1, most: int | None = None
-) -> Option:
-    """Return an option whose value is a whole number."""
-    return option(f"{name} N", help, whole_number(least, most), default=default)
+        with status(args, "loading"):  # of packages, which takes seconds
+            run = getattr(import_module(f"morphgen.cli.{module}"), function)
+        code: int | None = run(args)
+        return code
 
 
-def repeated(
-    name: str, help: str, type: Callable[[str], object] | None = None, **settings: object
-) -> Option:
-    """Return an option that may be given several times; its value is a list."""
-    settings = {"action": "append", "default": [], **settings}
-    return option(name, f"{help}; may be repeated", type, **settings)
+def read_commands() -> list[Command]:
+    """Return the commands of ``commands.txt``."""
+    text, names = COMMANDS.read_text(encoding="utf-8"), _names()
+    groups: dict[str, list[str]] = {}
+    commands = []
+    for section in re.split(r"\n(?=[@\w])", re.sub(r"(?m)^#.*\n", "", text).strip()):
+        head, _, body = section.partition("\n")
+        # What is indented deeper continues the line above it.
+        lines = re.sub(r"\n {3,}", "  ", textwrap.dedent(body)).splitlines()
+        lines = [each for line in lines for each in _with_groups(line, groups)]
+        if head.startswith("@"):
+            groups[head[1:]] = lines
+        else:
+            path, _, function = head.partition(" = ")
+            commands.append(_command(Command(path, *function.split(", extra ")), lines, names))
+    return commands
+
+
+def _with_groups(line: str, groups: Mapping[str, list[str]]) -> list[str]:
+    """Return a line, or the lines of the groups that it names."""
+    return (
+        [each for name in line[2:].split() for each in groups[name]] if line[0] == "+" else [line]
+    )
+
+
+def _command(command: Command, lines: Sequence[str], names: Mapping[str, Any]) -> Command:
+    """Fill a command with what the lines of its section say."""
+    command.summary, *lines = lines
+    for line in filter(None, lines):
+        signature, *help_text = re.split(r" {2,}", line)
+        if rule := _RULE.fullmatch(" ".join([signature, *help_text])):
+            flags, preposition, name, valid = rule.groups("")
+            command.rules.append(
+                (flags.split(), preposition, name, valid.split(",") if valid else [])
+            )
+        elif line.startswith("$ "):
+            command.examples.append(line[2:])
+        elif line.startswith("either "):
+            command.alternatives.append(re.findall(r"--\S+", line))
+        elif line == "advanced:":
+            command.basic = list(command.options)
+        elif line.startswith("-") or help_text:
+            name, settings = _option(signature, " ".join(help_text), names)
+            command.options[name] = settings
+        else:
+            command.details = f"{command.details} {line}".lstrip()
+    return command
+
+
+def _option(signature: str, text: str, names: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the flag of an option, and its settings for argparse."""
+    entry = _ENTRY.fullmatch(signature)
+    assert entry is not None, signature
+    name = entry["name"]
+    text = Template(text).substitute(names, presets=_presets(name.removeprefix("--[no-]")))
+    settings: dict[str, Any] = {"dest": entry["dest"]} if entry["dest"] else {}
+    if entry["required"]:
+        settings["required"] = True
+    if name.startswith("--[no-]"):
+        settings |= {"action": argparse.BooleanOptionalAction, "default": None}
+        name = name.replace("[no-]", "")
+    elif entry["value"] is None and name.startswith("-"):
+        settings |= {"action": "store_true", "default": False}
+    else:
+        settings |= _value(entry["value"] or "", names, is_flag=name.startswith("-"))
+    if settings.get("action") == "append":
+        text += "; may be repeated"
+    if default := entry["default"]:
+        default = default.strip('"')
+        convert = settings.get("type") or (lambda text: text != "off" and text)
+        settings["default"] = value = convert(default)
+        if "default" not in text and default:
+            shown = f"{value:,}" if isinstance(value, int) else default
+            text += f" (default: {shown})"
+    return name, {**settings, "help": text}
+
+
+def _value(text: str, names: Mapping[str, Any], *, is_flag: bool) -> dict[str, Any]:
+    """Return the settings for the value of an option, such as ``N(2..)`` or ``[ROBOT ...]``."""
+    is_optional = text.startswith("[") and text.endswith("]")
+    value = _VALUE.fullmatch(text[1:-1] if is_optional else text)
+    assert value is not None, text
+    word, kind, choices, many = value.groups()
+    kind = kind or ("1.." if word == "N" else "path" if _PATHS.fullmatch(word) else "str")
+    settings: dict[str, Any] = {"metavar": word or None, "type": _type(kind)}
+    if choices:
+        settings["choices"] = names[choices] if choices in names else choices.split(",")
+    if many == "*":
+        settings |= {"action": "append", "default": []}
+    elif many:
+        settings |= {"nargs": "*" if is_optional else "+"} | ({"default": []} if is_flag else {})
+    elif is_optional:
+        settings |= {"nargs": "?", "const": "" if is_flag else None}
+    return settings
+
+
+def _type(name: str) -> Callable[[str], object] | None:
+    """Return the function that reads a value; None for a text."""
+    least, dots, largest = name.partition("..")
+    if dots:
+        return whole_number(int(least), int(largest) if largest else None)
+    types = {"str": None, "path": Path, "float": float, "int": int}
+    return {**types, "positive": positive, "names": _names_of, "numbers": _numbers_of}[name]
+
+
+def _names() -> dict[str, Any]:
+    """Return what stands for the names in ``commands.txt``: choices of options, and texts."""
+    robot = (
+        "a bundle's folder, a URDF, xacro or MJCF, parts such as ur5-plane, or words of morphgen "
+        "compose such as arm=ur5 ee=plane"
+    )
+    observed = (
+        f"; --preset {label} has {', '.join(channels)} already, and --agent AGENT-NAME drops one"
+        for label, preset in PRESETS.items()
+        if (channels := [each for each in preset.switches if each.replace("-", "_") in CHANNELS])
+    )
+    return {
+        "ROBOT": robot,
+        "ROBOTS": f"{robot}; a set of morphgen sample or a folder of bundles names all its robots",
+        "SPLIT": "name of a split, its file or built folder; or a robot and its task, such as "
+        "arm=ur5 ee=stick task=reach",
+        "TASKS": TASKS,
+        "A_TASK": f"{', '.join(TASKS.builtin)}, or a task of an installed package",
+        "SIMULATORS": SIMULATORS,
+        "A_SIMULATOR": f"{', '.join(SIMULATORS.builtin)}, or a simulator of an installed package",
+        "AGENTS": ", ".join(AGENTS),
+        "BASELINES": ", ".join(BASELINES),
+        "POLICIES": ", ".join(POLICIES),
+        "CHANNELS": ", ".join(CHANNELS).replace("_", "-") + "".join(observed),
+        "PRESETS": tuple(PRESETS),
+        "A_PRESET": "; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items()),
+        "GEOMETRIES": COLLISION_GEOMETRIES,
+    }
+
+
+def _presets(switch: str) -> str:
+    """Return which presets turn a switch of agents on or off."""
+    return "".join(
+        f"; {'on' if preset.switches[switch] else 'off'} with --preset {label}"
+        for label, preset in PRESETS.items()
+        if switch in preset.switches
+    )
+
+
+def _names_of(text: str) -> tuple[str, ...]:
+    """Read names that are separated by commas; a type for argparse."""
+    return tuple(name.strip() for name in text.split(",")) if text else ()
+
+
+def _numbers_of(text: str) -> tuple[int, ...]:
+    """Read whole numbers that are separated by commas; a type for argparse."""
+    return tuple(map(whole_number(1), _names_of(text)))
 
 
 def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]:
@@ -118,98 +277,11 @@ def _number(text: str) -> float:
     return math.nan
 
 
-Options: TypeAlias = "Sequence[Option | tuple[Option, ...]]"
-"""Options of a command; those of a nested tuple exclude each other."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command, or a group of commands such as ``morphgen split``."""
-
-    name: str
-    """Word of the command line."""
-    summary: str
-    """Purpose of the command: a verb and its object, without a full stop."""
-    options: Options = ()
-    """Options and positional arguments."""
-    run: Run | None = None
-    """Function that runs the command; it may return an exit code. None for a group that needs one
-    of its commands."""
-    details: str = ""
-    """Sentences that follow the summary in the command's own help."""
-    examples: Sequence[str] = ()
-    """Command lines that the help shows."""
-    commands: Sequence[Command] = ()
-    """Commands of the group."""
-    extra: str = ""
-    """Extra of morphgen that the command needs, which errors name if a package is missing."""
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Further attributes of the parsed arguments."""
-
-    def add_to(self, parsers: argparse._SubParsersAction[Parser]) -> None:
-        """Add the command's parser to those of its group."""
-        parser = parsers.add_parser(self.name, help=self.summary, **self._texts())
-        if self.commands:
-            runs = self.run is not None
-            add_commands(
-                parser, self.commands, required=not runs, dest="subcommand", has_options=runs
-            )
-        if self.run is None:
-            return
-        for entry in self.options:
-            alternatives = entry if isinstance(entry, tuple) else (entry,)
-            group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
-            for argument in alternatives:
-                group.add_argument(*argument.names, **argument.settings)
-        parser.set_defaults(run=self._start, parser=parser, extra=self.extra, **self.defaults)
-
-    def _start(self, args: argparse.Namespace) -> int | None:
-        """Refuse options that have no effect, then run the command."""
-        groups = (each if isinstance(each, tuple) else (each,) for each in self.options)
-        options = [each for group in groups for each in group if each.names[0].startswith("-")]
-        given = {each.names[0]: each for each in options if _is_given(each, args)}
-        faults = {name: fault for name, each in given.items() if (fault := each.fault(given))}
-        if faults:
-            reason = next(iter(faults.values()))
-            names = " ".join(name for name, other in faults.items() if other == reason)
-            raise MorphgenError(f"{names}: {reason}")
-        assert self.run is not None
-        return self.run(args)
-
-    def _texts(self) -> dict[str, Any]:
-        # Argparse leaves these two columns free, too.
-        width = max(shutil.get_terminal_size().columns - 2, _MIN_HELP_WIDTH)
-        summary = f"{self.summary[0].upper()}{self.summary[1:]}."
-        lines = [f"  morphgen {example}" for example in self.examples]
-        return {
-            "description": textwrap.fill(f"{summary} {self.details}".strip(), width),
-            "epilog": "\n".join(["examples:", *lines]) if lines else None,
-            "formatter_class": argparse.RawDescriptionHelpFormatter,
-        }
-
-
-def _is_given(option: Option, args: argparse.Namespace) -> bool:
-    """Return whether an option has another value than its default."""
-    name = option.settings.get("dest") or option.names[0].lstrip("-").replace("-", "_")
-    # Argparse does not say which options were given.
-    is_flag = option.settings.get("action") == "store_true"
-    return bool(getattr(args, name) != option.settings.get("default", False if is_flag else None))
-
-
-def command(
-    name: str,
-    summary: str,
-    *options: Option | tuple[Option, ...],
-    details: str = "",
-    examples: Sequence[str] = (),
-    extra: str = "",
-) -> Callable[[Run], Command]:
-    """Return a decorator that makes a command of the function that runs it."""
-    return lambda run: Command(name, summary, options, run, details, examples, extra=extra)
-
-
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line and name the nearest valid choice."""
+
+    advanced: Sequence[argparse.Action] = ()
+    """Options that ``--help`` leaves out and ``--help-all`` shows."""
 
     def error(self, message: str) -> NoReturn:
         """Raise a ``UsageError`` that says what is wrong and where the usage is explained."""
@@ -222,6 +294,16 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(
                 action, f"invalid choice: {value!r}{nearest(str(value), names)}"
             )
+
+
+class _BriefHelp(argparse._HelpAction):
+    """Prints the help without the advanced options, and exits."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *args: Any, **options: Any) -> None:  # noqa: ANN401
+        assert isinstance(parser, Parser)
+        for action in parser.advanced:
+            action.help = argparse.SUPPRESS
+        super().__call__(parser, *args, **options)
 
 
 class _CommandAfterOptions(argparse._SubParsersAction):  # type: ignore[type-arg]  # not at run time
@@ -248,21 +330,56 @@ class _CommandAfterOptions(argparse._SubParsersAction):  # type: ignore[type-arg
         super().__call__(parser, namespace, values, option_string)
 
 
-def add_commands(
-    parser: argparse.ArgumentParser,
-    commands: Sequence[Command],
-    *,
-    required: bool = False,
-    dest: str = "command",
-    has_options: bool = False,
-) -> None:
-    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and, to its name, dest."""
-    action = _CommandAfterOptions if has_options else argparse._SubParsersAction
-    parsers = parser.add_subparsers(
-        metavar="COMMAND", dest=dest, required=required, parser_class=Parser, action=action
+def add_commands(parser: Parser, commands: Sequence[Command], path: str = "") -> None:
+    """Add commands to a parser; the chosen one sets ``run``, ``parser`` and its own word."""
+    level = [each for each in commands if each.path.rpartition(" ")[0] == path]
+    if not level:
+        return
+    group = next((each for each in commands if each.path == path and each.function), None)
+    # Argparse leaves these two columns free, too.
+    width = max(shutil.get_terminal_size().columns - 2, _MIN_HELP_WIDTH)
+    subparsers = parser.add_subparsers(
+        metavar="COMMAND",
+        dest="subcommand" if path else "command",
+        required=bool(path) and group is None,
+        parser_class=Parser,
+        action=_CommandAfterOptions if group else argparse._SubParsersAction,
     )
-    for entry in commands:
-        entry.add_to(parsers)
+    for command in level:
+        summary = f"{command.summary[0].upper()}{command.summary[1:]}."
+        examples = "\n  morphgen ".join(["examples:", *command.examples])
+        child = subparsers.add_parser(
+            command.path.rpartition(" ")[2],
+            help=command.summary,
+            description=textwrap.fill(f"{summary} {command.details}".rstrip(), width),
+            epilog=examples if command.examples else None,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            add_help=not command.basic,
+        )
+        add_commands(child, commands, command.path)
+        if command.function:
+            _add_options(child, command)
+
+
+def _add_options(parser: Parser, command: Command) -> None:
+    """Add the options of a command to its parser."""
+    if command.basic:
+        text = "show the most used options and exit"
+        parser.add_argument("-h", "--help", action=_BriefHelp, help=text)
+        parser.add_argument("--help-all", action="help", help="show all options and exit")
+    exclusive = {
+        name: group
+        for names in command.alternatives
+        for group in [parser.add_mutually_exclusive_group()]
+        for name in names
+    }
+    actions = {
+        name: exclusive.get(name, parser).add_argument(name, **settings)
+        for name, settings in command.options.items()
+    }
+    if command.basic:
+        parser.advanced = [actions[name] for name in actions if name not in command.basic]
+    parser.set_defaults(run=command.start, parser=parser, extra=command.extra)
 
 
 def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:

@@ -7,33 +7,61 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
+from morphgen.benchmark.release import is_release, read_release
+from morphgen.benchmark.scores.submission import (
+    Training,
+    make_submission,
+    require_rules,
+    submission_text,
+)
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, number, option
 from morphgen.cli.progress import note, training_progress
-from morphgen.cli.train import GOAL_SEED, SIDES, robots_to_train, split_option
+from morphgen.cli.train import robots_to_train
 from morphgen.errors import TaskError
+from morphgen.formats.files import require_writable_file, write_file
 from morphgen.progress import stage
 from morphgen.rl.baselines import BASELINES
-from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
-from morphgen.tasks.registry import DEFAULT_SIMULATOR
-
-if TYPE_CHECKING:
-    from morphgen.benchmark.eval_protocol import EvalProtocol
-    from morphgen.rl.evaluation import EvalConfig
-    from morphgen.rl.runs.checkpoint import RunConfig
-    from morphgen.rl.runs.robot_source import RobotSource
-    from morphgen.rl.scores import Score
-    from morphgen.splits.split import Side
-    from morphgen.tasks.task import TaskConfig
+from morphgen.rl.evaluation import (
+    EvalConfig,
+    episodes_for,
+    eval_config_of,
+    evaluate_baseline,
+    evaluate_checkpoints,
+    require_trained_tasks,
+)
+from morphgen.rl.inference import MODES
+from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint, read_config
+from morphgen.rl.runs.robot_source import (
+    FILE,
+    RobotSource,
+    fresh_source,
+    other_side,
+    specs_of,
+    split_of,
+    tasks_of,
+    trained_on,
+)
+from morphgen.rl.runs.training import checkpoint_files
+from morphgen.rl.scores import (
+    Score,
+    require_table,
+    score_table,
+    scores_to_json,
+    summary,
+    write_scores,
+)
+from morphgen.rl.shipped_policies import checkpoint_path, is_named
+from morphgen.splits.split import Side
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, require_device
+from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
+from morphgen.tasks.task import TaskConfig
 
 
 def rules_of(words: Sequence[str]) -> EvalProtocol:
     """Return the rules of the release that ``--split`` names, else the default ones."""
-    from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
-    from morphgen.benchmark.release import is_release, read_release
-
     folder = Path(words[0]) if len(words) == 1 else None
     if folder is None or not is_release(folder):
         return EvalProtocol()
@@ -50,15 +78,6 @@ def plan_submission(
 
     Without ``--submission`` it does nothing. ``facts`` are arguments of ``make_submission``.
     """
-    from morphgen.benchmark.eval_protocol import EvalProtocol
-    from morphgen.benchmark.scores.submission import (
-        make_submission,
-        require_rules,
-        submission_text,
-    )
-    from morphgen.formats.files import require_writable_file, write_file
-    from morphgen.rl.runs.robot_source import split_of
-
     if args.submission is None:
         return lambda scores: None
     if not source.split:
@@ -80,67 +99,8 @@ def plan_submission(
     )
 
 
-@command(
-    "eval",
-    "score a trained policy or a baseline on each robot",
-    option(
-        "checkpoint",
-        "a checkpoint, a run folder, a policy that comes with morphgen "
-        f"({', '.join(POLICIES)}), or a baseline ({', '.join(BASELINES)})",
-    ),
-    split_option("robots of a baseline, or other robots than the checkpoint's"),
-    option("--on", "side of the split (default: both)", choices=SIDES),
-    opt.OBSTACLES.needing("--split"),
-    option(
-        "--mode", "how the policy acts (default: both)", choices=["deterministic", "stochastic"]
-    ),
-    (
-        number("--episodes", "least number of episodes per robot"),
-        number(
-            "--steps",
-            "number of control steps per robot, in episodes of full length",
-            default=10_000,
-        ),
-    ),
-    opt.sim_option("that of the training"),
-    opt.goal_option("that of the training, or position for a baseline"),
-    opt.WORKERS,
-    opt.DEVICE,
-    opt.SEED,
-    GOAL_SEED,
-    option("--out FILE", "write a table: .csv, .json or .md", Path),
-    option(
-        "--submission FILE",
-        "write the outcome of every episode, for morphgen split score; the default mode is then "
-        "deterministic, and the default simulator that of the release, else mujoco",
-        Path,
-    ),
-    option("--method NAME", "with --submission: name of the method in rankings").needing(
-        "--submission"
-    ),
-    opt.LIBRARY.needing("--split"),
-    opt.JSON,
-    details="Scores have 95% bootstrap intervals over episodes, success rates 95% Wilson "
-    "intervals. The score of reach is relative to the random policy; that of push is the success "
-    "rate.",
-    examples=(
-        "eval runs/interpolation/arm3/reach/me-tf/seed0 --on test",
-        "eval ik --split interpolation/arm3/reach",
-        "eval zero-shot --split extrapolation/arms/reach --on test",
-        "eval ik --split interpolation/arm3/reach --submission ik.json",
-    ),
-    extra="rl",
-)
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate and print the scores."""
-    from morphgen.rl.scores import (
-        require_table,
-        score_table,
-        scores_to_json,
-        summary,
-        write_scores,
-    )
-
     if args.out is not None:
         require_table(args.out)
     is_baseline = args.checkpoint in BASELINES
@@ -155,9 +115,6 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
-    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
-    from morphgen.tasks.scenes.env_specs import default_configs
-
     name = args.checkpoint
     if not args.words:
         raise TaskError(f"{name}: name its robots with --split")
@@ -183,27 +140,11 @@ def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
 
 def _prepare(sources: Sequence[RobotSource], config: EvalConfig) -> None:
     """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
-    from morphgen.rl.runs.robot_source import specs_of
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
     for source in sources:
         specs_of(source, GoalConfig(tasks=config.tasks))
 
 
 def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
-    from morphgen.benchmark.scores.submission import Training
-    from morphgen.rl.evaluation import (
-        eval_config_of,
-        evaluate_checkpoints,
-        evaluate_run,
-        require_trained_tasks,
-    )
-    from morphgen.rl.inference import MODES
-    from morphgen.rl.runs.checkpoint import read_checkpoint, read_config
-    from morphgen.rl.runs.robot_source import other_side
-    from morphgen.rl.runs.training import checkpoint_files
-    from morphgen.tasks.registry import require_device
-
     require_device(args.device)
     path = checkpoint_path(args.checkpoint)
     files = list(checkpoint_files(path))
@@ -232,20 +173,16 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
         # A fine-tuned policy was trained before, by a run that its checkpoint does not describe.
         training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
-    _prepare(given or [other_side(run.source, side) for side in sides], config)
+    evaluated = given or [other_side(run.source, side) for side in sides]
+    _prepare(evaluated, config)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
         _warn_of_drawn(files[0].parent, sources)
     for mode in (args.mode,) if args.mode else MODES:
         scores = results[mode] = []
-        if given:
-            for source in given:
-                with stage(f"{mode} on {source.side}"):
-                    scores += evaluate_checkpoints(files, source, config, mode, device=args.device)
-            continue
-        for side in sides:
-            with stage(f"{mode} on {side}"):
-                scores += evaluate_run(path, side, config, mode, device=args.device)
+        for source in evaluated:
+            with stage(f"{mode} on {source.side}"):
+                scores += evaluate_checkpoints(files, source, config, mode, device=args.device)
     write(chain.from_iterable(results.values()))  # with --submission of one mode
     return results
 
@@ -254,9 +191,6 @@ def _given_robots(
     args: argparse.Namespace, run: RunConfig, folder: Path, config: EvalConfig
 ) -> list[RobotSource]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
-    from morphgen.rl.runs.robot_source import fresh_source
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
     if args.words:
         return _sources(args)
     if not run.source.grammars:
@@ -282,8 +216,6 @@ def _simulator(args: argparse.Namespace) -> str | None:
 
 def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
-    from morphgen.rl.runs.robot_source import FILE, trained_on
-
     if not (folder / FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"
         note(f"morphgen: {folder} has no {FILE}: {unknown}")
@@ -300,9 +232,7 @@ def _sides(args: argparse.Namespace, *, has_test: bool) -> tuple[Side, ...]:
 
 
 def _sources(args: argparse.Namespace) -> list[RobotSource]:
-    from morphgen.rl.runs.robot_source import other_side
-
-    source = robots_to_train(args.words, argparse.Namespace(**{**vars(args), "on": "train"}))
+    source = robots_to_train(args.words, args)
     return [other_side(source, side) for side in _sides(args, has_test=bool(source.split))]
 
 
@@ -310,15 +240,10 @@ def _with_goal(
     configs: Iterable[TaskConfig], sources: list[RobotSource], args: argparse.Namespace
 ) -> tuple[TaskConfig, ...]:
     """Return configs with the goal of ``--goal``, which must be for a robot of the sources."""
-    from morphgen.rl.runs.robot_source import tasks_of
-
     return opt.with_goal(configs, args.goal, (task for each in sources for task in tasks_of(each)))
 
 
 def _num_episodes(args: argparse.Namespace) -> int:
-    from morphgen.rl.evaluation import episodes_for
-    from morphgen.tasks.scenes.env_specs import default_configs
-
     if args.episodes is not None:
         return int(args.episodes)
     return episodes_for(args.steps, max(config.max_episode_steps for config in default_configs()))

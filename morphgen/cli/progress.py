@@ -7,15 +7,17 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
+from tqdm import tqdm
+
 from morphgen.progress import Progress, show_progress
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
-
     from morphgen.rl.distributed import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
@@ -43,24 +45,6 @@ def raise_if_interrupted() -> None:
         raise KeyboardInterrupt
 
 
-class Bar:
-    """A bar of tqdm that is set to the number of finished items."""
-
-    def __init__(self, shown: tqdm[NoReturn]) -> None:
-        self._shown = shown
-
-    def __call__(self, done: float, total: int | None = None) -> None:
-        """Show the number of finished items, and of all items if it was unknown."""
-        raise_if_interrupted()
-        if total is not None:
-            self._shown.total = total
-        self._shown.update(done - self._shown.n)  # tqdm counts steps, reports are sums
-
-    def add(self, count: int = 1) -> None:
-        """Show that more items are finished."""
-        self._shown.update(count)
-
-
 @contextmanager
 def bar(
     args: argparse.Namespace, title: str, unit: str = "robot", total: int | None = None
@@ -72,37 +56,39 @@ def bar(
 
 @contextmanager
 def _bar(
-    args: argparse.Namespace,
+    args: argparse.Namespace | None,
     title: str,
     unit: str = "robot",
     total: int | None = None,
     layout: str | None = None,
     delay: float = REDRAW_INTERVAL,
-) -> Iterator[Bar]:
-    """Yield a bar, which disappears at the end.
+) -> Iterator[Progress]:
+    """Yield the function that sets a bar, which disappears at the end.
 
     Nothing is shown without a terminal or with ``--json``.
 
     delay: Time before the bar appears, so that quick commands do not flicker [s].
     """
-    from tqdm import tqdm
-
     raise_if_interrupted()
     hidden = getattr(args, "json", False) or None  # None: shown on a terminal only
-    with (
-        tqdm(
-            desc=title,
-            unit=f" {unit}",
-            total=total,
-            bar_format=layout,
-            file=sys.stderr,
-            disable=hidden,
-            delay=delay,
-            leave=False,
-        ) as shown,
-        _redrawn(shown),
-    ):
-        yield Bar(shown)
+    shown: tqdm[NoReturn] = tqdm(
+        desc=title,
+        unit=f" {unit}",
+        total=total,
+        bar_format=layout,
+        file=sys.stderr,
+        disable=hidden,
+        delay=delay,
+        leave=False,
+    )
+
+    def show(done: float, total: int | None) -> None:
+        raise_if_interrupted()
+        shown.total = shown.total if total is None else total
+        shown.update(done - shown.n)  # tqdm counts steps, reports are sums
+
+    with shown, _redrawn(shown):
+        yield show
 
 
 @contextmanager
@@ -131,11 +117,11 @@ def track(
     items: Iterable[T], args: argparse.Namespace, title: str, unit: str, total: int
 ) -> Iterator[T]:
     """Yield the items, and show in a bar how many of them are finished."""
-    with _bar(args, title, unit, total) as shown:
-        for item in items:
+    with _bar(args, title, unit, total) as show:
+        for done, item in enumerate(items, 1):
             raise_if_interrupted()
             yield item
-            shown.add()
+            show(done, None)
 
 
 def note(text: str) -> None:
@@ -145,14 +131,12 @@ def note(text: str) -> None:
 
 def print_line(line: str) -> None:
     """Print a line above the bars that are shown."""
-    from tqdm import tqdm
-
     with tqdm.external_write_mode():
         print(line, flush=True)
 
 
 @contextmanager
-def status(args: argparse.Namespace, text: str) -> Iterator[None]:
+def status(args: argparse.Namespace | None, text: str) -> Iterator[None]:
     """Show on a terminal what the command does and for how long, until the work is done."""
     with _bar(args, text, layout="{desc} [{elapsed}]"):
         yield
@@ -179,61 +163,60 @@ class TrainingProgress:
 
     def __init__(self) -> None:
         self._shown = ExitStack()
-        self._shown.enter_context(status(argparse.Namespace(), "preparing"))
-        self._goal_bar: Bar | None = None
-        self._last_line: float | None = None
+        self._shown.enter_context(status(None, "preparing"))
+        self._goal_bar: Progress | None = None
+        self._print_goals = _at_intervals(GOAL_LINE_INTERVAL, "goal sets: {:.0f} of {} robots")
 
     def __call__(self, done: float, total: int | None) -> None:
         """Show how many of the robots have their goal set."""
         raise_if_interrupted()
         if not sys.stderr.isatty():
-            now = time.monotonic()
-            if self._last_line is None:
-                self._last_line = now
-            if total and done < total and now - self._last_line > GOAL_LINE_INTERVAL:
-                self._last_line = now
-                note(f"goal sets: {done} of {total} robots")
+            if total and done < total:
+                self._print_goals(done, total)
             return
         if self._goal_bar is None:
             self.close()
-            self._goal_bar = self._shown.enter_context(_bar(argparse.Namespace(), "goal sets"))
+            self._goal_bar = self._shown.enter_context(_bar(None, "goal sets"))
         self._goal_bar(done, total)
         if done == total:
             self.close()
-            self._shown.enter_context(status(argparse.Namespace(), "preparing"))
+            self._shown.enter_context(status(None, "preparing"))
 
     def training(self, subrun: Subrun) -> ShowMetrics:
         """Begin with a subrun; return the function that shows its metrics.
 
         A line at its end says how many of its episodes diverged, if any did.
         """
-        from tqdm import tqdm
-
         from morphgen.rl.runs.robot_source import tasks_of
-        from morphgen.tasks.registry import TASKS
 
         raise_if_interrupted()
         self.close()
-        name = subrun.config.source.member or subrun.config.source.name
-        diverged = Counter[str]()
-        self._shown.callback(_print_divergence, name, diverged)
+        config = subrun.config
+        name = config.source.member or config.source.name
+        counts = Counter[str]()
+        self._shown.callback(_print_divergence, name, counts)
         # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
-        tasks = tasks_of(subrun.config.source)
-        shown_metric = "score" if any(TASKS[t].relative_to_random for t in tasks) else "reward"
-        if not sys.stderr.isatty():
-            return lambda report, total: _print_update(
-                name, _counted(report, diverged), total, shown_metric
+        is_relative = any(TASKS[task].relative_to_random for task in tasks_of(config.source))
+        metric = "score" if is_relative else "reward"
+        show = partial(_print_update, name)
+        if sys.stderr.isatty():
+            shown: tqdm[NoReturn] = tqdm(
+                desc=name,
+                total=config.num_updates * config.ppo.num_steps * config.num_envs,
+                unit="step",
+                unit_scale=True,
+                file=sys.stderr,
+                dynamic_ncols=True,
             )
-        shown = tqdm(
-            desc=name,
-            total=subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs,
-            unit="step",
-            unit_scale=True,
-            file=sys.stderr,
-            dynamic_ncols=True,
-        )
-        self._shown.callback(shown.close)
-        return lambda report, total: _draw_update(shown, _counted(report, diverged), shown_metric)
+            self._shown.callback(shown.close)
+            show = partial(_draw_update, shown)
+
+        def update(report: UpdateMetrics, total: int) -> None:
+            counts.update(episodes=report.episodes, diverged=report.unstable)
+            success = f"{report.success:.0%}" if report.episodes else "unknown"
+            show(report, total, {metric: f"{getattr(report, metric):.2f}", "success": success})
+
+        return update
 
     @contextmanager
     def stage(self, title: str) -> Iterator[None]:
@@ -241,12 +224,11 @@ class TrainingProgress:
         raise_if_interrupted()
         self.close()
         if not sys.stderr.isatty():
-            with show_progress(_print_each_minute(title)):
+            with show_progress(_at_intervals(LINE_INTERVAL, f"{title}: {{:.0f}} of {{}} episodes")):
                 yield
             return
         layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
-        shown = _bar(argparse.Namespace(), title, "episode", layout=layout, delay=0)
-        with shown as show, show_progress(show):
+        with _bar(None, title, "episode", layout=layout, delay=0) as show, show_progress(show):
             yield
 
     def close(self) -> None:
@@ -255,45 +237,41 @@ class TrainingProgress:
         self._goal_bar = None
 
 
-def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics, metric: str) -> None:
+def _draw_update(
+    shown: tqdm[NoReturn], report: UpdateMetrics, total: int, facts: Mapping[str, str]
+) -> None:
     if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
         shown.initial = report.transitions - report.transitions // report.update
         shown.n = shown.initial
-    facts = {metric: f"{getattr(report, metric):.2f}", "success": _success(report)}
     shown.set_postfix(facts, refresh=False)
     shown.update(report.transitions - shown.n)
 
 
-def _print_update(name: str, report: UpdateMetrics, num_updates: int, metric: str) -> None:
+def _print_update(name: str, report: UpdateMetrics, total: int, facts: Mapping[str, str]) -> None:
     # The last update always has its line.
-    if report.update % max(num_updates // TRAINING_LINES, 1) and report.update < num_updates:
+    if report.update % max(total // TRAINING_LINES, 1) and report.update < total:
         return
-    updates_left = num_updates - report.update
     # Every update has equally many transitions.
-    seconds_left = updates_left * report.transitions / report.update / report.steps_per_second
+    seconds_left = (total - report.update) * report.transitions / report.update
+    seconds_left /= report.steps_per_second
     note(
-        f"{name}: update {report.update} of {num_updates}, {report.transitions:,} steps, "
-        f"{metric} {getattr(report, metric):.2f}, success {_success(report)}, "
+        f"{name}: update {report.update} of {total}, {report.transitions:,} steps, "
+        f"{', '.join(map(' '.join, facts.items()))}, "
         f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
     )
 
 
-def _print_each_minute(name: str) -> Progress:
+def _at_intervals(interval: float, line: str) -> Progress:
+    """Return a function that prints a line, but not more often than at an interval [s]."""
     last = time.monotonic()
 
     def update(done: float, total: int | None) -> None:
         nonlocal last
-        if time.monotonic() - last > LINE_INTERVAL:
+        if time.monotonic() - last > interval:
             last = time.monotonic()
-            note(f"{name}: {done:.0f} of {total} episodes")
+            note(line.format(done, total))
 
     return update
-
-
-def _counted(report: UpdateMetrics, diverged: Counter[str]) -> UpdateMetrics:
-    """Add the episodes of an update, and those that diverged, to the counts of its training."""
-    diverged.update(episodes=report.episodes, diverged=report.unstable)
-    return report
 
 
 def _print_divergence(name: str, counts: Counter[str]) -> None:
@@ -302,7 +280,3 @@ def _print_divergence(name: str, counts: Counter[str]) -> None:
             f"{name}: {counts['diverged']} of {counts['episodes']} episodes ended because their "
             "simulation diverged"
         )
-
-
-def _success(report: UpdateMetrics) -> str:
-    return f"{report.success:.0%}" if report.episodes else "unknown"

@@ -8,83 +8,52 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
+from tabulate import tabulate
+
+from morphgen.checks import check
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option, repeated
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import CompositionError, FormatError, MorphgenError
-
-if TYPE_CHECKING:
-    from morphgen.formats.description import NamedDescription
-    from morphgen.model.robot import Joint, Robot
-
+from morphgen.fitting.collision_geometry import with_geometry
+from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
+from morphgen.formats.data_files import read_json
+from morphgen.formats.description import NamedDescription, find_description
+from morphgen.grammar.catalogue import catalogue
+from morphgen.grammar.compose import compose as compose_parts
+from morphgen.grammar.part import part_manifest, write_part
+from morphgen.grammar.request import parse_words
+from morphgen.grammar.robot_source import import_robot, read_source
+from morphgen.model.robot import Joint, Robot
 
 PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
 
 
-@command(
-    "compose",
-    "join a base, arms and end-effectors into a robot",
-    option(
-        "words [GRAMMAR] KEY=VALUE",
-        "arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
-        nargs="+",
-    ),
-    option(
-        "--geometry",
-        "collision shapes: meshes of real parts; in their place fitted boxes, cylinders and "
-        "spheres, or convex pieces by CoACD, which takes minutes once for each part; or 8 spheres "
-        "for each link",
-        choices=["mesh", "primitive", "convex", "sphere"],
-        default="mesh",
-    ),
-    *opt.BUNDLE_OUT,
-    *opt.LIBRARY_JSON,
-    details="The bundle is a folder with the robot as URDF and MJCF. If the first word is a "
-    "grammar (see: morphgen grammar list), the robot follows its first alternatives and typical "
-    "values, except for those that KEY=VALUE sets.",
-    examples=("compose arm=ur5 ee=plane ee.size=80mm --out robots/", "compose chain beads=5"),
-)
 def compose(args: argparse.Namespace) -> int:
     """Compose a robot, check it and write its bundle."""
-    from morphgen.grammar.compose import compose
-    from morphgen.grammar.request import parse_words
-
     library = opt.library_of(args)
     with status(args, "composing"):
         derivation, name = parse_words(args.words, library)
-        robot = compose(derivation, library, name if args.name is None else args.name)
+        robot = compose_parts(derivation, library, name if args.name is None else args.name)
     if args.geometry != "mesh":
-        from morphgen.fitting.collision_geometry import with_geometry
-
         with bar(args, "replacing collision meshes", "shape"):
             robot = with_geometry(robot, args.geometry, library.folders)
-    written = write_checked(robot, args)
-    opt.print_result(args, written.data, lambda: written.text)
-    return written.code
+    data, text, code = write_checked(robot, args)
+    opt.print_result(args, data, lambda: text)
+    return code
 
 
-@dataclass(frozen=True)
-class WrittenBundle:
-    """Summary of a bundle that was written, as JSON and as text, with the exit code."""
-
-    data: dict[str, object]
-    """Folder and card of the bundle, printed with ``--json``."""
-    text: str
-    """Folder, sizes, repairs, findings and files of the bundle, in lines."""
-    code: int
-    """1 if the checks find an error in the robot, as ``morphgen check`` does, else 0."""
+Written: TypeAlias = tuple[dict[str, object], str, int]
+"""Summary of a bundle that was written, as JSON and as text, and the exit code."""
 
 
-def write_checked(robot: Robot, args: argparse.Namespace) -> WrittenBundle:
-    """Check a robot, write ``args.out / robot.name``, and return what to print."""
-    from morphgen.checks import check
-    from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
-    from morphgen.formats.data_files import read_json
+def write_checked(robot: Robot, args: argparse.Namespace) -> Written:
+    """Check a robot, write ``args.out / robot.name``, and return what to print.
 
+    The exit code is 1 if the checks find an error in the robot, as ``morphgen check`` does.
+    """
     folder = bundle_folder(args.out, robot.name)
     with status(args, f"checking and writing {folder}"):
         findings = check(robot)
@@ -96,49 +65,22 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> WrittenBundle:
     ]
     repairs = robot.provenance.get("repairs", ())
     lines += [f"  repaired {repair}" for repair in repairs]  # type: ignore[attr-defined]
-    lines += [
-        f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}"
-        for finding in findings
-        if finding.severity != "info"
-    ]
+    lines += [f"  {opt.finding_line(each)}" for each in findings if each.severity != "info"]
     files = sorted(folder.iterdir())
     lines += [f"  {path.name}{'/' if path.is_dir() else ''}" for path in files]
-    return WrittenBundle(
-        {"folder": str(folder), "card": read_json(folder / CARD)},
-        "\n".join(lines),
-        int(any(finding.severity == "error" for finding in findings)),
-    )
+    data = {"folder": str(folder), "card": read_json(folder / CARD)}
+    return data, "\n".join(lines), int(any(each.severity == "error" for each in findings))
 
 
-@command(
-    "list",
-    "list the parts that morphgen compose joins",
-    option("kind", "list only this kind", nargs="?", choices=list(PART_KINDS)),
-    *opt.LIBRARY_JSON,
-    details="The columns are degrees of freedom, reach (m), mass (kg), source, licence "
-    "and manufacturer of the real product.",
-    examples=("list arms",),
-)
 def list_parts(args: argparse.Namespace) -> None:
     """Print a table with a row per part."""
-    from morphgen.grammar.catalogue import catalogue
-
     with status(args, "reading the parts"):
         rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
-    opt.print_result(args, rows, lambda: opt.table(rows, headers="keys", floatfmt=".3g"))
+    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
 
 
-@command(
-    "show",
-    "print the link tree of a robot with joints, limits, masses and frames",
-    opt.ROBOT,
-    *opt.ROOT_LIBRARY_JSON,
-    examples=("show ur5-plane", "show my_arm.urdf"),
-)
 def show(args: argparse.Namespace) -> None:
     """Print the link tree of one robot."""
-    from morphgen.grammar.robot_source import read_source
-
     sources = opt.sources_of(args)
     if len(sources) > 1:
         raise CompositionError(
@@ -209,61 +151,8 @@ def _facts(robot: Robot) -> dict[str, object]:
     }
 
 
-KINDS_OF_PARTS = ("arm", "ee", "body")
-"""Kinds of parts that a robot can become."""
-_PARTS = Path("parts")
-
-
-@command(
-    "import",
-    "turn a URDF, xacro or MJCF into a bundle, or several",
-    option(
-        "files FILE",
-        "a URDF, an MJCF, or a xacro if its suffix is .xacro; or menagerie:NAME or "
-        "robot_descriptions:NAME, a robot of one of these pip packages",
-        nargs="+",
-    ),
-    option("--root-link LINK", "link where the robot begins (default: the root of the file)"),
-    option("--tool LINK", "link whose frame is the tool"),
-    option("--srdf FILE", "an SRDF; the pairs of links that it disables are ignored, too", Path),
-    repeated("--arg NAME=VALUE", "a xacro argument"),
-    flag(
-        "--as-is",
-        "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
-        "robot",
-    ),
-    flag(
-        "--skip-missing-meshes",
-        "leave out the shapes of a URDF whose mesh is missing; the findings and the card name them",
-    ),
-    option("--part", "also write a manifest: the robot becomes a part", choices=KINDS_OF_PARTS),
-    option(
-        "--parts DIR", f"with --part: folder of the manifests (default: {_PARTS})", Path
-    ).needing("--part"),
-    option("--licence TEXT", "with --part: licence, if the robot's source has none").needing(
-        "--part"
-    ),
-    opt.ROOT,
-    *opt.BUNDLE_OUT,
-    opt.JSON,
-    details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
-    "no safe repair removes (see morphgen check); the bundle is written all the same. Robots of "
-    "several files are named after their files; those that are refused are named with the reason, "
-    "and the exit code is 2. With --json, several files give one array with an object per file.",
-    examples=(
-        "import my_arm.urdf --tool flange",
-        "import my_arm.xacro --arg length=0.4",
-        "import scene.xml --root-link base",
-        "import my_arm.urdf --tool flange --srdf my_arm.srdf",
-        "import menagerie:universal_robots_ur5e --part arm --licence BSD-3-Clause",
-        "import bodies/*.xml --tool torso --part arm --licence MIT --out imported",
-    ),
-)
 def import_robots(args: argparse.Namespace) -> int:
     """Import descriptions, check them and write their bundles."""
-    from morphgen.formats.bundle import bundle_folder
-    from morphgen.formats.description import find_description
-
     sources = list(dict.fromkeys(args.files))
     if len(sources) > 1:
         if args.name is not None:
@@ -283,9 +172,9 @@ def import_robots(args: argparse.Namespace) -> int:
     xacro_args = _xacro_args(args.arg)
     if len(sources) > 1:
         return _import_several(sources, args, xacro_args)
-    robot = _import(find_description(sources[0]), args.name, xacro_args, args)
-    opt.print_result(args, robot.data, lambda: robot.text)
-    return robot.code
+    data, text, code = _import(find_description(sources[0]), args.name, xacro_args, args)
+    opt.print_result(args, data, lambda: text)
+    return code
 
 
 def _xacro_args(words: Sequence[str]) -> dict[str, str]:
@@ -301,8 +190,6 @@ def _import_several(
     sources: Sequence[str], args: argparse.Namespace, xacro_args: Mapping[str, str]
 ) -> int:
     """Import every file that can be, and print what became of each; return the exit code."""
-    from morphgen.formats.description import find_description
-
     found: dict[str, NamedDescription | MorphgenError] = {}
     for file in sources:
         try:
@@ -316,15 +203,15 @@ def _import_several(
         try:
             if isinstance(description, MorphgenError):
                 raise description
-            robot = _import(description, names[file], xacro_args, args)
+            data, text, own_code = _import(description, names[file], xacro_args, args)
         except MorphgenError as error:
             objects.append({"file": file, **opt.refusal(error, file, Path(file).name)})
             code = 2
             continue
-        objects.append({"file": file, **robot.data})
-        code = max(code, robot.code)
+        objects.append({"file": file, **data})
+        code = max(code, own_code)
         if not args.json:
-            print(robot.text)
+            print(text)
     if args.json:
         print(json.dumps(objects, default=str))
     return code
@@ -332,8 +219,6 @@ def _import_several(
 
 def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict[str, str]:
     """Return the names of the bundles: those of the descriptions, without their suffixes."""
-    from morphgen.formats.bundle import bundle_folder
-
     names = {
         file: re.sub(r"\W", "_", description.path.stem.removesuffix(".urdf"), flags=re.ASCII)
         for file, description in found.items()
@@ -360,12 +245,8 @@ def _import(
     name: str | None,
     xacro_args: Mapping[str, str],
     args: argparse.Namespace,
-) -> WrittenBundle:
+) -> Written:
     """Import a robot, and write its bundle and, if asked for, its manifest."""
-    from morphgen.formats.bundle import URDF, bundle_folder
-    from morphgen.grammar.part import part_manifest, write_part
-    from morphgen.grammar.robot_source import import_robot
-
     licence = args.licence or description.licence
     if args.part and not licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")
@@ -389,10 +270,10 @@ def _import(
         )
     part = None
     if args.part:  # refuses before the bundle is replaced
-        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, licence)
-    written = write_checked(robot, args)
+        part = part_manifest(robot, folder / URDF, args.part, args.parts, licence)
+    data, text, code = write_checked(robot, args)
     if part is None:
-        return written
+        return data, text, code
     write_part(*part)
     path = str(part[0])
-    return replace(written, data={**written.data, "part": path}, text=f"{written.text}\n{path}")
+    return {**data, "part": path}, f"{text}\n{path}", code

@@ -9,61 +9,73 @@ import math
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from tabulate import tabulate
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, command, flag, number, option, repeated
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import FormatError
+from morphgen.fitting.collision_geometry import with_geometry
+from morphgen.fitting.replace_collision import as_spheres
+from morphgen.formats.bundle import CARD, URDF, write_bundle
+from morphgen.formats.data_files import read_json, read_text
+from morphgen.grammar import analysis
+from morphgen.grammar.analysis import check_grammar, count_structures, load_sound_grammar, variables
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, difference, outline, parse_derivation
+from morphgen.grammar.grammar_file import (
+    Grammar,
+    find_grammar,
+    grammar_from_text,
+    grammar_names,
+    grammar_summary,
+    grammar_text,
+    load_grammar,
+)
+from morphgen.grammar.library import Library
+from morphgen.grammar.request import parse_words
+from morphgen.grammar.robot_set import (
+    DERIVATION,
+    GRAMMAR,
+    SetConfig,
+    light_urdf,
+    make_in_processes,
+    make_on_ray,
+    make_set,
+    read_index,
+    read_settings,
+)
+from morphgen.grammar.robot_source import find_robots
+from morphgen.grammar.sampling import mutate as mutations
+from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT, MAX_DERIVATION_TEXT, MAX_TEXT
+from morphgen.grammar.values import parse_conditions
 
-if TYPE_CHECKING:
-    from morphgen.grammar.derivation import Derivation
-    from morphgen.grammar.library import Library
-    from morphgen.grammar.robot_source import RobotSource
 
-
-GRAMMAR = option("grammar", "name of a grammar (see: morphgen grammar list), or its file")
-
-
-@command("list", "list the grammars that come with morphgen", opt.JSON)
 def list_grammars(args: argparse.Namespace) -> None:
     """Print the names and summaries."""
-    from morphgen.grammar.grammar_file import grammar_names, grammar_summary
-
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
-    opt.print_result(args, rows, lambda: opt.table(rows, headers="keys"))
+    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
 
 
-@command(
-    "check",
-    "check a grammar for faults",
-    GRAMMAR,
-    *opt.LIBRARY_JSON,
-    details="The exit code is 1 if it has any.",
-)
+def _grammar(args: argparse.Namespace) -> Grammar:
+    """Return the grammar of the arguments, which may have faults."""
+    folders = opt.library_of(args).folders
+    return load_grammar(find_grammar(args.grammar, folders), folders)
+
+
 def check(args: argparse.Namespace) -> int:
     """Print every fault."""
-    from morphgen.grammar.analysis import check_grammar
-
     library = opt.library_of(args)
-    grammar = opt.load_grammar_named(args.grammar, library)
+    grammar = _grammar(args)
     faults = check_grammar(grammar, library)
     opt.print_result(args, faults, lambda: "\n".join(faults) or f"{grammar.name}: sound")
     return int(bool(faults))
 
 
-@command(
-    "count",
-    "count the structures of a grammar, and list the values that are sampled",
-    GRAMMAR,
-    *opt.LIBRARY_JSON,
-)
 def count(args: argparse.Namespace) -> None:
     """Print the number of structures and the sampled values."""
-    from morphgen.grammar.analysis import count_structures, variables
-    from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT
-
-    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
+    grammar = load_sound_grammar(args.grammar, opt.library_of(args))
     structures, sampled = count_structures(grammar), variables(grammar)
     data = {
         "structures": int(structures) if structures <= MAX_COUNT else None,
@@ -86,20 +98,11 @@ def count(args: argparse.Namespace) -> None:
     opt.print_result(args, data, text)
 
 
-@command(
-    "enumerate",
-    "print every structure of a grammar, with typical values",
-    GRAMMAR,
-    number("--limit", "largest number of structures", default=50, least=0),
-    *opt.LIBRARY_JSON,
-)
 def enumerate_structures(args: argparse.Namespace) -> None:
     """Print a derivation per line."""
-    from morphgen.grammar.analysis import enumerate_structures
-
     library = opt.library_of(args)
-    grammar = opt.load_grammar_named(args.grammar, library, sound=True)
-    structures = enumerate_structures(grammar, library)
+    grammar = load_sound_grammar(args.grammar, library)
+    structures = analysis.enumerate_structures(grammar, library)
     texts = map(str, itertools.islice(structures, args.limit))
     if args.json:
         print(json.dumps(list(texts)))
@@ -108,54 +111,15 @@ def enumerate_structures(args: argparse.Namespace) -> None:
         print(text)
 
 
-@command("print", "print a grammar and its includes as one text", GRAMMAR, *opt.LIBRARY_JSON)
 def print_grammar(args: argparse.Namespace) -> None:
     """Print the text of the grammar."""
-    from morphgen.grammar.grammar_file import grammar_text
-
-    text = grammar_text(opt.load_grammar_named(args.grammar, opt.library_of(args)))
+    text = grammar_text(_grammar(args))
     opt.print_result(args, text, lambda: text.removesuffix("\n"))
 
 
-grammar = Command(
-    "grammar",
-    "list, check, count, enumerate or print grammars",
-    commands=(list_grammars, check, count, enumerate_structures, print_grammar),
-)
-
-
-NUMBER = number("-n", "number of robots", default=10)
-
-
-@command(
-    "sample",
-    "sample robots from a grammar",
-    GRAMMAR,
-    NUMBER,
-    opt.SEED,
-    option("--out DIR", "output folder (default: robots/GRAMMAR)", Path),
-    repeated("--where CONDITION", "keep only robots such as 'reach > 0.4 and dof >= 5'"),
-    flag("--light", "write the URDF and the derivation only"),
-    opt.NO_PICTURE,
-    opt.JOBS,
-    opt.RAY,
-    *opt.LIBRARY_JSON,
-    details="The same seed gives the same robots, with any number of jobs. Run the command again "
-    "to continue an interrupted one.",
-    examples=("sample chain -n 100 --jobs 4", "sample arm5 --where 'reach > 0.4'"),
-)
 def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
-    from morphgen.grammar.grammar_file import grammar_text
-    from morphgen.grammar.robot_set import (
-        SetConfig,
-        make_in_processes,
-        make_on_ray,
-        make_set,
-    )
-    from morphgen.grammar.values import parse_conditions
-
-    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
+    grammar = load_sound_grammar(args.grammar, opt.library_of(args))
     parse_conditions(args.where, "--where")  # refuses invalid ones
     folder = args.out or Path("robots") / grammar.name
     config = SetConfig(
@@ -183,33 +147,16 @@ def sample(args: argparse.Namespace) -> None:
     opt.print_result(args, {"folder": str(folder), **asdict(report)}, summary)
 
 
-@command(
-    "derive",
-    "print or replay the derivation of a robot",
-    option(
-        "words ROBOT",
-        "folder of a bundle or of a robot of a light set, or words of morphgen compose",
-        nargs="+",
-    ),
-    flag(
-        "--replay",
-        "build the URDF of a folder anew; the exit code is 1 unless every byte is the same",
-    ),
-    *opt.LIBRARY_JSON,
-    details="The derivation lists the parts of a robot, its grammar's choices and all parameters.",
-    examples=("derive robots/chain/chain-000001 --replay",),
-)
 def derive(args: argparse.Namespace) -> int:
     """Print or replay a derivation."""
-    from morphgen.formats.bundle import URDF
-    from morphgen.grammar.derivation import outline
-    from morphgen.grammar.robot_source import find_robots
-
     library = opt.library_of(args)
     source, *others = find_robots(args.words, library)
     if others:
         raise FormatError(f"{source.label} and {others[0].label}: expected one robot")
-    derivation = _derivation(source, library)
+    if source.path is None:
+        derivation, _ = parse_words(source.words, library)
+    else:
+        derivation = _stored_derivation(source.path)
     if not args.replay:
         opt.print_result(args, str(derivation), lambda: outline(derivation))
         return 0
@@ -225,28 +172,8 @@ def derive(args: argparse.Namespace) -> int:
     return int(not same)
 
 
-@command(
-    "mutate",
-    "sample neighbours of a robot: one choice or parameter of its grammar changed",
-    option("robot ROBOT", "a robot's folder in a set of morphgen sample", Path),
-    NUMBER,
-    opt.SEED,
-    option("--out DIR", "output folder (default: SET-mutants-SEED)", Path),
-    opt.NO_PICTURE,
-    *opt.LIBRARY_JSON,
-    examples=("mutate robots/chain/chain-000001 -n 20",),
-)
 def mutate(args: argparse.Namespace) -> None:
     """Write neighbours as bundles and print what differs."""
-    from morphgen.formats.bundle import write_bundle
-    from morphgen.formats.data_files import read_text
-    from morphgen.grammar.derivation import difference
-    from morphgen.grammar.grammar_file import grammar_from_text
-    from morphgen.grammar.robot_set import GRAMMAR, read_index, read_settings
-    from morphgen.grammar.sampling import mutate
-    from morphgen.grammar.syntax import MAX_TEXT
-    from morphgen.grammar.values import parse_conditions
-
     name, folder = args.robot.name, args.robot.resolve().parent
     if not (folder / GRAMMAR).is_file():
         _require_folder(args.robot)
@@ -260,7 +187,7 @@ def mutate(args: argparse.Namespace) -> None:
     grammar = grammar_from_text(read_text(folder / GRAMMAR, MAX_TEXT), settings["grammar"])
     origin = _stored_derivation(args.robot)
     out = args.out or folder.parent / f"{folder.name}-mutants-{args.seed}"
-    neighbours = mutate(
+    neighbours = mutations(
         grammar,
         opt.library_of(args),
         records[name]["choices"],
@@ -285,11 +212,6 @@ def mutate(args: argparse.Namespace) -> None:
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
     """Return the URDF that a derivation gives, as in a bundle or in a light set."""
-    from morphgen.fitting.collision_geometry import with_geometry
-    from morphgen.formats.bundle import CARD, URDF, write_bundle
-    from morphgen.grammar.compose import compose
-    from morphgen.grammar.robot_set import light_urdf
-
     robot = compose(derivation, library, folder.resolve().name)
     if not (folder / CARD).is_file():  # a light set has no meshes and no card
         return light_urdf(robot)
@@ -304,8 +226,6 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
                 "replay the robot that was fitted"
             )
         if "spheres" in primitives:
-            from morphgen.fitting.replace_collision import as_spheres
-
             number, cover = primitives["spheres"], primitives.get("cover")
             if not isinstance(number, int) or not isinstance(cover, float | None):
                 raise FormatError(
@@ -320,21 +240,7 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
         return (bundle / URDF).read_text(encoding="utf-8")
 
 
-def _derivation(source: RobotSource, library: Library) -> Derivation:
-    from morphgen.grammar.request import parse_words
-
-    if source.path is None:
-        return parse_words(source.words, library)[0]
-    return _stored_derivation(source.path)
-
-
 def _stored_derivation(folder: Path) -> Derivation:
-    from morphgen.formats.bundle import CARD
-    from morphgen.formats.data_files import read_text
-    from morphgen.grammar.derivation import parse_derivation
-    from morphgen.grammar.robot_set import DERIVATION
-    from morphgen.grammar.syntax import MAX_DERIVATION_TEXT
-
     _require_folder(folder)
     light, card = folder / DERIVATION, folder / CARD
     if light.is_file():
@@ -348,9 +254,6 @@ def _stored_derivation(folder: Path) -> Derivation:
 
 
 def _card(folder: Path) -> dict[str, Any]:
-    from morphgen.formats.bundle import CARD
-    from morphgen.formats.data_files import read_json
-
     content = read_json(folder / CARD)
     if not isinstance(content, dict):
         raise FormatError(f"{folder / CARD}: expected an object, not {type(content).__name__}")

@@ -8,49 +8,43 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from tabulate import tabulate
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, option
 from morphgen.cli.progress import bar, track
+from morphgen.encoding.similarity import (
+    Features,
+    classical_mds,
+    features,
+    get_measure,
+    similarity_matrix,
+    to_distances,
+)
+from morphgen.encoding.tokens import (
+    LAYOUT,
+    default_max_links,
+    require_max_links,
+    robot_from_tokens,
+    tokens_npz,
+)
+from morphgen.encoding.tokens import tokens as encode
 from morphgen.errors import BenchmarkError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.files import require_writable_file, write_file
+from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
+from morphgen.model.robot import Robot
 from morphgen.progress import part_of
-
-if TYPE_CHECKING:
-    from morphgen.encoding.similarity import Features
-    from morphgen.model.geometry import Shape
-    from morphgen.model.robot import Robot
-    from morphgen.typing import Array
-
+from morphgen.typing import Array
 
 MEASURES = ("cosine", "tree", "workspace", "all")
 LARGEST_MATRIX = 20
 """Largest number of robots whose matrix is printed."""
 
 
-@command(
-    "similarity",
-    "compare robots: tokens, kinematic trees, workspaces",
-    opt.ROBOTS,
-    option("--measure", "how the robots are compared", choices=MEASURES, default="tree"),
-    option("--heatmap FILE.png", "draw the matrix", Path),
-    option("--map FILE.png", "draw the robots by their distances", Path),
-    option("--csv FILE", "write a row per pair of robots", Path),
-    opt.MAX_LINKS,
-    *opt.ROOT_LIBRARY_JSON,
-    details="The whole matrix is printed for up to 20 robots; beyond that, the nearest robot of "
-    "each.",
-    examples=(
-        "similarity robots/ur5-plane robots/panda-stick",
-        "similarity robots/arm3 --measure all --heatmap arm3.png",
-    ),
-)
 def similarity(args: argparse.Namespace) -> None:
     """Compare the robots, print the result and write the files."""
-    from morphgen.encoding.similarity import get_measure, similarity_matrix
-    from morphgen.formats.files import require_writable_file, write_file
-
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
     outputs = {
         "--heatmap": (args.heatmap, ".png", _heatmap),
@@ -91,13 +85,10 @@ def similarity(args: argparse.Namespace) -> None:
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
     """Return the features of the robots and their names; equal names are replaced by labels."""
-    from morphgen.encoding.similarity import features
-    from morphgen.fitting.token_shapes import token_shapes
-
     pairs, folders = opt.read_robots(args), opt.library_of(args).folders
     if len(pairs) < 2:
         raise BenchmarkError(f"{pairs[0][0].label} is one robot; name others to compare it with")
-    max_links = opt.max_links_for(args, [robot for _, robot in pairs])
+    max_links = _max_links(args, [robot for _, robot in pairs])
     computed = []
     for source, robot in track(pairs, args, "computing features", "robot", len(pairs)):
         try:
@@ -110,12 +101,21 @@ def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
     return computed, names
 
 
+def _max_links(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
+    """Return the number of links that tokens are padded to.
+
+    It is the value of ``--max-links``, else the benchmark's or that of the largest robot if it has
+    more, such as a robot with two arms. All robots of a command share it.
+    """
+    if args.max_links is None:
+        return default_max_links(len(robot.links) for robot in robots)
+    for robot in robots:
+        require_max_links(len(robot.links), f"robot {robot.name!r}", args.max_links)
+    return int(args.max_links)
+
+
 def _text(names: Sequence[str], measure: str, values: Array) -> str:
     """Return the table of a measure with its title and statistics."""
-    import numpy as np
-
-    from morphgen.encoding.similarity import get_measure
-
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
     table = _matrix_table if len(names) <= LARGEST_MATRIX else _nearest_table
     pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
@@ -129,14 +129,10 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
 
 def _matrix_table(names: Sequence[str], measure: str, values: Array) -> str:
     rows = [(i, name, *row) for i, (name, row) in enumerate(zip(names, values, strict=True))]
-    return opt.table(rows, ("#", "robot", *map(str, range(len(names)))), floatfmt=".3f")
+    return tabulate(rows, ("#", "robot", *map(str, range(len(names)))), floatfmt=".3f")
 
 
 def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
-    import numpy as np
-
-    from morphgen.encoding.similarity import to_distances
-
     distance = to_distances(values, measure)
     np.fill_diagonal(distance, np.inf)  # no robot is its own nearest
     means = (values.sum(axis=1) - values.diagonal()) / (len(names) - 1)  # without the robot itself
@@ -144,12 +140,11 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
         (name, names[nearest], values[i, nearest], means[i])
         for i, (name, nearest) in enumerate(zip(names, distance.argmin(axis=1), strict=True))
     ]
-    return opt.table(rows, ("robot", "nearest", measure, "mean of others"), floatfmt=".3f")
+    return tabulate(rows, ("robot", "nearest", measure, "mean of others"), floatfmt=".3f")
 
 
 def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import Panel, heatmap_png
-    from morphgen.encoding.similarity import get_measure
 
     panels = []
     for name, values in matrices.items():
@@ -159,7 +154,6 @@ def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
 
 def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     from morphgen.benchmark.figures import MapPanel, map_png
-    from morphgen.encoding.similarity import classical_mds, to_distances
 
     panels = []
     for name, values in matrices.items():
@@ -168,8 +162,6 @@ def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
 
 
 def _title(measure: str) -> str:
-    from morphgen.encoding.similarity import get_measure
-
     return f"{measure}: {get_measure(measure).meaning}"
 
 
@@ -191,28 +183,8 @@ HEADERS = (
 )
 
 
-@command(
-    "tokens",
-    "print or write the tokens of robots, 48 numbers per link",
-    option("words ROBOT", opt.ROBOTS_HELP, nargs="*"),
-    flag("--layout", "print the fields of a token"),
-    option("--out FILE.npz", "write the tokens to this file", Path),
-    opt.MAX_LINKS,
-    *opt.ROOT_LIBRARY_JSON,
-    details="The table shows the tokens decoded, at the home configuration. The token of a link "
-    "holds the one primitive that overlaps the link most.",
-    examples=(
-        "tokens robots/ur5-plane --out ur5-plane.npz",
-        "tokens arm=ur5 ee=plane",
-        "tokens --layout",
-    ),
-)
 def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
-    from morphgen.encoding.tokens import tokens, tokens_npz
-    from morphgen.fitting.token_shapes import token_shapes
-    from morphgen.formats.files import require_writable_file, write_file
-
     if not args.words:
         if not args.layout or args.out or args.max_links is not None:
             raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
@@ -223,9 +195,9 @@ def tokens(args: argparse.Namespace) -> None:
     robots, folders = [robot for _, robot in opt.read_robots(args)], opt.library_of(args).folders
     if args.out and len(robots) > 1:
         raise BenchmarkError(f"--out {args.out}: {len(robots)} robots are named; expected one")
-    max_links = opt.max_links_for(args, robots)
+    max_links = _max_links(args, robots)
     tables = [
-        tokens(robot, token_shapes(robot, folders), max_links=max_links)
+        encode(robot, token_shapes(robot, folders), max_links=max_links)
         for robot in track(robots, args, "computing tokens", "robot", len(robots))
     ]
     data = [_data(*pair, max_links) for pair in zip(robots, tables, strict=True)]
@@ -253,8 +225,6 @@ def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:
 
 def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
     """Return a table with a row per link, decoded from the tokens."""
-    from morphgen.encoding.tokens import robot_from_tokens
-
     decoded, shapes = robot_from_tokens(tokens, robot.name, max_links=max_links)
     home = dict(zip(decoded.independent_joints, decoded.home, strict=True))
     tools = {frame.link for frame in decoded.frames}
@@ -276,13 +246,11 @@ def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
                 f"{home[i - 1] + 0.0:.3f}" if i - 1 in home else "",
             )
         )
-    table = opt.table(rows, HEADERS, disable_numparse=True)
+    table = tabulate(rows, HEADERS, disable_numparse=True)
     return f"{table}\n{robot.name}: {tokens.shape}, indices over {max_links - 1}"
 
 
 def _geometry_text(shape: Shape | None) -> str:
-    from morphgen.model.geometry import Box, Cylinder, Sphere
-
     match shape.geometry if shape else None:
         case Box(edges):
             return f"box {' x '.join(f'{edge:.3g}' for edge in edges)}"
@@ -300,13 +268,9 @@ def _numbers(values: Sequence[float], digits: int = 3) -> str:
 
 
 def _layout_text() -> str:
-    from morphgen.encoding.tokens import LAYOUT
-
     rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
-    return opt.table(rows, ("field", "columns", "size", "content"), disable_numparse=True)
+    return tabulate(rows, ("field", "columns", "size", "content"), disable_numparse=True)
 
 
 def _layout_data() -> list[dict[str, object]]:
-    from morphgen.encoding.tokens import LAYOUT
-
     return [asdict(field) for field in LAYOUT]

@@ -10,63 +10,67 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
+from tabulate import tabulate
+
+from morphgen.api.splits import NewSplit
+from morphgen.api.splits import split as choose
+from morphgen.benchmark import verify as verification
+from morphgen.benchmark.audit import Audit
+from morphgen.benchmark.audit import audit as audit_robots
+from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
+from morphgen.benchmark.hold_out import related_parts
+from morphgen.benchmark.licences import (
+    licence_lines,
+    licenced_parts,
+    restricted,
+    restriction_line,
+    restriction_text,
+)
+from morphgen.benchmark.release import build_with_goals
+from morphgen.benchmark.scores.results import study_results
+from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
+from morphgen.benchmark.survey import (
+    PAPER_TABLE,
+    PaperRow,
+    RobotDifficulty,
+    difficulty_csv,
+    difficulty_table,
+    paper_row,
+    split_difficulty,
+    statistics,
+)
+from morphgen.benchmark.verify import Difference
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, Option, command, flag, number, option
 from morphgen.cli.progress import bar, status
-from morphgen.cli.split_new import new
-from morphgen.cli.split_release import release, score
+from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
 from morphgen.errors import BenchmarkError, GrammarError, PartError
-from morphgen.tasks.registry import TASKS
-
-if TYPE_CHECKING:
-    from morphgen.benchmark.audit import Audit
-    from morphgen.benchmark.survey import BaselineResults, PaperRow, RobotDifficulty
-    from morphgen.benchmark.verify import Difference
-    from morphgen.encoding.similarity import NearThresholds
-    from morphgen.model.findings import Finding
-    from morphgen.splits.split import Member, Split
-    from morphgen.tasks.goals.split_goals import GoalResult, SplitGoals
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
+from morphgen.formats.files import require_writable_file, write_file
+from morphgen.grammar.library import Library
+from morphgen.model.findings import Finding
+from morphgen.rl.baselines import BASELINES
+from morphgen.splits.split import HOLD_OUT, SIDES, Member, Split, split_id
+from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
+from morphgen.tasks.goals.split_goals import (
+    GoalResult,
+    SplitGoals,
+    goal_record,
+    sample_robot_goals,
+    sample_split_goals,
+)
+from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
 
 HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
 
 
-@command(
-    "goals",
-    "sample the goal sets of robots, and certify that each goal can be reached",
-    option(
-        "words SPLIT",
-        f"name of a split, its file or built folder; with --task, a robot: {opt.ROBOT_HELP}",
-        nargs="+",
-    ),
-    option("--task TASK", f"one robot: its task, {opt.TASK_NAMES}", choices=TASKS),
-    opt.OBSTACLES,
-    opt.SEED,
-    flag("--certify", "verify every goal with the configuration that it was sampled from"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="Goals of reach and starts of push are kept in the cache. The goals of reach are full "
-    "poses, so the sets are the same for --goal position and --goal pose of other commands. Run "
-    "the command again to continue an interrupted one. The exit code is 1 if a robot has too few "
-    "goals, or if a goal fails --certify.",
-    examples=("goals extrapolation/arms/reach --certify", "goals arm=ur5 ee=plane --task reach"),
-)
 def goals(args: argparse.Namespace) -> int:
     """Sample goal sets and print a table with the failures."""
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
     if args.task is None:
-        if args.obstacles:
-            raise BenchmarkError(
-                "--obstacles goes with --task; a split says which robots have obstacles"
-            )
         if len(args.words) > 1:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
-        from morphgen.benchmark.split_folder import read_split_or_folder
 
         split, _ = read_split_or_folder(args.words[0])
         results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
@@ -79,10 +83,6 @@ def goals(args: argparse.Namespace) -> int:
 
 
 def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
-    from morphgen.splits.split_file import split_names
-    from morphgen.tasks.goals.split_goals import sample_robot_goals
-    from morphgen.tasks.scenes.env_specs import load_robot
-
     words = " ".join(args.words)
     if words in split_names():
         raise BenchmarkError(f"--task {args.task}: is for a robot; {words} is a split")
@@ -97,8 +97,6 @@ def make_goals(
     args: argparse.Namespace, split: Split, config: GoalConfig, *, certify: bool = False
 ) -> list[GoalResult]:
     """Sample the goal sets of a split's robots, or read them from the cache."""
-    from morphgen.tasks.goals.split_goals import sample_split_goals
-
     with bar(args, "sampling goals"):
         return sample_split_goals(
             split, opt.library_of(args), config, jobs=args.jobs, certified=certify
@@ -106,7 +104,7 @@ def make_goals(
 
 
 def _goals_text(results: Sequence[GoalResult], seed: int) -> str:
-    lines = [opt.table([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
+    lines = [tabulate([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
     for result in results:
         robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
         if result.goals is None:
@@ -131,8 +129,6 @@ def _goals_row(result: GoalResult) -> tuple[str, ...]:
 
 
 def _data(results: Sequence[GoalResult], seed: int) -> dict[str, object]:
-    from morphgen.tasks.goals.split_goals import goal_record
-
     sets = []
     for result in results:
         if result.goals:
@@ -152,40 +148,19 @@ MAX_LISTED = 10
 """Largest number of findings of one code, or of differences, that are printed."""
 
 
-def _goal_seed(help: str) -> Option:
-    return number("--goal-seed", help, least=0)
-
-
-@command(
-    "audit",
-    "look for leaks between train and test robots",
-    option("split SPLIT", "name of a split, its file, or its built folder"),
-    option(
-        "--near TREE,COSINE[,WORKSPACE]",
-        "robots are nearly the same if their tree distance is below, and their cosine similarity "
-        "or, at one reach, their workspace overlap above (default: 0.001,0.99999,0.999)",
-    ),
-    flag("--strict", "fail on warnings, too"),
-    flag("--goals", "audit goal sets even if the split ships none"),
-    _goal_seed("seed that the goal sets must have (default: as shipped, else 0)"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="The audit checks the rules of the split's regime, and names the nearest train robot "
-    "of each test robot. If a built split ships goal sets, it also looks for goals that are on "
-    "both sides, or out of reach. The exit code is 1 if there is an error that the split does not "
-    "accept, or a warning with --strict.",
-)
 def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
-    from morphgen.benchmark.audit import audit
-    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_line
-    from morphgen.benchmark.split_folder import read_split_or_folder
-
     near = _near(args.near)
     split, folder = read_split_or_folder(args.split)
     library = opt.library_of(args)
     with bar(args, "auditing"):
-        result = audit(split, library, near=near, jobs=args.jobs)
-    result, goals = _audit_goals(args, result, split, folder)
+        result = audit_robots(split, library, near=near, jobs=args.jobs)
+    sample = partial(make_goals, args, split) if args.goals else None
+    goals, findings = goals_to_audit(folder, args.goal_seed, sample), None
+    if goals is not None:
+        with bar(args, "auditing goals"):
+            findings = audit_goals(split, goals, library, jobs=args.jobs)
+    result = with_goal_findings(result, split, findings)
     passed = result.passed(strict=args.strict)
     sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
     try:
@@ -200,8 +175,6 @@ def audit(args: argparse.Namespace) -> int:
 
 
 def _near(text: str | None) -> NearThresholds:
-    from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds
-
     if text is None:
         return NEAR_THRESHOLDS
     try:
@@ -220,37 +193,18 @@ def _near(text: str | None) -> NearThresholds:
     return near
 
 
-def _audit_goals(
-    args: argparse.Namespace, result: Audit, split: Split, folder: Path | None
-) -> tuple[Audit, SplitGoals | None]:
-    """Add the findings about goal sets to an audit; return the goal sets, too."""
-    from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
-
-    sample = partial(make_goals, args, split) if args.goals else None
-    goals = goals_to_audit(folder, args.goal_seed, sample)
-    findings = None
-    if goals is not None:
-        with bar(args, "auditing goals"):
-            library = opt.library_of(args)
-            findings = audit_goals(split, goals, library, jobs=args.jobs)
-    return with_goal_findings(result, split, findings), goals
-
-
 def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
-    from morphgen.encoding.similarity import MEASURES
-
     nearest: dict[str, list[str]] = {}
     for neighbour in result.neighbours:
         cell = f"{neighbour.train} {neighbour.value:.3f}"
         nearest.setdefault(neighbour.test, []).append(cell)
     rows = [(test, *cells) for test, cells in nearest.items()]
     headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
-    lines = [opt.table(rows, headers, disable_numparse=True)] if rows else []
+    lines = [tabulate(rows, headers, disable_numparse=True)] if rows else []
+    reasons = {finding.code: reason for finding, reason in result.accepted}
     for code, findings in _by_code(result.findings).items():
         lines.append(f"{findings[0].severity} {code} ({len(findings)})")
-        lines += _listed(findings)
-        lines.append(f"    fix: {findings[0].fix}")
-    reasons = {finding.code: reason for finding, reason in result.accepted}
+        lines += [*_listed(findings), f"    fix: {findings[0].fix}"]
     for code, findings in _by_code([finding for finding, _ in result.accepted]).items():
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _listed(findings)
@@ -258,10 +212,7 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: s
         lines.append(f"{len(goals.sets)} goal sets were audited, seed {goals.config.seed}")
     if limits:
         lines.append(limits)
-    counts = ", ".join(
-        f"{sum(finding.severity == severity for finding in result.findings)} {severity}"
-        for severity in ("error", "warning")
-    )
+    counts = opt.severity_counts(result.findings, ("error", "warning"))
     verdict = "passed" if passed else "FAILED"
     lines.append(f"{result.split}: {verdict}: {counts}, {len(result.accepted)} accepted")
     return "\n".join(lines)
@@ -280,28 +231,8 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
     return [*lines, *([f"  and {more} more (--json lists all)"] if more > 0 else [])]
 
 
-@command(
-    "build",
-    "write every robot of a split and its tokens into a folder",
-    option("split SPLIT", "name of a split, or its file"),
-    option("--out DIR", "folder where the split's folder goes", Path, default=Path("data")),
-    flag("--light", "write the URDF and the derivation only"),
-    flag("--picture", "draw preview.png of every robot"),
-    flag("--goals", "ship the goal set of every robot"),
-    _goal_seed("with --goals: seed of the goal sets (default: 0)").needing("--goals"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="The same split gives the same bytes, with any number of jobs. Run the command again "
-    "to continue an interrupted one.",
-    examples=("split build interpolation/panda/reach --out data --goals --jobs 4",),
-)
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
-    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
-    from morphgen.benchmark.release import build_with_goals
-    from morphgen.benchmark.split_folder import BuildSettings
-    from morphgen.splits.split_file import read_split
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
     settings = BuildSettings(light=args.light, picture=args.picture)
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     goals = make_goals(args, split, config) if args.goals else []
@@ -321,20 +252,10 @@ def build(args: argparse.Namespace) -> None:
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 
-@command(
-    "verify",
-    "verify that a split, its built folder or its release has the robots that it claims",
-    option("path PATH", "name of a split, its file, its built folder, or the archive of a release"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="Every robot is composed anew and compared: with the hashes of the split, or with all "
-    "files of a built folder or a release. The exit code is 1 if something differs.",
-)
 def verify(args: argparse.Namespace) -> int:
     """Verify a split and print what differs."""
-    from morphgen.benchmark.verify import verify
-
     with bar(args, "verifying"):
-        result = verify(args.path, opt.library_of(args), jobs=args.jobs)
+        result = verification.verify(args.path, opt.library_of(args), jobs=args.jobs)
     differences, split = result.differences, result.split
     data = {
         "split": split.name,
@@ -357,75 +278,26 @@ def verify(args: argparse.Namespace) -> int:
     return int(bool(differences))
 
 
-@command(
-    "difficulty",
-    "print how hard each robot of splits is: size, nearest train robots, baselines",
-    option("splits SPLIT", "names of splits, their files, or their built folders", nargs="+"),
-    option(
-        "--study FOLDER",
-        "output folder of morphgen study, for score and success of the baselines",
-        Path,
-    ),
-    option("--csv FILE", "write a row per robot", Path),
-    *opt.JOBS_LIBRARY_JSON,
-    details="The columns are the movable joints between root and tool, links, reach, and by each "
-    "similarity measure the nearest other train robot with its value. With --study, score and "
-    "success rate of each baseline of the study follow; scores of reach are relative to the random "
-    "policy.",
-    examples=(
-        "split difficulty interpolation/arm3/reach --csv arm3.csv",
-        "split difficulty extrapolation/arms/reach --study results/reach-30m",
-    ),
-)
 def difficulty(args: argparse.Namespace) -> None:
     """Measure the robots of splits, print a table per split and write the file."""
-    from morphgen.benchmark.survey import difficulty_csv, split_difficulty
-    from morphgen.formats.files import require_writable_file, write_file
-
     if args.csv is not None:
         require_writable_file(args.csv, "--csv", ".csv")
-    splits = _splits(args.splits)
-    results = _results(args.study, splits)
+    words: dict[str, str] = {}
+    splits = [read_split_or_folder(name)[0] for name in args.splits]
+    for split, name in zip(splits, args.splits, strict=True):
+        opt.require_other_name(words, split.name, name)
+    results = [study_results(args.study, split) if args.study else {} for split in splits]
     library = opt.library_of(args)
     rows: list[RobotDifficulty] = []
     for split, known in zip(splits, results, strict=True):
         with bar(args, split.name):
             rows += split_difficulty(split, library, results=known, jobs=args.jobs)
-    baselines = _baselines(results)
+    baselines = [name for name in BASELINES if any(name in known for known in results)]
     if args.csv is not None:
         write_file(args.csv, difficulty_csv(rows, baselines))
     files = [] if args.csv is None else [str(args.csv)]
     data = {"rows": [row.as_dict() for row in rows], "files": files}
     opt.print_result(args, data, lambda: _difficulty_text(rows, splits, baselines, files))
-
-
-def _splits(names: Sequence[str]) -> list[Split]:
-    """Return the splits; two of one name could not be told apart in the rows."""
-    from morphgen.benchmark.split_folder import read_split_or_folder
-
-    words: dict[str, str] = {}
-    splits = []
-    for name in names:
-        split, _ = read_split_or_folder(name)
-        opt.require_other_name(words, split.name, name)
-        splits.append(split)
-    return splits
-
-
-def _results(study: Path | None, splits: Sequence[Split]) -> list[BaselineResults]:
-    """Return the results of the baselines of a study on each split; none without a study."""
-    if study is None:
-        return [{} for _ in splits]
-    from morphgen.benchmark.scores.results import study_results
-
-    return [study_results(study, split) for split in splits]
-
-
-def _baselines(results: Sequence[BaselineResults]) -> tuple[str, ...]:
-    """Return the names of all baselines with results, in the order of their registry."""
-    from morphgen.rl.baselines import BASELINES
-
-    return tuple(name for name in BASELINES if any(name in known for known in results))
 
 
 def _difficulty_text(
@@ -435,8 +307,6 @@ def _difficulty_text(
     files: Sequence[str],
 ) -> str:
     """Return a table per split, each with the baselines of its tasks, and the written files."""
-    from morphgen.benchmark.survey import difficulty_table
-
     parts = []
     for split in splits:
         own = [row for row in rows if row.split == split.name]
@@ -452,11 +322,8 @@ SHORT_DERIVATION = 60
 """Number of characters of a derivation that ``show`` prints without ``--full``."""
 
 
-@command("list", "list the splits that come with morphgen", opt.JSON)
 def list_splits(args: argparse.Namespace) -> None:
     """Print a row per split."""
-    from morphgen.splits.split_file import read_split, split_names
-
     splits = [read_split(name) for name in split_names()]
     data: list[dict[str, Any]] = [
         {
@@ -481,25 +348,11 @@ def list_splits(args: argparse.Namespace) -> None:
         )
         for row in data
     ]
-    opt.print_result(args, data, lambda: opt.table(rows, headers))
+    opt.print_result(args, data, lambda: tabulate(rows, headers))
 
 
-@command(
-    "show",
-    "print the robots of a split",
-    option("split SPLIT", "name of a split, or its file"),
-    flag("--full", "print whole derivations, and how the robots were chosen"),
-    *opt.LIBRARY_JSON,
-    details="Names the licences of the parts, and the robots with a part under a non-commercial, "
-    "no-derivatives or unknown licence.",
-    examples=("split show interpolation/panda/reach",),
-)
 def show(args: argparse.Namespace) -> None:
     """Print a split."""
-    from morphgen.benchmark.licences import licence_lines, licenced_parts
-    from morphgen.splits.split import split_id
-    from morphgen.splits.split_file import read_split
-
     split = read_split(args.split)
     try:
         parts = licenced_parts(split, opt.library_of(args))
@@ -511,8 +364,6 @@ def show(args: argparse.Namespace) -> None:
 
 
 def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
-    from morphgen.splits.split import SIDES, split_id
-
     lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]
     if split.reference:
         lines.append(f"  reference: {split.reference}")
@@ -528,7 +379,7 @@ def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
         counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
         rows = [_row(member, full=full) for member in members]
         lines.append(f"\n{side}, {len(members)}: {counts}")
-        lines.append(opt.table(rows, headers, disable_numparse=True))
+        lines.append(tabulate(rows, headers, disable_numparse=True))
     return "\n".join(lines)
 
 
@@ -551,22 +402,8 @@ def _categories(members: Sequence[Member]) -> Counter[str]:
     return Counter(member.category for member in members)
 
 
-@command(
-    "stats",
-    "print statistics of splits next to those of the paper",
-    option("splits SPLIT", "names or files (default: all shipped splits)", nargs="*"),
-    flag("--markdown", "print the table as Markdown"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="The columns are the mean numbers of links, of movable joints and of movable joints "
-    "between base and tool of the train robots, and the cosine similarity of test and train "
-    "robots; the paper's numbers are in parentheses. Splits with the same robots share a row.",
-)
 def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
-    from morphgen.benchmark.licences import licenced_parts, restricted, restriction_text
-    from morphgen.benchmark.survey import PAPER_TABLE, paper_row, statistics
-    from morphgen.splits.split_file import read_split, split_names
-
     library = opt.library_of(args)
     groups = _by_robots([read_split(name) for name in args.splits or split_names()])
     statistics_by_title: dict[str, dict[str, Any]] = {}
@@ -593,7 +430,7 @@ def stats(args: argparse.Namespace) -> None:
         ]
         style = "github" if args.markdown else "simple"
         lines = [
-            opt.table(rows, "keys", tablefmt=style, disable_numparse=True),
+            tabulate(rows, "keys", tablefmt=style, disable_numparse=True),
             "",
             "links, joints, mass: mean over the train robots; cosine: of test and train robots",
             f"in parentheses: {PAPER_TABLE}",
@@ -607,8 +444,6 @@ def stats(args: argparse.Namespace) -> None:
 
 def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
     """Return splits with the same robots together, by what their names have in common."""
-    from morphgen.splits.split import SIDES
-
     groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
     for split in splits:
         # The robots are compared in their order.
@@ -645,9 +480,67 @@ def _stats_row(
     return row
 
 
-split = Command(
-    "split",
-    "list, make, audit, build, release and score splits of train and test robots",
-    commands=(*(list_splits, show, new, audit, build, verify, stats, difficulty, release, score),),
-    details="A split is a YAML file with the robots to train on and those to test on.",
-)
+def new(args: argparse.Namespace) -> None:
+    """Choose the robots, write the splits and print what they are."""
+    if args.subcommand is None and not args.hold_out:
+        args.parser.error("the following arguments are required: --hold-out, or COMMAND")
+
+    # Smaller splits are parts of the largest.
+    total = args.train[-1] + args.test if args.train else None
+    choice = opt.given(args, NewSplit.__annotations__)
+    choice["regime"] = args.subcommand or HOLD_OUT
+    with bar(args, "sampling", total=total):
+        loaded = choose(args.name or "", train=args.train, library=args.library, **choice)
+    splits = [each.definition for each in loaded]
+    paths = split_paths(args.out, splits)
+    write_new_splits(splits, paths)
+    library = opt.library_of(args)
+    parts = [licenced_parts(split, library) for split in splits]
+    data = [
+        {
+            "file": str(path),
+            "name": split.name,
+            "id": split_id(split),
+            "train": len(split.train),
+            "test": len(split.test),
+            "restricted": [part.as_dict() for part in restricted(licenced)],
+        }
+        for split, path, licenced in zip(splits, paths, parts, strict=True)
+    ]
+    lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
+    lines += _hold_out_notes(splits[-1], library)  # the largest has all train robots
+    if limits := restriction_line(parts[-1]):  # of the largest split
+        lines.append(f"  {limits}")
+    lines.append(f"next: morphgen split audit {paths[-1]}")
+    opt.print_result(args, data, lambda: "\n".join(lines))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Read names that are separated by commas; a type for argparse."""
+    return tuple(name.strip() for name in text.split(",")) if text else ()
+
+
+def _summary(split: Split, path: Path) -> list[str]:
+    lines = [
+        f"{path}: {split.summary}",
+        f"  test: {', '.join(member.name for member in split.test)}",
+    ]
+    repeated = len(split.train) - len({(member.robot_hash, member.task) for member in split.train})
+    if repeated:
+        lines.append(f"  {repeated} train robots have the body and task of an earlier one")
+    return lines
+
+
+def _hold_out_notes(split: Split, library: Library) -> list[str]:
+    """Return what a user of ``--hold-out`` may not expect."""
+    if split.regime != HOLD_OUT:
+        return []
+    left_out = cast("Mapping[str, int]", split.provenance.get("left_out", {}))
+    return [
+        *(f"  left out: {n} drawn robots with {reason}" for reason, n in left_out.items()),
+        *(
+            f"  note: train robots have {', '.join(names)}; --hold-out {rule} excludes parts of "
+            "that manufacturer"
+            for rule, names in related_parts(split, library).items()
+        ),
+    ]

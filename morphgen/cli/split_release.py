@@ -5,74 +5,65 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from contextlib import ExitStack
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from morphgen.benchmark.eval_protocol import (
+    EPISODES,
+    SIMULATOR,
+    EvalProtocol,
+    expected_robots,
+    protocol_from,
+    tasks_of_split,
+)
+from morphgen.benchmark.release import (
+    SUBMISSIONS_DIR,
+    ReleaseRequest,
+    is_release,
+    opened_folder,
+    read_release,
+    release_split,
+)
+from morphgen.benchmark.scores.results import (
+    NOTE,
+    References,
+    collect_references,
+    ranked,
+    ranking_data,
+    ranking_table,
+    read_references,
+    reference_files,
+    result_rows,
+    result_tables,
+    rows_data,
+    score_submission,
+)
+from morphgen.benchmark.scores.submission import (
+    check_submission,
+    read_submission,
+    read_submissions,
+    require_same_random,
+)
+from morphgen.benchmark.split_folder import SPLIT_FILE, BuildSettings, is_archive
+from morphgen.benchmark.survey import BaselineResults
+from morphgen.benchmark.verify import require_unchanged
 from morphgen.cli import options as opt
-from morphgen.cli.command import command, flag, number, option, repeated
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError
+from morphgen.formats.files import require_writable_folder
+from morphgen.splits.split import Split
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.registry import TASKS
 
-if TYPE_CHECKING:
-    from morphgen.benchmark.eval_protocol import EvalProtocol
-    from morphgen.benchmark.scores.results import References
-    from morphgen.benchmark.survey import BaselineResults
-    from morphgen.splits.split import Split
 
-
-@command(
-    "release",
-    "write an archive of a split that others can verify, cite and score against",
-    option("split SPLIT", "name of a split, or its file"),
-    # `morphgen --version` has the other name
-    option("--version X.Y.Z", "version of the release", dest="release_version", default="1.0.0"),
-    option("--out DIR", "folder of the archive", Path, default=Path("releases")),
-    option("--date YYYY-MM-DD", "date of publication, which dataset tools recommend", default=""),
-    repeated("--creator NAME", "who publishes the release"),
-    option("--url", "address where the release will be", default=""),
-    repeated(
-        "--licence-allow LICENCE,...",
-        "licences with restrictions that parts may have, such as CC-BY-NC-ND-4.0",
-    ),
-    option(
-        "--scores PATH",
-        "reference scores: submissions (morphgen eval --submission), or folders of studies",
-        Path,
-        nargs="+",
-        default=[],
-    ),
-    opt.sim_option(),
-    number("--episodes", "least number of episodes per robot of a submission (default: 34)"),
-    flag("--light", "write the URDF and the derivation of robots only, without meshes"),
-    flag("--no-goals", "ship no goal sets"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="The archive holds the built split, goal sets, licences of all parts, a Croissant "
-    "description, a dataset card, the difficulty of every robot, reference scores and SHA-256 of "
-    "every file. A split that fails "
-    "its audit, or with a part under a non-commercial, no-derivatives or unknown licence that is "
-    "not allowed, is refused. The same inputs give the same bytes.",
-    examples=(
-        "split release interpolation/arm3/reach --version 1.0.0 --date 2027-01-31",
-        "split release extrapolation/arms/reach --licence-allow CC-BY-NC-ND-4.0",
-    ),
-)
 def release(args: argparse.Namespace) -> None:
     """Make a release and print where it is."""
-    from morphgen.benchmark.eval_protocol import EPISODES, SIMULATOR, EvalProtocol
-    from morphgen.benchmark.release import ReleaseRequest, release_split
-    from morphgen.benchmark.split_folder import BuildSettings
-    from morphgen.formats.files import require_writable_folder
-    from morphgen.splits.split_file import read_split
-
     require_writable_folder(args.out)  # before the audit and the goals, which take minutes
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or SIMULATOR, args.episodes or EPISODES)
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        from morphgen.benchmark.scores.results import collect_references, reference_files
-
         references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
     request = ReleaseRequest(
@@ -112,9 +103,6 @@ def release(args: argparse.Namespace) -> None:
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
     """Return what the release lacks that its users may expect."""
-    from morphgen.benchmark.eval_protocol import tasks_of_split
-    from morphgen.benchmark.release import SUBMISSIONS_DIR
-
     notes = []
     is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
     if is_relative and f"{SUBMISSIONS_DIR}/random.json" not in extra:
@@ -130,40 +118,8 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
     return notes
 
 
-@command(
-    "score",
-    "check submissions to a split, compute their scores and rank them",
-    option("submissions SUBMISSION", "file that morphgen eval --submission wrote", Path, nargs="+"),
-    option(
-        "--split SPLIT",
-        "archive or folder of a release, or name or file of a split (default: the split of "
-        "morphgen that the first submission names)",
-    ),
-    flag("--markdown", "print the table as Markdown"),
-    *opt.JOBS_LIBRARY_JSON,
-    details="Every episode of every test robot must be there, with the goals, simulator and "
-    "constants of the release. Scores and 95% intervals are computed from the episodes: bootstrap "
-    "for scores, Wilson for successes. They are ranked beside the reference scores of the release. "
-    "A submission with a fault is refused with one line, and nothing is ranked; so is a release "
-    "whose files differ from its SHA256SUMS, and so are submissions that disagree about the random "
-    "policy, if the release has no submission of it.",
-    examples=("split score mine.json --split releases/interpolation-arm3-reach-1.0.0.zip",),
-)
 def score(args: argparse.Namespace) -> None:
     """Score submissions and print the ranking."""
-    from morphgen.benchmark.eval_protocol import expected_robots
-    from morphgen.benchmark.scores.results import (
-        ranked,
-        ranking_data,
-        ranking_table,
-        score_submission,
-    )
-    from morphgen.benchmark.scores.submission import (
-        check_submission,
-        read_submission,
-        require_same_random,
-    )
-
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
     name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
@@ -212,8 +168,6 @@ def score(args: argparse.Namespace) -> None:
 
 def _shipped_split(name: str, where: Path) -> str:
     """Return the name of a split that comes with morphgen; a submission cannot name other files."""
-    from morphgen.splits.split_file import split_names
-
     if name not in split_names():
         raise BenchmarkError(
             f"{where}: split.name: {name} is not a split that comes with morphgen; name its "
@@ -224,15 +178,6 @@ def _shipped_split(name: str, where: Path) -> str:
 
 def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
-    from importlib.metadata import version
-
-    from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
-    from morphgen.benchmark.release import is_release, opened_folder, read_release
-    from morphgen.benchmark.scores.results import References, read_references
-    from morphgen.benchmark.split_folder import SPLIT_FILE, is_archive
-    from morphgen.benchmark.verify import require_unchanged
-    from morphgen.splits.split_file import read_split
-
     path = Path(name)
     if not path.is_dir() and not is_archive(path):
         return read_split(name), EvalProtocol(), References(), version("morphgen")
@@ -244,3 +189,21 @@ def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References,
     release = read_release(folder)
     protocol = protocol_from(release.evaluation, name)
     return split, protocol, read_references(folder), release.morphgen
+
+
+MODES = ("deterministic", "stochastic", "all")
+
+
+def tables(args: argparse.Namespace) -> None:
+    """Print a table for every split and task."""
+    submissions = read_submissions(args.files)
+    modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
+    found = {where: each for where, each in submissions.items() if each.mode in modes}
+    if not found:
+        raise BenchmarkError(
+            f"--mode {args.mode}: none of the {len(submissions)} submissions acts so; expected "
+            f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
+        )
+    rows = result_rows(found)
+    style = "github" if args.markdown else "simple"
+    opt.print_result(args, rows_data(rows), lambda: f"{result_tables(rows, style)}\n{NOTE}")

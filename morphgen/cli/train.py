@@ -1,4 +1,4 @@
-"""``morphgen train``: train an agent on the robots of a split, on one, or on drawn ones."""
+"""``morphgen train``, ``finetune`` and ``study``: agents and the robots they are trained on."""
 
 from __future__ import annotations
 
@@ -7,137 +7,97 @@ import re
 import shlex
 import sys
 from dataclasses import fields, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from morphgen.benchmark.eval_protocol import EvalProtocol
+from morphgen.benchmark.scores.study import (
+    TABLE,
+    Cell,
+    agent_cell,
+    baseline_cells,
+    finetuning_run,
+    matched_budget,
+    require_cells,
+    run_cells,
+    run_cells_on_ray,
+    write_tables,
+)
+from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.cli import options as opt
-from morphgen.cli.command import Option, command, flag, number, option, repeated
 from morphgen.cli.progress import note, status, training_progress
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
-from morphgen.rl.agents import AGENTS, PRESETS, preset_of
+from morphgen.rl.agents import AGENTS, preset_of
+from morphgen.rl.config import (
+    OBSERVATION_SWITCHES,
+    SWITCHES,
+    AgentSpec,
+    PPOConfig,
+    configs_of,
+    owners_of,
+    parse_agent,
+    parse_agents,
+    parse_constants,
+)
+from morphgen.rl.evaluation import EvalConfig, episodes_for
+from morphgen.rl.runs import training
+from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig, read_checkpoint
+from morphgen.rl.runs.robot_source import (
+    RobotSource,
+    draw,
+    drawn_source,
+    other_side,
+    robot_source,
+    split_of,
+    split_source,
+    tasks_of,
+)
+from morphgen.rl.runs.training import (
+    ExecutionConfig,
+    checkpoint_files,
+    default_slice_updates,
+    finetuning_config,
+    is_done,
+    num_slices,
+    require_runnable,
+    subruns_of,
+)
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
+from morphgen.splits.split import Side
+from morphgen.splits.split_file import read_split, split_names
+from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
 from morphgen.tasks.registry import (
-    CHANNELS,
-    COLLISION_GEOMETRIES,
     DEFAULT_SIMULATOR,
     SIMULATORS,
     TASKS,
+    batch_device,
+    evaluation_simulator,
+    require_device,
+    require_simulator_device,
 )
-
-if TYPE_CHECKING:
-    from morphgen.rl.config import AgentSpec
-    from morphgen.rl.runs.checkpoint import RunConfig
-    from morphgen.rl.runs.robot_source import RobotSource
-    from morphgen.rl.runs.training import ExecutionConfig
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-    from morphgen.tasks.task import TaskConfig
-
-
-AGENT = option("--agent", f"one of {', '.join(AGENTS)} (default: me-graph)", default="me-graph")
-SWITCHES = {
-    "symlog": ("the critic predicts the symlog of returns", "on"),
-    "slow-critic": ("compute returns with a moving average of the critic", "on"),
-    "discrete": ("discrete actions", "on if the task of all robots is reach"),
-    "task-reweighting": ("weight the robots randomly", "off"),
-    "curriculum": ("push: move the target line from near to far during training", "on"),
-    "fixed-deviation": ("keep the initial standard deviation of continuous actions", "off"),
-    "mask-morphology": ("hide the robot's morphology from the agent", "off"),
-    "tool-position": ("add the tool's position to the observations", "off"),
-    "residual": ("add the actions to the steps that the channel ik shows", "off"),
-    "normalize": ("normalize the kinematic channels of observations", "off"),
-    "robot-advantages": ("normalize advantages robot by robot", "off"),
-    "joint-entropy": ("weigh the mean entropy of the joints instead of their sum", "off"),
-}
-"""Purpose of each switch, and its default without a preset that sets it."""
-
-
-def switch_help(name: str) -> str:
-    """Return the help of a switch, with its default in every preset."""
-    purpose, default = SWITCHES[name]
-    others = [
-        f"{'on' if preset.switches[name] else 'off'} with --preset {label}"
-        for label, preset in PRESETS.items()
-        if name in preset.switches
-    ]
-    return f"{purpose} (default: {'; '.join([default, *others])})"
-
-
-def on_off(name: str, help: str, default: bool | None = None) -> Option:
-    """Return an option ``--name`` with its opposite ``--no-name``."""
-    return Option(
-        (f"--{name}",), {"action": argparse.BooleanOptionalAction, "default": default, "help": help}
-    )
-
-
-OBSERVE = option(
-    "--observe A,B,...",
-    "further channels of the observations: "
-    + ", ".join(CHANNELS).replace("_", "-")
-    + "".join(
-        f"; --preset {label} has {', '.join(names)} already, and --agent AGENT-NAME drops one"
-        for label, preset in PRESETS.items()
-        if (names := [name for name in preset.switches if name.replace("-", "_") in CHANNELS])
-    ),
-    default="",
-)
-AGENT_OPTIONS = (*(on_off(name, switch_help(name)) for name in SWITCHES), OBSERVE)
+from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs, load_robot
+from morphgen.tasks.task import TaskConfig
 
 
 def agent_spec(args: argparse.Namespace) -> AgentSpec:
     """Return the agent with the switches that were given."""
-    from morphgen.rl.config import OBSERVATION_SWITCHES, parse_agent
-
-    values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
-    spec = parse_agent(args.agent)
-    switches = {name: value for name, value in values.items() if value is not None}
-    observed = [name for name in args.observe.split(",") if name]
-    for name in observed:
+    switches = dict.fromkeys(filter(None, args.observe.split(",")), True)
+    for name in switches:
         if name not in OBSERVATION_SWITCHES:
             raise TaskError(f"--observe {name}{nearest(name, OBSERVATION_SWITCHES)}")
-    return replace(spec, switches={**spec.switches, **switches, **dict.fromkeys(observed, True)})
+    for name in set(SWITCHES).difference(OBSERVATION_SWITCHES):
+        if (value := getattr(args, name.replace("-", "_"))) is not None:
+            switches[name] = value
+    spec = parse_agent(args.agent)
+    return replace(spec, switches={**spec.switches, **switches})
 
 
-SPLIT_HELP = (
-    "name of a split, its file or built folder; or a robot and its task, such as arm=ur5 ee=stick "
-    "task=reach"
-)
-SIDES = ["train", "test"]
-GOAL_SEED = number(
-    "--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0
-).needing("--split")
-
-DRAWN_OPTIONS = (
-    option(
-        "--robots GRAMMAR:N,...",
-        "train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
-        "processes as --workers; the test robots of the splits of morphgen are never drawn",
-    ),
-    number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0).needing(
-        "--robots"
-    ),
-    repeated(
-        "--held-out SPLIT", "with --robots: a further split whose test robots are never drawn"
-    ).needing("--robots"),
-    number(
-        "--slice-updates",
-        "with more --robots than --envs: number of updates after which the next robots take the "
-        "environments (default: those of two episodes)",
-    ).needing("--robots"),
-)
-"""Options of robots that are drawn from grammars."""
-
-
-def split_option(purpose: str) -> Option:
-    """Return the option ``--split``, whose words ``robots_to_train`` reads."""
-    return option("--split SPLIT", f"{purpose}: {SPLIT_HELP}", dest="words", nargs="+", default=[])
-
-
-def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
+def robots_to_train(
+    words: list[str], args: argparse.Namespace, side: Side = "train"
+) -> RobotSource:
     """Return the robots that a split, or a robot and ``task=NAME``, describe."""
-    from morphgen.benchmark.split_folder import read_split_or_folder
-    from morphgen.rl.runs.robot_source import robot_source, split_source
-    from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
-
     seed, library = args.goal_seed or 0, tuple(args.library)
     choices = " or ".join(f"task={name}" for name in TASKS)
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
@@ -167,13 +127,11 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
                 f"--goal-seed {seed}: the goals in {goal_folder} are of seed {shipped_seed}"
             )
         seed = shipped_seed
-    return split_source(split, side=args.on, goal_seed=seed, goals=goal_folder, library=library)
+    return split_source(split, side=side, goal_seed=seed, goals=goal_folder, library=library)
 
 
 def robots_to_draw(args: argparse.Namespace) -> RobotSource:
     """Return the source that ``--robots`` describes; none of its robots is drawn yet."""
-    from morphgen.rl.runs.robot_source import drawn_source
-
     choices = " or ".join(f"task={name}" for name in TASKS)
     words, task = " ".join(args.words), args.words[0].removeprefix("task=")
     if words != f"task={task}":
@@ -192,128 +150,8 @@ def robots_to_draw(args: argparse.Namespace) -> RobotSource:
     )
 
 
-def draw_robots(
-    source: RobotSource, config: GoalConfig, args: argparse.Namespace
-) -> tuple[RobotSource, int]:
-    """Draw the robots of a source and print how many were skipped.
-
-    Returns:
-        The source with the hash of its robots, and the number of links that observations are
-        padded to: ``--max-links`` if it is given, else the largest of the benchmark's number, those
-        of the splits of ``--held-out`` and the links of the largest robot.
-    """
-    from morphgen.encoding.tokens import default_max_links
-    from morphgen.rl.runs.robot_source import draw
-    from morphgen.splits.split_file import read_split
-
-    with training_progress():
-        robots = draw(source, config, jobs=args.workers)
-    if robots.skipped:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
-        note(f"morphgen: robots that were skipped: {reasons}")
-    held_out = (read_split(name).max_links for name in source.held_out)
-    max_links = args.max_links or default_max_links([robots.most_links, *held_out])
-    return replace(source, drawn_hash=robots.hash), max_links
-
-
-NETWORK_SWITCHES = {
-    "bf16": "run the networks in bfloat16",
-    "compile": "run networks and losses with torch.compile",
-}
-
-
-def learning_options(num_steps: int | None, num_envs: int | None) -> tuple[Option, ...]:
-    """Return the options of all commands that train."""
-    preset = "" if num_steps else " (default: the preset's)"
-    return (
-        number(
-            "--steps",
-            f"number of control steps of all environments together{preset}",
-            default=num_steps,
-        ),
-        number(
-            "--envs", f"number of environments, which the robots share{preset}", default=num_envs
-        ),
-        opt.WORKERS,
-        opt.DEVICE,
-        repeated(
-            "--set NAME=VALUE", "set a hyperparameter, such as learning_rate=1e-4 or num_steps=32"
-        ),
-        flag("--no-tensorboard", "write no TensorBoard events"),
-        flag("--wandb", "also log metrics to Weights & Biases"),
-    )
-
-
-TRAINING_OPTIONS = (
-    *learning_options(None, None),
-    option(
-        "--preset",
-        "; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items())
-        + " (default: the agent's, fast for me-graph and paper for the agents of the paper)",
-        choices=list(PRESETS),
-    ),
-    opt.sim_option(),
-    number(
-        "--goal-seed", "seed of all goals (default: as shipped with the split, else 0)", least=0
-    ),
-    opt.goal_option(),
-    number(
-        "--train-goals",
-        "number of goals of reach, or starts of push, per robot in training; evaluations "
-        "have 100 (default: 100, as in the paper)",
-        least=2,
-    ),
-    flag(
-        "--whole",
-        "agent se on a split: give each robot all steps and environments instead of a share",
-    ),
-    opt.MAX_LINKS,
-    option(
-        "--geometry",
-        "collision shapes of the robots in training: primitives, or convex pieces of the "
-        "meshes; evaluations have primitives (default: primitive)",
-        choices=COLLISION_GEOMETRIES,
-        default=COLLISION_GEOMETRIES[0],
-    ),
-    *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
-)
-"""Options of the commands that train from random weights."""
-RESUME = flag("--resume", "continue the run in the output folder")
-MINUTES = number(
-    "--minutes", "stop with a checkpoint after the update in which so many minutes are over"
-)
-
-
-@command(
-    "train",
-    "train an agent on the robots of a split, or on one robot",
-    option("words SPLIT", f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}", nargs="+"),
-    AGENT,
-    opt.SEED,
-    option("--on", "side of the split", choices=SIDES, default="train"),
-    opt.OBSTACLES,
-    option("--out DIR", "run folder (default: runs/SPLIT/AGENT/seedN)", Path),
-    RESUME,
-    MINUTES,
-    *DRAWN_OPTIONS,
-    *AGENT_OPTIONS,
-    *TRAINING_OPTIONS,
-    opt.LIBRARY,
-    details="The algorithm is PPO. The policy is written to the run folder. Ctrl-C, SIGTERM and "
-    "--minutes stop after the running update, with a checkpoint; --resume continues from there.",
-    examples=(
-        "train interpolation/arm3/reach --agent me-tf --sim mujoco",
-        "train arm=ur5 ee=stick task=reach --agent se",
-        "train task=reach --robots arm3:300,chain:300 --agent me-tf --workers 4",
-    ),
-    extra="rl",
-)
 def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
-    with status(args, "loading"):
-        from morphgen.rl.runs.robot_source import other_side
-        from morphgen.tasks.registry import batch_device, require_simulator_device
-
     sim = args.sim or DEFAULT_SIMULATOR
     require_simulator_device(sim, batch_device(sim, args.device))
     with status(args, "reading the robots"):
@@ -334,25 +172,21 @@ def train(args: argparse.Namespace) -> None:
 
 def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
     """Train in a folder with a progress bar, and print the paths of the checkpoints."""
-    from morphgen.rl.runs.checkpoint import CHECKPOINT
-    from morphgen.rl.runs.training import is_done, train
-
-    with training_progress("with --resume") as show:
+    with training_progress("with --resume") as display:
         execution = execution_config(args)
         if config.source.grammars and not SIMULATORS[config.sim].takes_workers:
             execution = replace(execution, workers=1)  # those of --workers have drawn the robots
-        subruns = train(folder, config, resume=args.resume, execution=execution, show=show.training)
+        subruns = training.train(
+            folder, config, resume=args.resume, execution=execution, show=display.training
+        )
     for subrun in subruns:
         if (subrun.folder / CHECKPOINT).is_file():
             print(subrun.folder / CHECKPOINT)
-    if subruns:  # the first process of torchrun alone says it
-        left = sum(not is_done(subrun) for subrun in subruns)
-        if left:
-            what = f" with {left} of {len(subruns)} robots left" * (len(subruns) > 1)
-            text = f"stopped after {args.minutes} minutes{what}; it continues with --resume"
-        else:
-            text = _next_command(folder, config)
-        note(text)
+    if left := sum(not is_done(subrun) for subrun in subruns):
+        what = f" with {left} of {len(subruns)} robots left" * (len(subruns) > 1)
+        note(f"stopped after {args.minutes} minutes{what}; it continues with --resume")
+    elif subruns:  # the first process of torchrun alone says it
+        note(_next_command(folder, config))
 
 
 def _next_command(folder: Path, config: RunConfig) -> str:
@@ -375,10 +209,6 @@ def _next_command(folder: Path, config: RunConfig) -> str:
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
     """Return the configuration of a run from the options."""
-    from morphgen.rl.config import configs_of, parse_constants
-    from morphgen.rl.runs.checkpoint import RunConfig
-    from morphgen.rl.runs.robot_source import tasks_of
-
     preset = preset_of(args.preset, spec.agent)
     changes = {**preset.constants, **parse_constants(args.set)}
     changes |= {"bf16": args.bf16, "compile": args.compile}
@@ -402,9 +232,6 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
 
 def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
     """Draw the robots of a run, after all that can be checked before; return its configuration."""
-    from morphgen.rl.runs.training import default_slice_updates, num_slices, require_runnable
-    from morphgen.tasks.scenes.env_specs import GoalConfig
-
     if args.slice_updates is not None and num_slices(config) == 1:
         raise TaskError(
             f"--slice-updates {args.slice_updates}: {config.source.name} has an environment for "
@@ -413,7 +240,14 @@ def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
     slice_updates = args.slice_updates or default_slice_updates(config)
     config = replace(config, slice_updates=slice_updates)
     require_runnable(config)
-    source, max_links = draw_robots(config.source, GoalConfig(tasks=config.tasks), args)
+    with training_progress():
+        robots = draw(config.source, GoalConfig(tasks=config.tasks), jobs=args.workers)
+    if robots.skipped:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
+        note(f"morphgen: robots that were skipped: {reasons}")
+    held_out = (read_split(name).max_links for name in config.source.held_out)
+    max_links = args.max_links or default_max_links([robots.most_links, *held_out])
+    source = replace(config.source, drawn_hash=robots.hash)
     return replace(config, source=source, max_links=max_links)
 
 
@@ -424,10 +258,6 @@ def _max_links(source: RobotSource) -> int:
     it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    from morphgen.encoding.tokens import default_max_links
-    from morphgen.rl.runs.robot_source import split_of
-    from morphgen.tasks.scenes.env_specs import load_robot
-
     if source.split:
         return split_of(source).max_links
     if source.grammars:
@@ -438,8 +268,6 @@ def _max_links(source: RobotSource) -> int:
 
 def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskConfig, ...]:
     """Return the configurations of the tasks from ``--goal`` and ``--train-goals``."""
-    from morphgen.rl.runs.robot_source import tasks_of
-
     tasks, num_goals = tasks_of(source), args.train_goals
     names = dict.fromkeys((*TASKS.builtin, *tasks))
     configs = opt.with_goal((TASKS[name].config_type() for name in names), args.goal, tasks)
@@ -458,8 +286,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 
     A study does not require it: its options may be for some of its agents.
     """
-    from morphgen.rl.config import owners_of, parse_constants
-
     agent = config.policy.agent
     if args.whole and not AGENTS[agent].per_robot:
         valid = " or ".join(name for name in AGENTS if AGENTS[name].per_robot)
@@ -477,8 +303,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 
 def execution_config(args: argparse.Namespace) -> ExecutionConfig:
     """Return how runs are executed."""
-    from morphgen.rl.runs.training import ExecutionConfig
-
     minutes = getattr(args, "minutes", None)  # a study has none
     return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb, minutes)
 
@@ -492,46 +316,8 @@ def _folder_name(source: RobotSource) -> str:
     return re.sub(r"[^\w./-]+", "-", name).strip("/.")
 
 
-@command(
-    "finetune",
-    "train a policy further, by default on the test robots of its split",
-    option("checkpoint", f"a checkpoint, a run folder, or {', '.join(POLICIES)}"),
-    split_option("other robots than those of the checkpoint's split"),
-    option("--on", "side of the split", choices=SIDES, default="test"),
-    opt.OBSTACLES.needing("--split"),
-    opt.SEED,
-    opt.sim_option("that of the training"),
-    GOAL_SEED,
-    opt.goal_option("that of the training"),
-    option(
-        "--out DIR",
-        "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)",
-        Path,
-    ),
-    RESUME,
-    MINUTES,
-    *(
-        on_off(name, f"{help} (default: as the checkpoint's run)")
-        for name, help in NETWORK_SWITCHES.items()
-    ),
-    on_off(
-        "curriculum",
-        "push: move the target line from near to far again (default: it stays far)",
-        default=False,
-    ),
-    # 64 is NUM_ENVS of morphgen.rl.runs.training, whose import takes seconds.
-    *learning_options(100_000, 64),
-    opt.LIBRARY.needing("--split"),
-    details="The run begins with the networks of the checkpoint, and with a new optimiser and "
-    "schedule. The agent and most hyperparameters are the checkpoint's. The learning rate follows "
-    "the change of the policy, so that little of what it can do is lost.",
-    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 300000",),
-    extra="rl",
-)
 def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""
-    from morphgen.rl.runs.training import checkpoint_files
-
     files = list(checkpoint_files(checkpoint_path(args.checkpoint)))
     if len(files) > 1:
         raise TaskError(
@@ -544,20 +330,15 @@ def finetune(args: argparse.Namespace) -> None:
 
 
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
-    from morphgen.rl.config import PPOConfig, parse_constants
-    from morphgen.rl.runs.checkpoint import read_checkpoint
-    from morphgen.rl.runs.robot_source import other_side, tasks_of
-    from morphgen.rl.runs.training import finetuning_config
-
     initial, _ = read_checkpoint(file)
     if args.words:
-        source = robots_to_train(args.words, args)
+        source = robots_to_train(args.words, args, args.on)
     else:
         source = other_side(initial.source, args.on)
     changes: dict[str, Any] = parse_constants(args.set)
     if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
         raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
-    switches = {name: getattr(args, name) for name in NETWORK_SWITCHES}
+    switches = {"bf16": args.bf16, "compile": args.compile}
     changes |= {name: value for name, value in switches.items() if value is not None}
     changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
     return replace(
@@ -568,3 +349,105 @@ def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
         device=args.device,
         tasks=opt.with_goal(initial.tasks, args.goal, tasks_of(source)),
     )
+
+
+PAPER = "paper"
+"""Word for all splits of the benchmark."""
+
+
+def study(args: argparse.Namespace) -> int:
+    """Train, evaluate, write tables, and print failures."""
+    execution_config(args)  # refuses invalid options before the work
+    cells = _cells(args)
+    require_cells(cells)
+    args.out.mkdir(parents=True, exist_ok=True)
+    failures = 0 if args.report else _run_cells(args, cells)
+    written = write_tables(args.out, cells)
+    print((args.out / TABLE).read_text(encoding="utf-8"))
+    for path in written:
+        print(path)
+    return int(failures > 0)
+
+
+def _cells(args: argparse.Namespace) -> list[Cell]:
+    """Return the cells of the study, baselines first."""
+    episode_steps = max(config.max_episode_steps for config in default_configs())
+    num_episodes = episodes_for(args.eval_steps, episode_steps)
+    sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
+    # A study has no such options, which robots_to_train and run_config read.
+    args.obstacles, args.seed = False, 0
+    agents, seeds = parse_agents(args.agents or ",".join(AGENTS)), _seeds(args.seeds)
+    finetune = sorted(set(args.finetune))
+    cells: list[Cell] = []
+    words: dict[str, str] = {}
+    for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
+        source = robots_to_train([name], args)
+        opt.require_other_name(words, source.name, name)
+        sides = tasks_of(source), tasks_of(other_side(source, "test"))
+        tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))
+        eval_config = EvalConfig(num_episodes, sim, tasks=tasks)
+        if sim in SIMULATORS.builtin:  # the episodes become submissions, whose number is limited
+            EvalProtocol(sim, num_episodes, goals=GoalConfig(source.goal_seed, tasks))
+        cells += baseline_cells(args.out, source, eval_config)
+        for label, spec, side in agents:
+            config = run_config(other_side(source, side), spec, args)
+            for seed in seeds:
+                seeded = matched_budget(replace(config, seed=seed))
+                cell = agent_cell(args.out, label, seeded, eval_config, finetune)
+                cells.append(cell)
+                if not args.report:
+                    _require_startable(cell, seeded, args)
+    return cells
+
+
+def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) -> None:
+    """Require that training and fine-tuning of a cell can begin, before any of them does."""
+    parts = subruns_of(cell.folder, config)
+    for part in parts:
+        require_runnable(part.config)
+    for steps in cell.finetune:
+        try:
+            require_runnable(finetuning_run(cell, config, steps))
+        except TaskError as error:
+            raise TaskError(f"--finetune {steps}: {error}") from error
+    is_on_gpu = args.device != "cpu" and args.ray is None  # with Ray, other machines have the GPUs
+    if is_on_gpu and not all(map(is_done, parts)):
+        require_device(args.device)  # policies are evaluated on the CPU
+
+
+def _splits(word: str) -> tuple[str, ...]:
+    """Return the split that a word names, or the splits of the benchmark."""
+    return tuple(split_names()) if word == PAPER and not Path(word).exists() else (word,)
+
+
+def _seeds(text: str) -> list[int]:
+    """Read ``0..2`` or ``0,3``."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, dots, last = part.partition("..")
+        if not first.isdecimal() or (dots and not last.isdecimal()):
+            raise TaskError(f"--seeds {text}: expected such as 0..2 or 0,3")
+        seeds += range(int(first), int(last or first) + 1)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise TaskError(f"--seeds {text}: expected at least one seed, and none twice")
+    return seeds
+
+
+def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
+    """Run the cells and return how many failed."""
+    failures = 0
+    execution = execution_config(args)
+    with training_progress("if the same command is given again") as show:
+        if args.ray is None:
+            outcomes = run_cells(cells, execution, show.training)
+        else:
+            gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
+            outcomes = run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
+        for done, (cell, error) in enumerate(outcomes, 1):
+            show.close()
+            seed = "" if cell.seed is None else f" seed {cell.seed}"
+            state = f"failed: {error}" if error else "done"
+            line = f"{done} of {len(cells)}: {cell.split} {cell.agent}{seed} {state}"
+            note(line)
+            failures += bool(error)
+    return failures

@@ -10,15 +10,10 @@ import threading
 import time
 import warnings
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
-from morphgen.cli.command import command, option, repeated, whole_number
-from morphgen.cli.options import LIBRARY
 from morphgen.cli.progress import note
 from morphgen.processes import STOP_SIGNALS
-
-if TYPE_CHECKING:
-    from morphgen.viewer.app.app import Viewer
+from morphgen.viewer.app.app import Viewer, serve
 
 SIGNAL_POLL = 0.5
 """Longest delay before a signal is handled [s]."""
@@ -27,40 +22,8 @@ STOP_GRACE = 5.0
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
-@command(
-    "view",
-    "show robots in the browser: browse, compose, compare and run them",
-    option(
-        "words TARGET",
-        "a folder of robots, a bundle, a URDF, xacro or MJCF, a split's name or file, a "
-        "grammar, words of morphgen compose, a checkpoint or a run's folder (its policy is run), "
-        "or an episode that was saved from the page",
-        nargs="*",
-    ),
-    option("--host", "address to listen on", default="127.0.0.1"),
-    option("--port", "default: 8080", whole_number(1, 65535), default=8080),
-    repeated(
-        "--allow-origin ORIGIN",
-        "a website whose pages may use this one, such as https://hub.example.com if a proxy shows "
-        "it there, or http://box:8080 for the name of this machine",
-    ),
-    LIBRARY,
-    details="The server runs until it is interrupted. Without a target, it shows the library, the "
-    "splits and grammars that come with morphgen, and the robots of this folder.",
-    examples=(
-        "view",
-        "view robots/arm3",
-        "view extrapolation/arms/reach",
-        "view arm=ur5 ee=plane",
-        "view some.urdf",
-        "view runs/reach/checkpoint.pt",
-        "view episode.npz",
-    ),
-)
 def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    from morphgen.viewer.app.app import serve
-
     with suppress(KeyboardInterrupt), warnings.catch_warnings():
         # Work that ends after its browser has disconnected still writes to the page: harmless.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")

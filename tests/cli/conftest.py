@@ -115,8 +115,8 @@ def nothing_is_stored(monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("a test was about to store the fits of the library's parts")
 
-    monkeypatch.setattr("morphgen.fitting.robot_fit.parts_with_meshes", forbidden)
-    monkeypatch.setattr("morphgen.fitting.robot_fit.store_parts", forbidden)
+    monkeypatch.setattr("morphgen.cli.fit.parts_with_meshes", forbidden)
+    monkeypatch.setattr("morphgen.cli.fit.store_parts", forbidden)
 
 
 @pytest.fixture

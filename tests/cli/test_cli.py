@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,9 +16,9 @@ from helpers.parts import PINCER
 from helpers.robots import arm
 from morphgen.checks.readers import LOADERS
 from morphgen.cli import main
+from morphgen.cli.command import read_commands
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf.write import urdf_text
-from morphgen.grammar import catalogue
 
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 
@@ -33,22 +34,7 @@ def test_compose_writes_a_bundle_and_prints_its_summary(ok, tmp_path):
         "robot.xml",
     ]
     assert [path.name for path in (tmp_path / "robots").iterdir()] == ["gantry-plane"]
-
-
-def test_compose_again_replaces_the_bundle(run, tmp_path):
-    options = ("--no-picture", "--out", "o", "--name", "g")
-    assert run("compose", "base=gantry", "ee=plane", *options)[0] == 0
-    assert run("compose", "base=gantry", "ee=cube", *options)[0] == 0
-    assert "ee_cube" in read_bundle(tmp_path / "o" / "g").link_index
-    assert [path.name for path in (tmp_path / "o").iterdir()] == ["g"]
-
-
-@pytest.mark.slow
-def test_compose_prints_the_card_as_json_and_nothing_else():
-    process = start("compose", "base=gantry", "ee=plane", "--out", "robots", "--json")
-    out, err = process.communicate()
-    assert (process.returncode, err) == (0, "")
-    data = json.loads(out)
+    data = json.loads(ok("compose", "base=gantry", "ee=plane", "--no-picture", "--json"))
     assert data["folder"] == "robots/gantry-plane"
     assert data["card"] == json.loads(Path("robots/gantry-plane/card.json").read_text())
 
@@ -249,6 +235,26 @@ def test_help_names_every_command(capsys):
     assert all(f"    {command} " in listed for command in COMMANDS)
 
 
+def test_the_help_of_a_first_use_is_short(capsys):
+    shown = []
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main(["train", flag])
+        shown.append(capsys.readouterr().out)
+    assert all("--agent" in text and "--resume" in text for text in shown)
+    assert ["--robots" in text and "--symlog" in text for text in shown] == [False, True]
+
+
+def test_definitions_name_functions_and_options_that_exist():
+    for command in read_commands():
+        module, _, function = command.function.rpartition(".")
+        assert not function or hasattr(import_module(f"morphgen.cli.{module}"), function)
+        named = [name for flags, _, other, _ in command.rules for name in (*flags, other)]
+        assert {*named, *(name for names in command.alternatives for name in names)} <= {
+            *command.options
+        }, command.path
+
+
 def test_without_a_command_usage_is_printed_and_exit_code_is_2(run):
     code, out, _ = run()
     assert code == 2
@@ -286,7 +292,7 @@ def test_internal_errors_keep_their_traceback(monkeypatch):
     def fail(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(catalogue, "catalogue", fail)
+    monkeypatch.setattr("morphgen.cli.robots.catalogue", fail)
     with pytest.raises(ZeroDivisionError):
         main(["list"])
 
@@ -332,19 +338,3 @@ def test_check_and_show_read_an_mjcf(run, ok, tmp_path):
     }
     code, out, _ = run("show", "robot.xml")
     assert (code, out.splitlines()[0]) == (0, "test: 3 links, 2 DoF, 12.57 kg")
-
-
-def test_import_converts_an_mjcf_to_a_bundle(ok, tmp_path):
-    path = write(tmp_path, TWO_JOINTS)
-    out = ok("import", path, "--tool", "right", "--no-picture", "--out", "robots")
-    assert out.startswith("robots/test: 3 links, 2 DoF, ")
-    assert read_bundle(tmp_path / "robots" / "test").frame("tool").link == "right"
-
-
-def test_import_keeps_the_excluded_pairs_of_an_mjcf(run, tmp_path):
-    apart = TWO_JOINTS.replace('name="right"', 'name="right" pos="1 0 0"')
-    for exclude, is_ignored in (("", False), ('<exclude body1="left" body2="right"/>', True)):
-        path = write(tmp_path, f"{apart}<contact>{exclude}</contact>")
-        assert run("import", path, "--no-picture", "--out", "robots")[0] == 0
-        pairs = read_bundle(tmp_path / "robots" / "test").ignore_pairs
-        assert (("left", "right") in pairs) == is_ignored

@@ -6,9 +6,9 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
-from morphgen.cli.export import SAMPLES
+from morphgen.cli import export
+from morphgen.cli.command import read_commands
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.fitting import replace_collision as sphere_robot
 from morphgen.formats.bundle import file_findings, write_bundle
 from morphgen.formats.files import MANIFEST
 from morphgen.formats.fits import FITS
@@ -108,13 +108,15 @@ def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):
     assert f"b: {tmp_path / 'arm-sdf'} is of another robot of this command already" in err
 
 
-def test_default_number_of_samples_is_that_of_the_matrix():
-    assert SAMPLES == MATRIX_SAMPLES
+def test_the_help_has_the_formats_and_the_default_number_of_samples():
+    (command,) = [each for each in read_commands() if each.path == "export"]
+    assert command.options["--format"]["choices"] == [*export.FILES, *export.FOLDERS]
+    assert f"default: {MATRIX_SAMPLES:,}" in command.options["--samples"]["help"]
 
 
 @pytest.mark.parametrize("name", ["srdf", "ros2", "curobo"])
 def test_export_without_a_tool_is_refused_before_the_fit(run, tmp_path, monkeypatch, name):
-    monkeypatch.setattr(sphere_robot, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
+    monkeypatch.setattr(export, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
     bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)
     words = ("--format", name, "--spheres", "2", "--out", tmp_path)
     code, _, err = run("export", bundle, *words)

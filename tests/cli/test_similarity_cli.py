@@ -42,7 +42,8 @@ def light_set(run):
 
 def test_folder_of_bundles_gives_one_matrix_per_measure(ok, bundles, tmp_path):
     before = tree(tmp_path)
-    out = ok(*("similarity", *ARGUMENTS))
+    assert list(json.loads(ok("similarity", "robots", "--json"))["measures"]) == ["tree"]
+    out = ok("similarity", *ARGUMENTS)
     assert tree(tmp_path) == before
     blocks = out.rstrip("\n").split("\n\n")
     robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
@@ -73,13 +74,6 @@ def test_json_holds_the_matrices(ok, bundles):
         np.testing.assert_allclose(
             about["matrix"], similarity_matrix(robot_features, name), atol=1e-6
         )
-
-
-def test_tree_is_the_default_measure(run, bundles):
-    _, out, _ = run("similarity", "robots", "--json")
-    assert list(json.loads(out)["measures"]) == ["tree"]
-    _, out, _ = run("similarity", "robots", "--measure", "cosine", "--json")
-    assert list(json.loads(out)["measures"]) == ["cosine"]
 
 
 def test_paths_can_be_mixed_and_duplicates_are_dropped(ok, bundles, light_set):
@@ -177,19 +171,6 @@ def test_tokens_are_printed_link_by_link(ok, bundle):
         f"5 | right | 3 |  | {cylinder} {twice} | 0 -0.05 0.2 | 0 0 0 | 0.000",
     ]
     assert out.splitlines()[-1] == "arm: (6, 48), indices over 22"
-
-
-def test_robot_can_be_given_as_urdf_or_parts(run, robot_urdf):
-    code, out, _ = run("tokens", robot_urdf(arm()))
-    assert (code, len(rows_of(out))) == (0, 6)
-    assert {row[3] for row in rows_of(out)} == {""}
-    code, out, _ = run("tokens", *WORDS, "ee.size=0.2")
-    assert (code, len(rows_of(out))) == (0, 7)
-    assert rows_of(out)[-1][3:6] == ["tool", "box 0.01 x 0.2 x 0.2", "fixed"]
-    code, out, _ = run("tokens", "chain", "beads=2")
-    assert (code, len(rows_of(out))) == (0, 10)
-    drawn = [row[4].split()[0] for row in rows_of(out) if row[4]]
-    assert {*drawn} == {"cylinder", "sphere"}
 
 
 def test_options_may_stand_between_parts(run):

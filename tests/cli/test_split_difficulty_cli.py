@@ -82,17 +82,8 @@ def test_several_splits_have_the_baselines_of_all_their_tasks(ok, small):
     assert "-0.0" not in out
 
 
-def test_bad_input_is_refused(refused, small):
-    assert "a.yaml: no such file" in refused(*WORDS, "a.yaml")
+def test_studies_of_other_splits_are_refused(refused, small):
     assert "'mine/small' is also in small.yaml" in refused(*WORDS, small, small)
-    err = refused(*WORDS, small, "--csv", "none/a.csv")
-    assert "--csv none/a.csv: there is no folder none" in err
-    Path("folder.csv").mkdir()
-    assert "--csv folder.csv: it is a folder" in refused(*WORDS, small, "--csv", "folder.csv")
-    refusal = refused(*WORDS, small, "--csv", small)  # which would replace the split
-    assert "--csv small.yaml: expected a name that ends in .csv" in refusal
-    assert "0: expected a whole number" in refused(*WORDS, small, "--jobs", "0")
-    assert "none: no episodes.csv.gz" in refused(*WORDS, small, "--study", "none")
     err = refused(*WORDS, small, "--study", STUDY)
     assert "no episodes of baselines on split 'mine/small'" in err
     assert "interpolation/arm3/reach" in err

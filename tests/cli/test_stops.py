@@ -52,8 +52,10 @@ def _handlers():
         signal.signal(each, handler)
 
 
-@pytest.mark.parametrize("number", CODES)
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [*((name, signal.SIGINT) for name in WRITERS), *(("compose", each) for each in CODES)],
+)
 def test_a_signal_leaves_no_partial_file(name, number, run, tmp_path, monkeypatch):
     seen = []
 
@@ -110,8 +112,14 @@ def test_an_ignored_signal_stays_ignored(run, monkeypatch):
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        *((name, errno.ENOSPC) for name in WRITERS),
+        *(("compose", each) for each in (errno.EDQUOT, errno.EROFS, errno.EACCES)),
+        ("tokens", errno.EACCES),
+    ],
+)
 def test_a_disk_that_cannot_be_written_is_an_error_with_the_name(
     name, number, run, tmp_path, monkeypatch
 ):

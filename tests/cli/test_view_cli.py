@@ -37,14 +37,8 @@ def test_bundle_is_served_until_interrupted(tmp_path):
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize(
-    "end",
-    [
-        signal.SIGTERM,
-        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     viewing = start("view", "--port", "8933")
@@ -72,7 +66,7 @@ STUCK = {
 @pytest.mark.parametrize(
     "stuck",
     [
-        pytest.param(work, id=name, marks=[pytest.mark.slow] if "PIPE" in work else [])
+        pytest.param(work, id=name, marks=[] if name == "worker" else [pytest.mark.slow])
         for name, work in STUCK.items()
     ],
 )

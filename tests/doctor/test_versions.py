@@ -26,6 +26,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_set import SetConfig
 from morphgen.grammar.sampling import sample_robot
+from morphgen.model.dynamics import GRAVITY
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
 from morphgen.rl.runs import checkpoint as runs
 from morphgen.rl.runs import robot_source
@@ -37,7 +38,7 @@ from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP
+from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.viewer import episode
 
 RECORDED = json.loads(Path(__file__).with_name("reference.json").read_text(encoding="utf-8"))
