@@ -363,7 +363,7 @@ class Learner:
         # One copy from the device instead of one for each number.
         sums = torch.cat([means.double(), robot_scores.double(), robot_envs.double()])
         sums = self.processes.sum(sums.to(self.device)).cpu()
-        of_rollout, scores, envs = sums.split([len(means), self.num_robots, self.num_robots])
+        of_rollout, scores, envs = torch.split(sums, [len(means), self.num_robots, self.num_robots])
         successes, episodes, unstable = of_rollout[:3].tolist()
         reward, score, *term_means = (of_rollout[3:] / self.processes.size).tolist()
         return {
@@ -406,7 +406,7 @@ class Learner:
         values = torch.cat(chunks)[:count]
         return symexp(values) if self.config.symlog else values
 
-    def _learn(self) -> dict[str, float]:
+    def _learn(self) -> dict[str, Any]:
         """Improve actor and critic on the rollout; return the means of ``LEARN_METRICS``."""
         config = self.config
         learning_rate = config.learning_rate * (1 - self.update / self.num_updates)

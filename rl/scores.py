@@ -103,7 +103,8 @@ def episode_interval(
     else ``stratified_mean_interval``. Scores and successes of a robot have the shape (episodes,).
     """
     if not relative and all(map(np.array_equal, scores, successes)):
-        return success_interval(list(map(np.mean, successes)), list(map(np.size, successes)))
+        tables = [np.asarray(each, dtype=np.float64) for each in successes]
+        return success_interval([each.mean() for each in tables], [each.size for each in tables])
     return stratified_mean_interval(scores)
 
 

@@ -88,7 +88,7 @@ def _require_tensors(
     stored: Mapping[str, Any], wanted: Mapping[str, torch.Tensor], where: str
 ) -> None:
     """Require tensors of the same names, shapes and types as others."""
-    for name in wanted | stored:
+    for name in {**wanted, **stored}:
         if name not in stored:
             raise TaskError(f"{where} has no {name}")
         if name not in wanted:
@@ -440,7 +440,8 @@ def config_from(data: object) -> RunConfig:
 def _task_config(name: str, constants: object) -> TaskConfig:
     where, kind = f"run: {name}", TASKS[name].config_type
     fields = config_fields(name, read_record(constants, dict[str, Any], where, TaskError))
-    return kind(**read_fields(fields, kind, where))
+    config: TaskConfig = kind(**read_fields(fields, kind, where))
+    return config
 
 
 def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:

@@ -70,7 +70,8 @@ def state_of(learner: Learner) -> dict[str, Any]:
     """
     states = {name: getattr(learner, name).state_dict() for name in (*NETWORKS, "optimiser")}
     states["batch"] = learner.batch.state_dict()
-    joined, copied = learner.processes.joined, {n: in_main_memory(s) for n, s in states.items()}
+    joined = learner.processes.joined
+    copied: dict[str, Any] = {name: in_main_memory(state) for name, state in states.items()}
     return {
         **copied,
         "generators": {n: joined(each.get_state()[None]) for n, each in learner.generators.items()},
@@ -101,7 +102,8 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         "processes": learner.processes.size,
     }
     processes = len(state["generators"]["actions"])
-    _require_same(asdict(PPOConfig(**state["config"])) | state | {"processes": processes}, ours)
+    stored = {**asdict(PPOConfig(**state["config"])), **state, "processes": processes}
+    _require_same(stored, ours)
     n, rank, batch = learner.batch.num_envs, learner.processes.rank, state["batch"]
     if processes > 1:  # a checkpoint has the environments of all processes, one after another
         own = slice(rank * n, (rank + 1) * n)

@@ -52,22 +52,22 @@ def this_version(monkeypatch):
 def test_scores_are_computed_from_the_episodes():
     row = score_submission(submission())
     assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
-    assert [(each.side, each.task, each.robots) for each in row.sides] == [
-        ("train", "reach", 2),
-        ("test", "reach", 1),
-    ]
-    test = row.group("test", "reach")
+    assert {group: side.robots for group, side in row.sides.items()} == {
+        ("train", "reach"): 2,
+        ("test", "reach"): 1,
+    }
+    test = row.sides["test", "reach"]
     relative = np.array([150, 151, 152, -1]) + 2
     assert (test.score.value, test.success) == (relative.mean(), success_interval(0.75, 4))
     assert test.score == stratified_mean_interval([relative])
-    train = row.group("train", "reach")
+    train = row.sides["train", "reach"]
     assert train.score.value == relative.mean()
     assert test.score.high - test.score.low > train.score.high - train.score.low > 0
 
 
 def test_the_random_scores_of_a_release_replace_those_of_a_submission():
     forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
-    assert score_submission(submission(forged)).group("test", "reach").score.value > 600
+    assert score_submission(submission(forged)).sides["test", "reach"].score.value > 600
     random = random_scores(submission())
     fair = score_submission(submission(forged), random)
     assert fair.sides == score_submission(submission()).sides
@@ -77,18 +77,18 @@ def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
     random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
     for episodes in (4, 5, 8):
         each = submission(data(episodes=episodes))
-        score = score_submission(each, random).group("test", "reach").score.value
+        score = score_submission(each, random).sides["test", "reach"].score.value
         assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
 
 
 def row(method, *sides):
-    sides = (
-        SideScore(
-            *group, Interval(score, math.nan, math.nan), success_interval(rate, 34 * group[2])
+    scores = {
+        (side, task): SideScore(
+            robots, Interval(score, math.nan, math.nan), success_interval(rate, 34)
         )
-        for *group, score, rate in sides
-    )
-    return Row(method, "submission", "", (), 34, tuple(sides))
+        for side, task, robots, score, rate in sides
+    }
+    return Row(method, "submission", "", (), 34, scores)
 
 
 def test_rows_are_ranked_by_the_test_robots():

@@ -6,6 +6,7 @@ import re
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
+from math import isnan
 from types import SimpleNamespace
 
 import pytest
@@ -13,9 +14,10 @@ import torch
 
 from helpers.commands import tree
 from helpers.learners import learner
-from helpers.runs import PPO, small_config, small_source
+from helpers.runs import EVAL, PPO, small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.distributed import UpdateMetrics
+from morphgen.rl.evaluation import eval_config_of, evaluate_baseline
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
     CONFIG,
@@ -27,8 +29,11 @@ from morphgen.rl.runs.checkpoint import (
     unpacked,
     write_checkpoint,
 )
-from morphgen.rl.runs.robot_source import robot_source, specs_of
+from morphgen.rl.runs.robot_source import other_side, robot_source, specs_of
 from morphgen.rl.runs.training import METRICS, ROBOTS, read_metrics, recording, state_of
+from morphgen.rl.scores import score_table, scores_to_json
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
@@ -251,3 +256,41 @@ def test_a_source_needs_a_split_or_a_robot_with_a_task():
         TaskError, match=r"^'planar-cube': neither a split nor a robot with a task$"
     ):
         specs_of(source, GoalConfig())
+
+
+NEW = ("goal", "near_angle", "rotation_weight")
+POSE = (ReachConfig(num_goals=7, goal="pose", near_angle=0.2), PushConfig())
+
+
+def test_a_run_keeps_its_goal_and_missing_constants_have_defaults():
+    config = replace(small_config(small_source()), tasks=POSE)
+    data = json.loads(json.dumps(config.as_data()))
+    assert config_from(data).tasks == POSE
+    assert eval_config_of(config, 3).tasks[0] == replace(POSE[0], num_goals=100)
+    for name in NEW:
+        del data["reach"][name]
+    assert config_from(data).tasks[0] == ReachConfig(num_goals=7)
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"), [("poses", "unknown goal of reach 'poses'"), (3, "goal: invalid value 3")]
+)
+def test_an_invalid_goal_in_a_file_is_named(goal, message):
+    data = json.loads(json.dumps(small_config(small_source()).as_data()))
+    data["reach"]["goal"] = goal
+    with pytest.raises(TaskError, match=message):
+        config_from(data)
+
+
+def test_scores_of_poses_have_the_angle():
+    config = replace(EVAL, tasks=(replace(EVAL.tasks[0], goal="pose"), *EVAL.tasks[1:]))
+    source = other_side(small_source(), "test")
+    (score,) = evaluate_baseline("ik", source, config)
+    assert 0 < score.angle < config.tasks[0].near_angle
+    (stored,) = scores_to_json([score])
+    assert stored["angle"] == score.angle
+    assert f"{score.angle * 57.29578:.1f} deg" in score_table({"ik": [score]})
+    (by_position,) = evaluate_baseline("ik", source, EVAL)
+    assert isnan(by_position.angle)
+    assert "deg" not in score_table({"ik": [by_position]})
+    assert scores_to_json([by_position])[0]["angle"] is None

@@ -64,8 +64,6 @@ Source = Literal["submission", "reference"]
 class SideScore:
     """Mean result over the robots of a side that do one task."""
 
-    side: Side
-    task: str
     robots: int
     score: Interval  # mean score, relative to the random policy where the task wants it
     success: Interval  # mean success rate, 0 to 1, with its Wilson interval over all episodes
@@ -73,9 +71,9 @@ class SideScore:
     def as_data(self) -> dict[str, Any]:
         """Return JSON values, with null for ends of intervals that are not known."""
         score, success = self.score, self.success
-        values: dict[str, Any] = {"side": self.side, "task": self.task, "robots": self.robots}
-        values |= {"score": score.value, "success": success.value, "low": score.low}
-        values |= {"high": score.high, "success_low": success.low, "success_high": success.high}
+        values = {"robots": self.robots, "score": score.value, "success": success.value}
+        values |= {"low": score.low, "high": score.high}
+        values |= {"success_low": success.low, "success_high": success.high}
         return dict(finite_or_none(values))
 
 
@@ -88,7 +86,7 @@ class Row:
     mode: str
     seeds: tuple[int, ...]  # seeds of the training; empty for a baseline
     episodes: int  # episodes per robot
-    sides: tuple[SideScore, ...]
+    sides: Mapping[tuple[Side, str], SideScore]  # by side and task
     finetuned: int = 0  # transitions of fine-tuning on the test robots
 
     @property
@@ -99,10 +97,6 @@ class Row:
             remarks.append(f"fine-tuned {self.finetuned:,}")
         return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
 
-    def group(self, side: Side, task: str) -> SideScore | None:
-        """Return the result of a side at a task."""
-        return next((s for s in self.sides if (s.side, s.task) == (side, task)), None)
-
 
 def score_submission(
     submission: Submission, random: RandomScores | None = None, source: Source = "submission"
@@ -111,7 +105,7 @@ def score_submission(
     groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
     for outcomes in sorted(submission.robots, key=lambda robot: SIDES.index(robot.side)):
         groups.setdefault((outcomes.side, outcomes.task), []).append(outcomes)
-    sides = []
+    sides = {}
     for (side, task), robots in groups.items():
         successes = [each.success for each in robots]
         score = episode_interval(
@@ -120,7 +114,7 @@ def score_submission(
             relative=TASKS[task].relative_to_random,
         )
         success = success_interval(list(map(np.mean, successes)), list(map(len, successes)))
-        sides.append(SideScore(side, task, len(robots), score, success))
+        sides[side, task] = SideScore(len(robots), score, success)
     seed = submission.training_seed
     return Row(
         submission.method,
@@ -128,7 +122,7 @@ def score_submission(
         submission.mode,
         () if seed is None else (seed,),
         min(len(each.score) for each in submission.robots),
-        tuple(sides),
+        sides,
         submission.finetuned,
     )
 
@@ -145,10 +139,10 @@ def ranked(rows: Sequence[Row]) -> list[Row]:
     added, so with several tasks it is the mean success rate. Rows without all of these tasks come
     last.
     """
-    tasks = {side.task for row in rows for side in row.sides if side.side == "test"}
+    tasks = {task for row in rows for side, task in row.sides if side == "test"}
 
     def result(row: Row) -> float:
-        test = [side for side in row.sides if side.side == "test"]
+        test = [score for (side, _), score in row.sides.items() if side == "test"]
         if not test or len(test) < len(tasks):
             return -math.inf
         if len(tasks) == 1:
@@ -161,20 +155,20 @@ def ranked(rows: Sequence[Row]) -> list[Row]:
 
 def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
     """Return the ranking as a table; ``style`` is one of tabulate's."""
-    pairs = {(side.side, side.task): None for row in rows for side in row.sides}
+    pairs = {pair for row in rows for pair in row.sides}
     groups = sorted(pairs, key=lambda pair: (pair[0] != "test", pair[1]))
     headers = ["rank", "method", "from", "seeds"]
     for side, task in groups:
         headers += [f"{SIDE_NAMES[side]} {task}", "95%", "success"]
     decimals = {}
     for group in groups:
-        scores = [row.group(*group) for row in rows]
-        decimals[group] = score_decimals(side.score.value for side in scores if side is not None)
+        scores = [row.sides[group].score.value for row in rows if group in row.sides]
+        decimals[group] = score_decimals(scores)
     lines = []
     for rank, row in enumerate(ranked(rows), 1):
         cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
-        for side, task in groups:
-            cells += _cells(row.group(side, task), decimals[side, task])
+        for group in groups:
+            cells += _cells(row.sides.get(group), decimals[group])
         lines.append([*cells, str(row.episodes)])
     return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
 
@@ -182,7 +176,14 @@ def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
 def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows for JSON, in their order."""
     return [
-        {**vars(row), "seeds": list(row.seeds), "sides": [side.as_data() for side in row.sides]}
+        {
+            **vars(row),
+            "seeds": list(row.seeds),
+            "sides": [
+                {"side": side, "task": task, **score.as_data()}
+                for (side, task), score in row.sides.items()
+            ],
+        }
         for row in rows
     ]
 
