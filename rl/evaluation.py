@@ -22,6 +22,7 @@ from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import (
+    LISTS,
     RobotOutcomes,
     Score,
     finite_or_none,
@@ -251,11 +252,7 @@ def _score(
         task=spec.task,
         body=robot_hash,
         goal_set=spec.goals.key,
-        success=tuple(each.success for each in episodes),
-        score=tuple(each.score for each in episodes),
-        distance=tuple(each.distance for each in episodes),
-        steps=tuple(each.steps for each in episodes),
-        diverged=tuple(each.unstable for each in episodes),
+        **{name: tuple(getattr(each, name) for each in episodes) for name in LISTS},
         random_score=tuple(each.score for each in random_episodes),
         random_success=tuple(each.success for each in random_episodes),
     )

@@ -284,7 +284,7 @@ class Episode:
     distance: float  # distance from success at the end [m]
     score: float  # score of the episode; see `episode_score`
     steps: int  # length of the episode [control steps]
-    unstable: bool  # whether the episode ended because the simulation diverged
+    diverged: bool  # whether the episode ended because the simulation diverged
     angle: float = math.nan
     """Angle from success at the end [rad]; nan if the task wants no orientation."""
 

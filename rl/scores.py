@@ -173,6 +173,9 @@ class RobotOutcomes(Record, frozen=True):
     random_success: tuple[bool, ...]
 
 
+LISTS = ("success", "score", "distance", "steps", "diverged")
+"""Lists of a robot with an entry per episode of the policy, named as the fields of an episode."""
+
 RandomScores = Mapping[tuple[Side, str], Sequence[float]]
 """Scores of the random policy's episodes, by side and name of the robot."""
 

@@ -54,7 +54,7 @@ def play(args: argparse.Namespace) -> None:
         print_line(
             f"episode {next(episodes)}: {'success' if episode.success else 'failure'}, "
             f"{episode.distance:.3f} m{angle} from the {target}, score {episode.score:.2f}, "
-            f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}"
+            f"{episode.seconds:.2f} s{', the simulation diverged' * episode.diverged}"
         )
 
     with bar(args, f"preparing {robot} and its goals"):

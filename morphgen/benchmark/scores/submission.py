@@ -36,7 +36,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import parse_json, read_bytes, read_json
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.formats.records import Record, dotted_values, read_record
-from morphgen.rl.scores import Count, Name, RobotOutcomes, Score
+from morphgen.rl.scores import LISTS, Count, Name, RobotOutcomes, Score
 from morphgen.splits.split import Split, split_id
 from morphgen.tasks.registry import TASKS
 
@@ -154,8 +154,6 @@ def submission_from(data: object, where: Path | str) -> Submission:
     return read_record(data, Submission, str(where), BenchmarkError)
 
 
-LISTS = ("success", "score", "distance", "steps", "diverged")
-"""Lists of a robot with an entry per episode of the policy."""
 MAX_EPISODES = 10_000  # largest number of episodes of a robot
 MAX_DISTANCE = 1e3  # largest distance from success [m]
 ROUNDING = 1e-4
