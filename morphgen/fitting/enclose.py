@@ -171,7 +171,7 @@ def _outermost(points: Array) -> Array:
     if len(points) <= _MAX_POINTS:
         return points
     along = _half_sphere(2 * _MAX_POINTS) @ points.T
-    return points[np.unique([along.argmin(axis=1), along.argmax(axis=1)])]
+    return np.asarray(points[np.unique([along.argmin(axis=1), along.argmax(axis=1)])])
 
 
 def _half_sphere(n: int) -> Array:

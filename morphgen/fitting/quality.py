@@ -179,17 +179,18 @@ def _sobol(n: int, rng: np.random.Generator) -> Array:
 def _tessellated(shape: Shape) -> trimesh.Trimesh:
     """Return the triangles of a primitive in the link frame."""
     mesh: trimesh.Trimesh
-    match shape.geometry:
-        case Sphere(radius):
-            mesh = trimesh.creation.icosphere(_SUBDIVISIONS, radius)
+    if isinstance(shape.geometry, Sphere):
+        mesh = trimesh.creation.icosphere(_SUBDIVISIONS, shape.geometry.radius)
+        return mesh.apply_transform(shape.T_link_shape.matrix)
+    match _solid_primitive(shape):
+        case Box(size):
+            mesh = trimesh.creation.box(size)
         case Cylinder(radius, length):
             mesh = trimesh.creation.cylinder(radius, length, _SECTIONS)
         case Capsule(radius, length):
             mesh = trimesh.creation.capsule(length, radius, (_SECTIONS, _SECTIONS))
             # trimesh has one end of the axis at the origin.
             mesh.apply_translation(-mesh.bounds.mean(axis=0))
-        case geometry:
-            mesh = trimesh.creation.box(geometry.size)
     return mesh.apply_transform(shape.T_link_shape.matrix)
 
 

@@ -153,29 +153,6 @@ def test_too_few_points_give_no_further_guess():
     assert by_growth(one.candidate, some, 0) is None
 
 
-@pytest.mark.slow
-def test_an_added_primitive_starts_at_the_uncovered_part_of_the_solid():
-    arms = [Shape(Box((0.5, 0.1, 0.1)), Pose((0.0, y, 0.0))) for y in (-0.4, 0.0, 0.4)]
-    spine = Shape(Box((0.1, 0.9, 0.1)), Pose((-0.2, 0.0, 0.0)))
-    target = target_of(spine, *arms)
-    fit = best_single(target)
-    for _ in range(3):
-        fit = best_several(target, fit, 0)
-    assert len(fit.shapes) == 4
-    assert quality(target.solid, fit.shapes).iou > 0.93
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_thin_tilted_solids_are_sampled_and_fitted(seed):
-    rod = Shape(Cylinder(0.005, 0.3), TILTED)
-    plate = Shape(Box((0.3, 0.3, 0.006)), TILTED)
-    for shape in (rod, plate):
-        fit = best_single(target_of(shape, seed=seed))
-        assert fit.iou > 0.85
-        assert type(fit.shapes[0].geometry) is type(shape.geometry)
-
-
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_a_point_at_the_centre_has_finite_gradients(kind):
     points = np.vstack([np.zeros((1, 3)), np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))])

@@ -104,15 +104,6 @@ def test_a_cavity_is_filled_for_any_triangle_orientation(inner, outer):
     assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
-@pytest.mark.parametrize("inverted", [(False, False), (False, True), (True, True)])
-def test_overlapping_boxes_form_their_union(inverted):
-    first, second = inverted
-    boxes = [box((0.2,) * 3, (-0.06, 0, 0), first), box((0.2,) * 3, (0.06, 0, 0), second)]
-    solid = solid_of_mesh(trimesh.util.concatenate(boxes))
-    assert counted(solid) == pytest.approx(0.32 * 0.2 * 0.2, rel=1e-9)
-    assert solid.contains(np.array([(x, 0, 0) for x in (-0.1, 0, 0.1)])).all()
-
-
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize("inverted", [False, True])
 def test_a_duplicated_mesh_is_counted_once(merged, inverted):

@@ -132,14 +132,6 @@ def test_a_value_for_which_an_expression_fails_is_an_error(write):
         compiled.fill({"x": "0.3"})
 
 
-def test_constants_may_change_the_structure(write, tmp_path):
-    body = '<xacro:arg name="n" default="1"/><xacro:if value="${n > 1}"><a v="${x}"/></xacro:if>'
-    path = write(body.replace("n >", "$(arg n) >"))
-    for n in ("1", "2"):
-        compiled = compile_xacro(path, {"n": n}, {"x": "0.3"}, FINDER)
-        assert compiled.fill({"x": "0.4"}) == expand(path, {"n": n, "x": "0.4"}, FINDER)
-
-
 def test_a_file_is_compiled_once_until_it_changes(write):
     path = write('<a v="${x}"/>')
     before = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
@@ -152,10 +144,3 @@ def test_a_file_is_compiled_once_until_it_changes(write):
         b'<robot name="x"><a v="2"></a></robot>',
         b'<robot name="x"><a v="4"></a></robot>',
     )
-
-
-def test_compiling_does_not_affect_later_expansions(write):
-    path = write('<a v="${max(x, 1)}"/>')
-    plain = expand(path, {"x": "3"}, FINDER)
-    compile_xacro(path, {}, {"x": "0.3"}, FINDER)
-    assert expand(path, {"x": "3"}, FINDER) == plain

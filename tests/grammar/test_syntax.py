@@ -46,11 +46,6 @@ def test_an_item_has_a_port_parameters_and_a_repetition():
     ]
 
 
-@pytest.mark.parametrize(("text", "counts"), [("{3}", (3, 3)), ("{1,2}", (1, 2)), ("", None)])
-def test_one_number_repeats_exactly(text, counts):
-    assert only(f"tail -> bead{text}").alternatives[0].items[0].repetition == counts
-
-
 def test_a_weight_belongs_to_its_alternative():
     production = only("arm -> @weight(3) ur5 | panda | @weight(1/2) xarm7")
     weights = [alternative.weight for alternative in production.alternatives]
@@ -82,10 +77,6 @@ def test_comments_blank_lines_and_windows_line_ends_are_ignored():
 )
 def test_indented_lines_and_lines_with_a_bar_continue_a_statement(text):
     assert names(only(text)) == [["b", "c"], ["d"]]
-
-
-def test_an_unindented_line_starts_a_statement():
-    assert len(parse_grammar("a -> b\nc -> d", "g")) == 2
 
 
 @pytest.mark.parametrize(

@@ -441,6 +441,7 @@ class _Evaluation:
 
     def _call(self, node: ast.Call) -> object:
         operands: list[Value] = []
+        function: object
         if isinstance(node.func, ast.Attribute):
             owner, name = self.value(node.func.value), node.func.attr
             if method := METHODS.get(type(owner), {}).get(name):
@@ -521,16 +522,16 @@ def _variables(target: ast.expr, item: Value) -> dict[str, object]:
     """Return the variables of a comprehension for an item."""
     if isinstance(target, ast.Name):
         return {target.id: item}
-    names, values = _targets(target), tuple(item)
+    names = [name.id for name in _targets(target) if isinstance(name, ast.Name)]
+    values = tuple(item)
     if len(values) != len(names):
         raise ValueError(f"{len(names)} names for {len(values)} values")
     return dict(zip(names, values, strict=True))
 
 
-def _targets(target: ast.expr) -> list[str | None]:
-    """Return the names of a comprehension's variables; None for anything else."""
-    targets = target.elts if isinstance(target, ast.Tuple) else [target]
-    return [name.id if isinstance(name, ast.Name) else None for name in targets]
+def _targets(target: ast.expr) -> list[ast.expr]:
+    """Return the nodes of a comprehension's variables."""
+    return target.elts if isinstance(target, ast.Tuple) else [target]
 
 
 def _data(value: Value) -> Value:
@@ -589,8 +590,10 @@ def _require_allowed(node: ast.AST, text: str) -> None:
         is_allowed = type(node.value) in _SCALARS and checked(node.value) == node.value
     elif isinstance(node, ast.Attribute):
         is_allowed = not node.attr.startswith("__")
-    elif isinstance(node, ast.comprehension) and (node.is_async or None in _targets(node.target)):
-        node, is_allowed = node.target, False
+    elif isinstance(node, ast.comprehension):
+        are_names = all(isinstance(name, ast.Name) for name in _targets(node.target))
+        is_allowed = are_names and not node.is_async
+        node = node.target
     if not is_allowed:
         raise _refused(node, text)
 
