@@ -240,12 +240,6 @@ def _add_range(gallery: Gallery, fact: str) -> None:
 REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
 
 
-def load_pictures(gallery: Gallery, rows: Sequence[Row]) -> None:
-    """Load or draw the pictures of rows that have none yet, and measure their scale if needed."""
-    load_bundle_pictures(gallery, rows)
-    _request_missing(gallery, rows, lambda: True)
-
-
 def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
     """Load the pictures that bundles have, for robots whose facts are known."""
     for row in rows:
@@ -257,19 +251,19 @@ def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
             gallery.thumbnails[row.uri] = thumbnail
 
 
-def draw_missing(gallery: Gallery) -> None:
-    """Let the workers draw the page's missing thumbnails; retry once if a worker dies."""
-    rows = gallery.page_rows
+def load_pictures(
+    gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Load or draw the pictures that rows lack while they are wanted, and measure their scale.
 
-    def is_current() -> bool:
-        """Return whether the page still shows these robots; otherwise thumbnails can wait."""
-        return gallery.page_rows is rows
-
+    If a worker dies, they are requested once more.
+    """
+    load_bundle_pictures(gallery, rows)
     try:
-        _request_missing(gallery, rows, is_current)
+        _request_missing(gallery, rows, is_wanted)
     except WorkerDied:
         gallery.session.notify("A worker died", "another one continues with the thumbnails")
-        _request_missing(gallery, rows, is_current)
+        _request_missing(gallery, rows, is_wanted)
 
 
 def _request_missing(gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool]) -> None:
@@ -371,4 +365,10 @@ def show_page(gallery: Gallery, number: int) -> None:
     load_bundle_pictures(gallery, gallery.page_rows)
     show_histograms(gallery)
     draw_cards(gallery)
-    session.run_in_background(lambda: draw_missing(gallery), "thumbnails")
+
+    def draw_missing() -> None:
+        """Draw what the page lacks while it is the current one; other thumbnails can wait."""
+        shown = gallery.page_rows
+        load_pictures(gallery, shown, lambda: gallery.page_rows is shown)
+
+    session.run_in_background(draw_missing, "thumbnails")

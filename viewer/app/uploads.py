@@ -40,7 +40,6 @@ from morphgen.formats.zip_files import (
     stays_inside,
 )
 from morphgen.model.geometry import MESH_SUFFIXES
-from morphgen.viewer.app.server import MAX_UPLOAD
 from morphgen.viewer.robot_uri import (
     UPLOAD,
     FileAccess,
@@ -72,12 +71,7 @@ class UploadError(MorphgenError):
 
 
 def store_upload(name: str, content: bytes, files: FileAccess) -> str:
-    """Check and store an upload; return the URI of its robot."""
-    if len(content) > MAX_UPLOAD:
-        raise UploadError(
-            f"{shorten(name)}: {len(content) / 2**20:.0f} MB; at most {MAX_UPLOAD // 2**20} "
-            "MB are accepted: open it on this machine instead, with morphgen view"
-        )
+    """Check and store an upload, whose size the server has limited; return its robot's URI."""
     file = PurePosixPath(name.replace("\\", "/")).name
     if not _FILE_NAME.fullmatch(file):
         raise UploadError(
