@@ -16,7 +16,7 @@ from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.task import GOAL, ObservationField, StepResult, TaskEnvs
+from morphgen.tasks.task import GOAL, ObservationField, StepResult
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,6 @@ class FollowConfig(ReachConfig):
 
 class FollowEnvs(ReachEnvs):
     """The k environments of a batch that follow a goal; every tensor has k rows."""
-
-    numpy_row = TaskEnvs.numpy_row  # the NumPy formulas of reach are for goals that stand still
 
     def __init__(self, specs, env_spec_index, num_joints):
         super().__init__(specs, env_spec_index, num_joints)

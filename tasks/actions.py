@@ -1,14 +1,24 @@
-"""Actions: decoding to normalized joint steps, encoding back, and integration into targets."""
+"""Actions: decoding to normalized joint steps, encoding back, and motion of the joint targets."""
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Generic, Literal
 
+import numpy as np
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.sim.base import is_host
+from morphgen.tasks.rows import (
+    at,
+    clamped,
+    flat_index,
+    limit_violation,
+    namespace_of,
+    row_sums,
+)
+from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
+from morphgen.tasks.task import A, TaskState
 
 if TYPE_CHECKING:
     from morphgen.tasks.scenes.robot_tables import RobotTables
@@ -17,41 +27,46 @@ ActionKind = Literal["continuous", "discrete"]
 
 BINS = (-1.0, -1 / 2, -1 / 4, -1 / 8, -1 / 16, 0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Normalized actions that the discrete ones index, exponentially spaced about zero (AnyBody)."""
+_INTEGERS = f"discrete actions are integers from 0 to {len(BINS) - 1}"
+_NUMPY_BINS = np.array(BINS, np.float32)
 _TOLERANCE = 1e-6
 """Excess of a bin over the normalized action that it encodes which float32 rounding allows."""
 
 
-def decode_actions(
-    actions: torch.Tensor, kind: ActionKind, shape: tuple[int, int], device: torch.device
-) -> torch.Tensor:
+def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
     """Return actions as fractions of the largest joint steps, in [-1, 1], of a ``shape`` (n, L).
 
     On a GPU, which is not read here, actions that are not finite or out of range become nan: their
     environments diverge.
     """
-    if tuple(actions.shape) != shape:
-        raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {shape}")
-    actions = actions.to(device)
-    is_index = kind == "discrete"
-    if is_index and actions.is_floating_point():
-        raise TaskError(f"discrete actions are integers from 0 to {len(BINS) - 1}")
-    is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else torch.isfinite(actions)
-    if is_host(device) and not is_valid.all():
-        env, link = torch.nonzero(~is_valid)[0].tolist()
+    if actions.shape != shape:
+        raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {tuple(shape)}")
+    xp, is_index = namespace_of(actions), kind == "discrete"
+    if is_index and actions.dtype in (xp.float32, xp.float64):
+        raise TaskError(_INTEGERS)
+    is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else xp.isfinite(actions)
+    on_host = not isinstance(actions, torch.Tensor) or is_host(actions.device)
+    if on_host and xp.count_nonzero(~is_valid):  # in NumPy faster than `all`
+        env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
         where = f"environment {env}, link {link}"
-        if is_index:
-            raise TaskError(f"{where}: discrete actions are integers from 0 to {len(BINS) - 1}")
-        raise TaskError(f"the action of {where} is not finite")
+        raise TaskError(
+            f"{where}: {_INTEGERS}" if is_index else f"the action of {where} is not finite"
+        )
     if is_index:
-        numbers = _bins(device)[actions.long().clamp(0, len(BINS) - 1)]
+        numbers = _bins(actions)[xp.where(is_valid, actions, 0)]
     else:
-        numbers = actions.float().clamp(-1, 1)
-    return numbers if is_host(device) else torch.where(is_valid, numbers, torch.nan)
+        bounds = _bins(actions)[:1], _bins(actions)[-1:]
+        numbers = clamped(xp.asarray(actions, dtype=xp.float32), *bounds)
+    return numbers if on_host else xp.where(is_valid, numbers, xp.nan)
+
+
+def _bins(like: A) -> A:
+    """Return ``BINS`` as an array of the same kind, on the same device."""
+    return _bins_on(like.device) if isinstance(like, torch.Tensor) else _NUMPY_BINS
 
 
 @lru_cache(maxsize=16)
-def _bins(device: torch.device) -> torch.Tensor:
-    """Return ``BINS`` on a device."""
+def _bins_on(device: torch.device) -> torch.Tensor:
     return torch.tensor(BINS, device=device)
 
 
@@ -62,28 +77,54 @@ def encode_actions(normalized: torch.Tensor, kind: ActionKind) -> torch.Tensor:
     """
     if kind == "continuous":
         return normalized
-    bins = _bins(normalized.device)
+    bins = _bins_on(normalized.device)
     size = normalized.abs()[..., None] + _TOLERANCE  # so that a bin encodes to itself
     fits = (bins.abs() <= size) & (bins * normalized[..., None] >= 0)
     return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)
 
 
-class JointTargets:
-    """Integrates normalized actions into the joint targets of a batch."""
+class JointMotion(Generic[A]):
+    """The joint targets of a batch, and what its tasks need to know about the joints' motion.
 
-    def __init__(
-        self, tables: RobotTables, env_robot_index: torch.Tensor, action_mask: torch.Tensor
-    ) -> None:
-        """Gather the tables of the robots (n,); the mask (n, L) has the joints that obey."""
-        self._link = tables.link_of_joint[env_robot_index]
-        # Joints that do not obey have a step of zero: no mask is needed in a control step.
-        self._max_step = tables.max_step[env_robot_index] * torch.gather(action_mask, 1, self._link)
-        self._lower, self._upper = tables.lower[env_robot_index], tables.upper[env_robot_index]
+    Attributes:
+        targets: Targets of the independent joints, shape (n, J) [rad or m].
+        previous_action: Normalized actions of the last step, shape (n, L).
+        previous_qd: Velocities of the independent joints after the last step, shape (n, J).
+    """
 
-    def __call__(self, targets: torch.Tensor, normalized: torch.Tensor) -> torch.Tensor:
-        """Return the targets (n, J) after normalized actions (n, L), within the joint limits.
+    def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
+        """Gather the tables of the robots (n,)."""
+        link = tables.link_of_joint[env_robot_index]
+        self._link: Any = flat_index(link, tables.max_links)
+        self._max_step: Any = tables.max_step[env_robot_index]
+        self._lower: Any = tables.lower[env_robot_index]
+        self._upper: Any = tables.upper[env_robot_index]
+        zeros = tables.lower.new_zeros
+        self.targets: Any = zeros(self._lower.shape)
+        self.previous_qd: Any = zeros(self._lower.shape)
+        self.previous_action: Any = zeros(len(link), tables.max_links)
+
+    def act(self, normalized: A) -> None:
+        """Advance the targets by normalized actions (n, L), within the joint limits.
 
         They start from the previous targets, not from the measured positions: lag adds nothing.
         """
-        change = torch.gather(normalized, 1, self._link) * self._max_step
-        return torch.clamp(targets + change, self._lower, self._upper)
+        self.previous_action[:] = normalized
+        change = at(normalized, self._link) * self._max_step
+        self.targets[:] = clamped(self.targets + change, self._lower, self._upper)
+
+    def task_state(
+        self,
+        q: A,
+        qd: A,
+        *,
+        tool: A,
+        block_pose: A,
+        diverged: A,
+        tool_rotation: A | None = None,
+    ) -> TaskState[A]:
+        """Return the state after a step that ended at joint positions and velocities (n, J)."""
+        acceleration = row_sums(abs(qd - self.previous_qd)) / CONTROL_PERIOD
+        self.previous_qd[:] = qd
+        violation = limit_violation(q, self._lower, self._upper)
+        return TaskState(tool, block_pose, violation, acceleration, diverged, tool_rotation)

@@ -10,7 +10,7 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
+from morphgen.tasks.actions import ActionKind, JointMotion, decode_actions
 from morphgen.tasks.observation import (
     BatchObservation,
     EpisodeLayouts,
@@ -22,18 +22,17 @@ from morphgen.tasks.observation import (
 )
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
 from morphgen.tasks.reset_options import EpisodePlacer
-from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import RobotTables
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation, is_host
-from morphgen.tasks.task import EnvSpec, StepResult, TaskState
+from morphgen.tasks.sim.base import Simulation, is_host
+from morphgen.tasks.task import EnvSpec, StepResult
 from morphgen.tasks.task_groups import TaskGroups
 
 _FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Step(StepResult):
+class Step(StepResult[torch.Tensor]):
     """Result of a control step for n environments; where an episode ended, the next has begun.
 
     Terms are zero where the task has no such term, and the angle is nan where it wants no
@@ -85,10 +84,12 @@ class TaskBatch:
         action_mask: Links whose joint obeys actions, shape (n, L), bool.
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
         episode_step: Control steps since the episode began, shape (n,), int64.
+        motion: Motion of the joints, of which these are tensors:
         targets: Targets of the independent joints, shape (n, J) [rad or m].
         previous_action: Normalized actions of the last step, shape (n, L); 0 in a new episode.
         layouts: Layouts of the obstacles in the running episodes.
         previous_qd: Velocities of the independent joints after the last step, shape (n, J).
+        observation: Function that computes the observations.
         observation_config: Optional entries of observations.
         device: Device of all tensors.
     """
@@ -136,21 +137,19 @@ class TaskBatch:
             robot_tables.action_mask(fingers=False)[index],
         )
         self.max_episode_steps = self.groups.max_episode_steps
-        self.targets = torch.zeros(n, robot_tables.max_joints, device=device)
+        self.motion: JointMotion[torch.Tensor] = JointMotion(robot_tables, index)
+        self.targets, self.previous_action = self.motion.targets, self.motion.previous_action
+        self.previous_qd = self.motion.previous_qd
         self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
         env_number = torch.arange(first, first + n, device=device)
         self._episodes = EpisodeSequence(seed, env_number, torch.zeros_like(env_number))
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
         self._num_sim_joints = simulation.q.shape[1]
-        self.previous_qd = torch.zeros(n, robot_tables.max_joints, device=device)
-        self.previous_action = torch.zeros(n, robot_tables.max_links, device=device)
-        self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
         self.observation_config = observe or ObservationConfig()
         self.layouts = EpisodeLayouts(self.specs, index, layouts, self.observation_config)
         paths = StraightPaths(self.layouts, index)
         self._place = EpisodePlacer(self.specs, index, paths)
-        self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
-        self._observation = BatchObservation(
+        self.observation = BatchObservation(
             robot_tables,
             self.specs,
             index,
@@ -269,10 +268,9 @@ class TaskBatch:
         Raises:
             TaskError: If the actions are invalid.
         """
-        shape = (self.num_envs, self.robot_tables.max_links)
-        normalized = decode_actions(actions, self.action_kind, shape, self.device)
-        self.previous_action.copy_(torch.where(self.action_mask, normalized, 0.0))
-        self.targets.copy_(self._joint_targets(self.targets, self.previous_action))
+        mask = self.action_mask
+        normalized = decode_actions(actions.to(self.device), self.action_kind, mask.shape)
+        self.motion.act(torch.where(mask, normalized, 0.0))
         targets = self.targets[:, : self._num_sim_joints].contiguous()
         return BeforePhysics(targets, self.q, self.simulation.block_pose.clone())
 
@@ -326,7 +324,7 @@ class TaskBatch:
 
     def requested_entries(self) -> Observation:
         """Return the entries of the current observation that the configuration asks for."""
-        return self._observation.requested(self._state, self.targets, self.previous_action)
+        return self.observation.requested(self._state, self.targets, self.previous_action)
 
     def advance(self, progress: float) -> None:
         """Advance the curricula of the tasks that have one.
@@ -365,18 +363,17 @@ class TaskBatch:
 
     def _evaluate(
         self, state: PhysicsState, diverged: torch.Tensor
-    ) -> tuple[StepResult, torch.Tensor]:
+    ) -> tuple[StepResult[torch.Tensor], torch.Tensor]:
         """Let the tasks evaluate the step that was simulated; return also the rewards, (n,)."""
-        q, qd = state.q, state.qd
-        task_state = TaskState(
-            tool=self._observation.tool_positions(q),
+        q = state.q
+        task_state = self.motion.task_state(
+            q,
+            state.qd,
+            tool=self.observation.tool_positions(q),
             block_pose=state.block_pose,
-            limit_violation=limit_violation(q, self._lower, self._upper),
-            acceleration=row_sums((qd - self.previous_qd).abs()) / CONTROL_PERIOD,
             diverged=diverged,
             tool_rotation=self._tool_rotation(q) if self.groups.needs_tool_rotation else None,
         )
-        self.previous_qd.copy_(qd)
         return self.groups.evaluate(task_state)
 
     def _tool_rotation(self, q: torch.Tensor) -> torch.Tensor:
@@ -397,7 +394,7 @@ class TaskBatch:
         q, block_pose = self.groups.begin(mask, random, layout)
         if options:
             q, block_pose = self._place(options, self.groups, q, block_pose)
-        self._observation.begin(mask, random)
+        self.observation.begin(mask, random)
         obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()
         self.simulation.reset(mask, sim_q, block_pose, *obstacles)
@@ -410,7 +407,7 @@ class TaskBatch:
 
     def _observe(self, state: PhysicsState) -> Observation:
         """Return the observation in a state of the simulation."""
-        return self._observation(state, self.targets, self.previous_action)
+        return self.observation(state, self.targets, self.previous_action)
 
     @property
     def _state(self) -> PhysicsState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 import torch
@@ -17,10 +17,11 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import KinematicChannels
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
+from morphgen.tasks.rows import at, duplicate, flat_index, namespace_of
 from morphgen.tasks.scenes.obstacles import LayoutSide, layouts_of, place_boxes
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.task import OBJECT, EnvSpec
+from morphgen.tasks.task import OBJECT, A, EnvSpec
 from morphgen.tasks.task_groups import TaskGroups
 from morphgen.typing import Array
 
@@ -102,43 +103,59 @@ def observation_config(names: Collection[str], *, obstacles: int = 0) -> Observa
     return ObservationConfig(**entries)
 
 
-class LinkTokens:
+class LinkTokens(Generic[A]):
     """Tokens of the links of a batch's environments; only codes of joint positions change."""
 
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
         """Gather the tables of every environment."""
-        device = env_robot_index.device
         movable = tables.movable_links[env_robot_index]
         max_movable = int(movable.sum(dim=1).max())
         # Indices of movable links (n, M); robots with fewer are filled up with other links.
-        self._links = (~movable).int().argsort(dim=1, stable=True)[:, :max_movable]
-        self._rows = torch.arange(len(env_robot_index), device=device)[:, None]
-        self._constant = tables.tokens[env_robot_index]
-        index = env_robot_index[:, None], self._links
-        gains = tables.position_gain[index]
-        self._joint = gains.abs().argmax(dim=2)  # each link follows one independent joint
-        self._gain = torch.gather(gains, 2, self._joint[..., None])[..., 0]
-        self._offset, self._wraps = tables.position_offset[index], tables.wraps[index]
-        self._is_movable = tables.movable_links[index][..., None]
-        self._frequencies = torch.from_numpy(FREQUENCIES).float().to(device)
+        links = (~movable).int().argsort(dim=1, stable=True)[:, :max_movable]
+        rows = env_robot_index[:, None]
+        gains, is_movable = tables.position_gain[rows, links], tables.movable_links[rows, links]
+        joint = gains.abs().argmax(dim=2)  # each link follows one independent joint
+        self._constant: Any = tables.tokens[env_robot_index]
+        self._joint: Any = flat_index(joint, tables.max_joints)
+        self._gain: Any = torch.gather(gains, 2, joint[..., None])[..., 0]
+        self._offset: Any = tables.position_offset[rows, links]
+        self._wraps: Any = tables.wraps[rows, links]
+        self._frequencies: Any = torch.from_numpy(FREQUENCIES[None]).float().to(rows.device)
+        self._is_movable: Any = is_movable[..., None]
+        self._some_wrap, self._all_movable = bool(self._wraps.any()), bool(is_movable.all())
+        first = flat_index(links, tables.max_links)[..., None] * self._constant.shape[2]
+        half = torch.arange(len(FREQUENCIES), device=rows.device) + POSITION.start
+        self._sines: Any = first + half
+        self._cosines: Any = self._sines + len(FREQUENCIES)
 
-    def __call__(self, q: torch.Tensor) -> torch.Tensor:
+    def __call__(self, q: A) -> A:
         """Return the tokens (n, L, 48) at independent joint positions (n, J)."""
-        x = self._gain * torch.gather(q, 1, self._joint) + self._offset
-        x = torch.where(self._wraps, x - 2 * torch.ceil((x - 1) / 2), x)
+        xp = namespace_of(q)
+        x = at(q, self._joint) * self._gain + self._offset
+        if self._some_wrap:
+            x = xp.where(self._wraps, x - 2 * xp.ceil((x - 1) / 2), x)
         angles = x[..., None] * self._frequencies
-        codes = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1) * self._is_movable
-        tokens = self._constant.clone()
-        tokens[..., POSITION.columns][self._rows, self._links] = codes
+        sines, cosines = xp.sin(angles), xp.cos(angles)
+        if not self._all_movable:
+            sines, cosines = sines * self._is_movable, cosines * self._is_movable
+        tokens: A = duplicate(self._constant)
+        flat = tokens.reshape(-1)
+        flat[self._sines], flat[self._cosines] = sines, cosines
         return tokens
 
 
-def joint_to_link(
-    tables: RobotTables, env_robot_index: torch.Tensor, values: torch.Tensor
-) -> torch.Tensor:
-    """Return values of independent joints (n, J) at the links that they move, shape (n, L)."""
-    joint = tables.joint_of_link[env_robot_index]
-    return torch.gather(values, 1, joint.clamp(min=0)) * (joint >= 0)
+class LinkJoints(Generic[A]):
+    """The independent joints that move the links of a batch's environments."""
+
+    def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
+        """Gather the tables of every environment."""
+        joint = tables.joint_of_link[env_robot_index]
+        self._joint: Any = flat_index(joint.clamp(min=0), tables.max_joints)
+        self._has_joint: Any = joint >= 0
+
+    def __call__(self, values: A) -> A:
+        """Return values of independent joints (n, J) at the links that they move, (n, L)."""
+        return at(values, self._joint) * self._has_joint
 
 
 def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
@@ -420,6 +437,8 @@ class BatchObservation:
     """Computes the observations of a batch.
 
     Attributes:
+        tokens: Function that returns the tokens (n, L, 48) at joint positions (n, J).
+        link_joints: Function that returns values of joints at the links that they move.
         tool_positions: Function that returns the positions of the tools (n, 3) [m] at joint
             positions (n, J).
     """
@@ -436,10 +455,10 @@ class BatchObservation:
         paths: StraightPaths,
     ) -> None:
         """Gather the tables of all environments."""
-        self._tables, self._index, self._config = robot_tables, env_robot_index, config
-        self._groups, self._layouts = groups, layouts
+        self._config, self._groups, self._layouts = config, groups, layouts
         index, device = env_robot_index, env_robot_index.device
-        self._tokens = LinkTokens(robot_tables, index)
+        self.tokens: LinkTokens[torch.Tensor] = LinkTokens(robot_tables, index)
+        self.link_joints: LinkJoints[torch.Tensor] = LinkJoints(robot_tables, index)
         self.tool_positions = FramePositions(robot_tables.tool_chain, index)
         scenes = [specs[i].scene for i in index.tolist()]
         self._constant_entries = {
@@ -475,7 +494,7 @@ class BatchObservation:
     ) -> Observation:
         """Return the observation in a state, in tensors that the caller owns."""
         return {
-            "tokens": self._tokens(state.q),
+            "tokens": self.tokens(state.q),
             **self._groups.fields(state.block_pose),
             **copied(self._constant_entries),
             **self.requested(state, targets, previous_action),
@@ -490,7 +509,7 @@ class BatchObservation:
         if not config.state:
             observation["object"] = torch.zeros(len(q), OBJECT.size, device=q.device)
         if config.velocity:
-            observation["velocity"] = joint_to_link(self._tables, self._index, state.qd)
+            observation["velocity"] = self.link_joints(state.qd)
         if config.previous_action:
             observation["previous_action"] = previous_action.clone()
         if config.tool:

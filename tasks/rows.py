@@ -1,59 +1,103 @@
-"""Tensors with a row per environment: functions of rows, and tables that rows are drawn from.
+"""Arrays with a row per environment: functions of rows, and tables that rows are drawn from.
 
-The bits of a row depend on no other row.
-``row_norms``, ``choose`` and ``positive_part`` also accept NumPy values of one row without its
-axis, so that formulas of tasks serve batches in torch and single environments in NumPy.
+The bits of a row depend on no other row. Batches are tensors of torch, with an axis of rows. A
+single environment is one row in NumPy, without that axis: a call takes a tenth of the time, and
+operators on numbers less. What a control step computes is written once, for both (``A``), with
+operators, functions of ``namespace_of``, and those of this module.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.tasks.task import GoalSet
+from morphgen.tasks.task import A, GoalSet
+
+T = TypeVar("T")
 
 
-def row_sums(values: torch.Tensor) -> torch.Tensor:
+def namespace_of(values: A) -> Any:  # noqa: ANN401 - a module
+    """Return the module of an array, torch or NumPy, for functions that both have."""
+    return torch if isinstance(values, torch.Tensor) else np
+
+
+def numpy_row(tables: T) -> Any:  # noqa: ANN401 - the same type, of NumPy arrays
+    """Return a copy of an object whose tensors are NumPy views of their first row, on the CPU."""
+    row = copy(tables)
+    for name, value in vars(tables).items():
+        if isinstance(value, torch.Tensor):
+            setattr(row, name, value.numpy()[0, ...])
+    return row
+
+
+def duplicate(values: A) -> A:
+    """Return a copy of an array."""
+    return values.clone() if isinstance(values, torch.Tensor) else values.copy()
+
+
+def row_sums(values: A) -> A:
     """Return the sums of rows (n, k), shape (n,).
 
     They are added in double precision: in single precision the order of a sum, and with it the
     last bit, depends on padding and on the number of rows.
     """
-    return values.sum(dim=1, dtype=torch.float64).float()
+    if isinstance(values, torch.Tensor):
+        return values.sum(dim=1, dtype=torch.float64).float()
+    total: Any = np.float32(sum(values.tolist()))
+    return total
 
 
-def row_norms(vectors: torch.Tensor) -> torch.Tensor:
+def row_norms(vectors: A) -> A:
     """Return the Euclidean norms of rows (n, 3), shape (n,); see ``row_sums``."""
     if isinstance(vectors, torch.Tensor):
         return vectors.double().square().sum(dim=1).sqrt().float()
-    exact = vectors.astype(np.float64)
-    return np.float32(math.sqrt(exact.dot(exact)))
+    length: Any = np.float32(math.hypot(*vectors.tolist()))
+    return length
 
 
-def choose(
-    condition: torch.Tensor, value: float, otherwise: torch.Tensor | float = 0.0
-) -> torch.Tensor:
+def choose(condition: A, value: float, otherwise: A | float = 0.0) -> A:
     """Return a value in the rows where a condition holds, and other values elsewhere, (n,)."""
     if isinstance(condition, torch.Tensor):
         return torch.where(condition, value, otherwise)
-    return value if condition else otherwise
+    chosen: Any = value if condition else otherwise
+    return chosen
 
 
-def positive_part(values: torch.Tensor) -> torch.Tensor:
-    """Return values (n,), or 0 where they are negative."""
+def positive_part(values: A) -> A:
+    """Return values, or 0 where they are negative."""
     if isinstance(values, torch.Tensor):
         return torch.clamp(values, min=0)
     return np.maximum(values, np.float32(0))
 
 
-def limit_violation(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+def clamped(values: A, lower: A, upper: A) -> A:
+    """Return values within bounds of the same shape."""
+    xp = namespace_of(values)
+    within: A = xp.minimum(xp.maximum(values, lower), upper)  # np.clip takes four times as long
+    return within
+
+
+def limit_violation(q: A, lower: A, upper: A) -> A:
     """Return the sum over joints of their distance outside of the limits, shape (n,) [rad, m]."""
-    return row_sums(torch.clamp(torch.maximum(q - upper, lower - q), min=0))
+    return row_sums(abs(q - clamped(q, lower, upper)))
+
+
+def flat_index(columns: torch.Tensor, width: int) -> torch.Tensor:
+    """Return indices in a flattened table (n, width) of columns (n, k) of its rows; see ``at``."""
+    rows = torch.arange(len(columns), device=columns.device)
+    return rows[:, None] * width + columns
+
+
+def at(table: A, index: A) -> A:
+    """Return the elements of a table at flat indices, in the shape of the indices."""
+    return table.reshape(-1)[index]
 
 
 def padded_rows(

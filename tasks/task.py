@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -30,51 +30,60 @@ if TYPE_CHECKING:  # tasks are also used by processes that need no torch, which 
     from morphgen.tasks.random_numbers import EpisodeRandom
 
 
+A = TypeVar("A", "torch.Tensor", NDArray[Any])
+"""Tensors of a batch with an axis of rows, or NumPy values of one environment without it."""
+
+
 @dataclass(frozen=True, eq=False)
-class TaskState:
+class TaskState(Generic[A]):
     """State after a step for its evaluation: rows of k environments; positions in root frames."""
 
-    tool: torch.Tensor
+    tool: A
     """Position of the tool, shape (k, 3) [m]."""
-    block_pose: torch.Tensor
+    block_pose: A
     """Pose of the block, shape (k, 7); zeros if there is none."""
-    limit_violation: torch.Tensor
+    limit_violation: A
     """Sum over joints of their distance outside of the limits, shape (k,) [rad and m]."""
-    acceleration: torch.Tensor
+    acceleration: A
     """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
-    diverged: torch.Tensor
+    diverged: A
     """Whether the simulation diverged, shape (k,), bool; such a step is never a success."""
-    tool_rotation: torch.Tensor | None = None
+    tool_rotation: A | None = None
     """Rotation matrix of the tool, shape (k, 3, 3); None if no task ``needs_tool_rotation``."""
 
 
 @dataclass(frozen=True, eq=False)
-class StepResult:
+class StepResult(Generic[A]):
     """Result of a step: rows of k environments."""
 
-    success: torch.Tensor
+    success: A
     """Whether the task is fulfilled, shape (k,), bool."""
-    terminated: torch.Tensor
+    terminated: A
     """Whether the task ends the episode, shape (k,), bool."""
-    distance: torch.Tensor
+    distance: A
     """Distance from success, shape (k,) [m]."""
-    score: torch.Tensor
+    score: A
     """Score of the step, shape (k,); see ``Task.episode_score``."""
-    terms: dict[str, torch.Tensor]
+    terms: dict[str, A]
     """Weighted reward terms by name, each of shape (k,); the reward is their sum."""
-    angle: torch.Tensor | None = None
+    angle: A | None = None
     """Angle from success, shape (k,) [rad]; None if the task wants no orientation."""
 
 
-@dataclass(frozen=True, eq=False)
-class NumpyRow:
-    """The formulas of one environment of a task in NumPy."""
+class StepFormulas(ABC, Generic[A]):
+    """The formulas of a task's step, for tensors of k environments and for NumPy arrays alike.
 
-    evaluate: Callable[[TaskState], StepResult]
-    """``TaskEnvs.evaluate`` of a state whose values are vectors and bools of NumPy and numbers:
-    those of ``TaskState`` without the axis of rows. The result has numbers, too."""
-    observe: Callable[[NDArray[np.float32]], dict[str, NDArray[np.float32]]]
-    """``TaskEnvs.observe`` of the pose of the block, shape (7,), in arrays that the caller owns."""
+    They use operators, functions that torch and NumPy share, and those of ``morphgen.tasks.rows``.
+    Arrays that they need are attributes, which ``TaskEnvs`` updates in place.
+    """
+
+    @abstractmethod
+    def evaluate(self, state: TaskState[A]) -> StepResult[A]:
+        """Return the result of a step."""
+
+    @abstractmethod
+    def observe(self, block_pose: A) -> dict[str, A]:
+        """Return the task's observation fields by name from poses of the block, shape (k, 7)."""
 
 
 class TaskConfig(Protocol):
@@ -224,6 +233,9 @@ class TaskEnvs(ABC):
 
     needs_tool_rotation: bool = False
     """Whether ``evaluate`` needs ``TaskState.tool_rotation``."""
+    formulas: StepFormulas[torch.Tensor]
+    """What ``evaluate`` and ``observe`` return, unless a task has its own of these in torch.
+    ``TaskEnv`` steps one environment in NumPy with them, several times as fast."""
 
     @abstractmethod
     def begin(
@@ -244,17 +256,17 @@ class TaskEnvs(ABC):
             if there is none. Rows outside of the mask are ignored.
         """
 
-    @abstractmethod
-    def evaluate(self, state: TaskState) -> StepResult:
+    def evaluate(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
         """Return the result of a step, and advance whatever depends on time."""
+        return self.formulas.evaluate(state)
 
-    @abstractmethod
     def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the task's observation fields by name, each of shape (k, size).
 
         Args:
             block_pose: Pose of the block, shape (k, 7).
         """
+        return self.formulas.observe(block_pose)
 
     def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
         """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.
@@ -288,16 +300,6 @@ class TaskEnvs(ABC):
 
     def target_rotations(self) -> torch.Tensor | None:
         """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
-        return None
-
-    def numpy_row(self, row: int) -> NumpyRow | None:
-        """Return the formulas of an environment in NumPy, with which ``TaskEnv`` steps it.
-
-        They must return what ``evaluate`` and ``observe`` do: formulas of operators and functions
-        of ``morphgen.tasks.rows`` serve both. The environment's state must be in views of the
-        tensors that ``begin``, ``advance`` and ``load_state_dict`` change. With None, the default,
-        ``TaskEnv`` steps the batch in torch.
-        """
         return None
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:

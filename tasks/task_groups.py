@@ -177,9 +177,11 @@ class TaskGroups:
         """Begin an episode as options ask for; see ``TaskEnvs.place``."""
         return self._group_of(env).envs.place(int(self._row[env]), options, space, q, block_pose)
 
-    def evaluate(self, state: TaskState) -> tuple[StepResult, torch.Tensor]:
+    def evaluate(
+        self, state: TaskState[torch.Tensor]
+    ) -> tuple[StepResult[torch.Tensor], torch.Tensor]:
         """Evaluate a step of all environments; return also the rewards, shape (n,)."""
-        results: list[StepResult] = []
+        results: list[StepResult[torch.Tensor]] = []
         for group in self._groups.values():
             values: dict[str, Any] = {
                 name: None if value is None else self._rows_of(group, value)

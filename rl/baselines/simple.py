@@ -13,7 +13,7 @@ import torch
 from morphgen.model.kinematics_torch import frame_jacobian, pose_task
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.observation import joint_to_link
+from morphgen.tasks.observation import LinkJoints
 from morphgen.tasks.reach.config import ReachConfig
 
 
@@ -90,7 +90,7 @@ class JacobianColumns:
             J, error = pose_task(T_root_tool, J_root_tool, *goal)
         steps = column_steps(J, error)
         fractions = (GAIN * steps / tables.max_step[robots].clamp(min=1e-9)).clamp(-1, 1)
-        return encode_actions(joint_to_link(tables, robots, fractions), task.action_kind)
+        return encode_actions(LinkJoints(tables, robots)(fractions), task.action_kind)
 
 
 def column_steps(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

@@ -2,13 +2,11 @@
 
 A call of torch takes microseconds however small its tensors are, and a step makes a hundred; a call
 of NumPy takes a tenth of that. A step in NumPy equals ``TaskBatch.step`` to the rounding of single
-precision. Rewards, scores and observation fields come from the task's own formulas, see
-``TaskEnvs.numpy_row``.
+precision: all of its formulas are those of the batch, for arrays of NumPy.
 """
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -22,18 +20,18 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from morphgen.encoding.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError
 from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.tasks.actions import BINS, ActionKind, decode_actions
-from morphgen.tasks.batch import Step, TaskBatch
+from morphgen.tasks.actions import BINS, ActionKind, JointMotion, decode_actions
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
     RENDER_MODES,
+    Array,
     NumpyObservation,
     action_space,
     final_state,
@@ -45,105 +43,79 @@ from morphgen.tasks.gym.vector import (
     task_config,
     text_spec,
 )
-from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation, ObservationConfig
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.obstacles import LayoutSide
-from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
-from morphgen.tasks.task import STANDARD_FIELDS, NumpyRow, StepResult, TaskConfig, TaskState
+from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
 
-Float32 = NDArray[np.float32]
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
 """Observation, reward, whether terminated, whether truncated, and info, as of Gymnasium."""
-_BINS = np.array(BINS, np.float32)
-
-
-def numpy_stepper(
-    batch: TaskBatch, unpadded: Callable[[Observation], NumpyObservation]
-) -> NumpyStepper | None:
-    """Return the stepper of a batch of one environment.
-
-    There is none if the batch is not on the CPU, or if its task has no formulas in NumPy: its
-    ``TaskEnvs`` has no ``numpy_row``, or a class that changes ``evaluate`` or ``observe`` without.
-    """
-    envs = batch.groups[batch.specs[0].task]
-    depth = {
-        name: next(i for i, cls in enumerate(type(envs).__mro__) if name in vars(cls))
-        for name in ("numpy_row", "evaluate", "observe")
-    }
-    if batch.device.type != "cpu" or depth["numpy_row"] > min(depth.values()):
-        return None
-    row = envs.numpy_row(0)
-    return None if row is None else NumpyStepper(batch, row, unpadded)
-
-
-def pad_action(batch: TaskBatch, action: NDArray[Any]) -> torch.Tensor:
-    """Return actions for all links, shape (1, L), from an action for the task's joints."""
-    values = torch.from_numpy(action)
-    actions = torch.zeros(batch.action_mask.shape, dtype=values.dtype)
-    actions[batch.action_mask] = values
-    return actions
 
 
 class NumpyStepper:
-    """Steps a batch of one environment.
+    """Steps a batch of one environment in NumPy.
 
     It works on views of the tensors of the batch, which is thus always in the same state. Unlike
     the batch it does not begin the next episode where one ends.
     """
 
     def __init__(
-        self, batch: TaskBatch, row: NumpyRow, unpadded: Callable[[Observation], NumpyObservation]
+        self, batch: TaskBatch, unpadded: Callable[[Observation], NumpyObservation]
     ) -> None:
         """Take views of the batch's tensors; ``begin`` must follow."""
-        self._batch, self._row, self._unpadded = batch, row, unpadded
-        tables = batch.robot_tables
-        self._discrete = batch.action_kind == "discrete"
-        self._links = np.flatnonzero(batch.action_mask[0].numpy())
-        self._targets, self._previous_qd = batch.targets[0].numpy(), batch.previous_qd[0].numpy()
-        self._previous_action = batch.previous_action[0].numpy()
+        self._batch, self._unpadded = batch, unpadded
+        robot = batch.specs[0].robot
+        self._formulas: StepFormulas[Array] = numpy_row(_envs(batch).formulas)
+        self._motion: JointMotion[Array] = numpy_row(batch.motion)
+        self._tokens: LinkTokens[Array] = numpy_row(batch.observation.tokens)
+        self._link_joints: LinkJoints[Array] = numpy_row(batch.observation.link_joints)
+        self._tool_position = FramePosition(robot)
+        self._padded, self._kind = ActionPadding(batch), batch.action_kind
+        self._links, self._rows = batch.action_mask[0].numpy(), slice(len(robot.links))
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
         self._view_state()
-        self._lower, self._upper = tables.lower[0].numpy(), tables.upper[0].numpy()
-        self._limits = list(zip(self._lower.tolist(), self._upper.tolist(), strict=True))
-        self._link_of_joint = tables.link_of_joint[0].numpy()
-        self._max_step = tables.max_step[0].numpy()
-        self._tokens, self._tool_position = _Tokens(tables), FramePosition(tables.robots[0])
-        joint = tables.joint_of_link[0, : len(tables.robots[0].links)].numpy()
-        self._joint_of_link, self._has_joint = np.maximum(joint, 0), joint >= 0
         self._constant: NumpyObservation = {}
         self._requested: Callable[[], NumpyObservation] = dict
 
     def begin(self, observation: NumpyObservation) -> None:
         """Begin an episode that the batch has begun."""
         requested = self._unpadded(self._batch.requested_entries()).keys()
-        changing = {"tokens", *self._row.observe(self._block_pose), *requested}
+        changing = {"tokens", *self._formulas.observe(self._block_pose), *requested}
         self._constant = {k: v.copy() for k, v in observation.items() if k not in changing}
-        in_numpy: dict[str, Callable[[], Float32]] = {
-            "velocity": lambda: self._qd[self._joint_of_link] * self._has_joint,
-            "previous_action": lambda: self._previous_action[self._links],
-            "tool": lambda: np.array(self._tool_position(self._q.tolist()), np.float32),
+        in_numpy: dict[str, Callable[[], Array]] = {
+            "velocity": lambda: self._link_joints(self._qd)[self._rows],
+            "previous_action": lambda: self._motion.previous_action[self._links],
+            "tool": self._tool,
         }
         if requested <= in_numpy.keys():
             self._requested = lambda: {name: in_numpy[name]() for name in requested}
         else:
             self._requested = lambda: self._unpadded(self._batch.requested_entries())
 
-    def step(self, action: NDArray[Any]) -> EnvStep:
+    def step(self, action: Array) -> EnvStep:
         """Act for one control step."""
-        self._previous_action[self._links] = self._normalized(action)
-        change = self._previous_action[self._link_of_joint] * self._max_step
-        # np.clip takes four times as long.
-        np.minimum(np.maximum(self._targets + change, self._lower), self._upper, out=self._targets)
+        actions = self._padded(action)
+        self._motion.act(decode_actions(actions, self._kind, actions.shape)[0])
         diverged = self._simulate()
         steps = self._episode_step.item() + 1
         self._episode_step[0] = steps
-        result = self._row.evaluate(self._state(diverged))
-        self._previous_qd[:] = self._qd
-        observation = {"tokens": self._tokens(self._q), **self._row.observe(self._block_pose)}
+        result = self._formulas.evaluate(
+            self._motion.task_state(
+                self._q,
+                self._qd,
+                tool=self._tool(),
+                block_pose=self._block_pose,
+                diverged=np.bool_(diverged),
+            )
+        )
+        observation = {"tokens": self._tokens(self._q)[self._rows]}
+        for name, values in self._formulas.observe(self._block_pose).items():
+            observation[name] = values.copy()
         for name, values in self._constant.items():
             observation[name] = values.copy()
         observation |= self._requested()
@@ -151,28 +123,15 @@ class NumpyStepper:
         truncated = (steps >= self._max_episode_steps or diverged) and not terminated
         return observation, sum(info["terms"].values()), terminated, truncated, info
 
-    def _normalized(self, action: NDArray[Any]) -> Float32:
-        """Return an action as fractions of the joints' largest steps; see ``decode_actions``."""
-        if not self._discrete:
-            if math.isfinite(action.dot(action)):  # then all are finite; a sum may also overflow
-                return np.minimum(np.maximum(action.astype(np.float32), -1), 1)
-        elif action.dtype.kind == "i" and ((action >= 0) & (action < len(BINS))).all():
-            return np.asarray(_BINS[action])
-        # Unusual or invalid: torch decodes it or says what is wrong.
-        actions, kind = pad_action(self._batch, action), self._batch.action_kind
-        decoded = decode_actions(actions, kind, (1, actions.shape[1]), self._batch.device)
-        return np.asarray(decoded[0, self._links].numpy())
-
     def _simulate(self) -> bool:
         """Step the simulation, undo the step if it diverged; return whether it did."""
         q, block_pose = self._q.copy(), self._block_pose.copy()
-        mask = self._batch.simulation.step(self._batch.targets)
+        simulation = self._batch.simulation
+        mask = simulation.step(self._batch.targets)
         diverged = bool(mask.item())
         if diverged:
-            state = torch.from_numpy(q[None]), torch.from_numpy(block_pose[None])
-            self._batch.simulation.reset(mask, *state)
-            self._previous_qd[:] = 0
-        simulation = self._batch.simulation
+            simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(block_pose[None]))
+            self._motion.previous_qd[:] = 0
         current = simulation.q, simulation.qd, simulation.block_pose
         if not all(map(operator.is_, current, self._tensors)):
             self._view_state()  # a simulator may replace its tensors
@@ -184,27 +143,40 @@ class NumpyStepper:
         self._tensors = simulation.q, simulation.qd, simulation.block_pose
         self._q, self._qd, self._block_pose = (tensor[0].numpy() for tensor in self._tensors)
 
-    def _state(self, diverged: bool) -> TaskState:
-        """Return the state that the task evaluates, in NumPy; see ``NumpyRow``."""
-        q, violation = self._q.tolist(), 0.0
-        for position, (lower, upper) in zip(q, self._limits, strict=True):
-            if position > upper:
-                violation += position - upper
-            elif position < lower:
-                violation += lower - position
-        change = np.abs(self._qd - self._previous_qd).tolist()
-        values: list[Any] = [
-            np.array(self._tool_position(q), np.float32),
-            self._block_pose,
-            violation,
-            sum(change) / CONTROL_PERIOD,
-            np.bool_(diverged),
-        ]
-        return TaskState(*values)
+    def _tool(self) -> Array:
+        """Return the position of the tool, shape (3,) [m]."""
+        return np.array(self._tool_position(self._q.tolist()), np.float32)
 
 
-def _info(result: StepResult | Step, diverged: bool) -> dict[str, Any]:
-    """Return the info of a step of one environment, whose result has numbers or one row."""
+def _envs(batch: TaskBatch) -> TaskEnvs:
+    return batch.groups[batch.specs[0].task]
+
+
+def steps_in_numpy(batch: TaskBatch) -> bool:
+    """Return whether the task of a batch of one steps by formulas, which serve NumPy, too."""
+    envs = _envs(batch)
+    kind = type(envs)
+    by_formulas = kind.evaluate is TaskEnvs.evaluate and kind.observe is TaskEnvs.observe
+    return by_formulas and not envs.needs_tool_rotation and batch.device.type == "cpu"
+
+
+class ActionPadding:
+    """Pads an action for the task's joints to all links, whose others stay where they are."""
+
+    def __init__(self, batch: TaskBatch) -> None:
+        stay = BINS.index(0) if batch.action_kind == "discrete" else 0
+        self._stay = np.full(batch.action_mask.shape, stay)
+        self._links = np.flatnonzero(batch.action_mask[0].numpy())
+
+    def __call__(self, action: Array) -> Array:
+        """Return actions, shape (1, L)."""
+        actions = self._stay.astype(action.dtype)
+        actions[0, self._links] = action
+        return actions
+
+
+def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
+    """Return the info of a step of one environment."""
     info: dict[str, Any] = {
         "success": bool(result.success),
         "is_success": bool(result.success),
@@ -216,36 +188,6 @@ def _info(result: StepResult | Step, diverged: bool) -> dict[str, Any]:
     if result.angle is not None:
         info["angle"] = float(result.angle)
     return info
-
-
-class _Tokens:
-    """Tokens of a robot's links; see ``morphgen.tasks.observation.LinkTokens``."""
-
-    def __init__(self, tables: RobotTables) -> None:
-        num_links, num_codes = len(tables.robots[0].links), len(FREQUENCIES)
-        self._constant = tables.tokens[0, :num_links].numpy()
-        links = np.flatnonzero(tables.movable_links[0].numpy())
-        gains, offsets = tables.position_gain[0, links].numpy(), tables.position_offset[0, links]
-        joint = np.abs(gains).argmax(axis=1)  # each link follows one independent joint
-        # Arrays of a number for each link and frequency: NumPy is fastest without broadcasting.
-        rows = links, joint, gains[np.arange(len(links)), joint], offsets.numpy()
-        link, self._joint, self._gain, self._offset = (np.repeat(row, num_codes) for row in rows)
-        self._wraps = np.flatnonzero(tables.wraps[0].numpy()[link])
-        self._frequencies = np.tile(FREQUENCIES.astype(np.float32), len(links))
-        columns = POSITION.start + np.tile(np.arange(num_codes), len(links))
-        self._sines = link * self._constant.shape[1] + columns
-        self._cosines = self._sines + num_codes
-
-    def __call__(self, q: Float32) -> Float32:
-        """Return the tokens, shape (links, 48), at joint positions, shape (J,)."""
-        x = self._gain * q[self._joint] + self._offset
-        if len(self._wraps):
-            x[self._wraps] -= 2 * np.ceil((x[self._wraps] - 1) / 2)
-        angles = x * self._frequencies
-        tokens = self._constant.copy()
-        flat = tokens.reshape(-1)
-        flat[self._sines], flat[self._cosines] = np.sin(angles), np.cos(angles)
-        return tokens
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
@@ -273,9 +215,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     A copy (``copy.deepcopy``, ``pickle``) goes on exactly as the original would; with simulators
     that hold their state elsewhere, such as PyBullet, it is refused.
 
-    Reach and push on the CPU step in NumPy (``NumpyStepper``), several times as fast as the batch;
-    all results equal the batch's to the rounding of single precision. A task whose ``TaskEnvs`` has
-    no ``numpy_row``, such as one of another package, steps the batch in torch.
+    A task whose ``TaskEnvs`` has ``formulas``, such as reach and push, steps in NumPy on the CPU
+    (``NumpyStepper``), several times as fast as the batch; all results equal the batch's to the
+    rounding of single precision. Others, and goals that are poses, step the batch in torch.
 
     Attributes:
         batch: The batch of one environment.
@@ -365,7 +307,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         self._running = self._closed = self._was_reset = self._next_has_begun = False
         self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
         self._final_state: RenderState | None = None
-        self._stepper = numpy_stepper(self.batch, self._without_padding)
+        self._stepper = self._make_stepper()
         first = self._in_goal_form(self._without_padding(self.batch.observe()))
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
@@ -449,7 +391,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy: views of tensors must be of its own tensors."""
         vars(self).update(state)
-        self._stepper = numpy_stepper(self.batch, self._without_padding)
+        self._stepper = self._make_stepper()
         if self._stepper is not None and self._was_reset:
             self._stepper.begin(self._without_padding(self.batch.observe()))
 
@@ -485,10 +427,15 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
         return action
 
+    def _make_stepper(self) -> NumpyStepper | None:
+        if not steps_in_numpy(self.batch):
+            return None
+        return NumpyStepper(self.batch, self._without_padding)
+
     def _torch_step(self, action: NDArray[Any]) -> EnvStep:
         """Step the batch, which begins the next episode where one ends."""
         before = render_state(self.batch) if self.render_mode is not None else None
-        step = self.batch.step(pad_action(self.batch, action))
+        step = self.batch.step(torch.from_numpy(ActionPadding(self.batch)(action)))
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
             self._final_physics = step.q, step.block_pose

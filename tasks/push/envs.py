@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
 import torch
@@ -16,12 +15,35 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet, require_pushable
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reset_options import unit_quaternion
-from morphgen.tasks.rows import GoalChoices, choose, padded_rows, positive_part, row_norms
-from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.rows import (
+    GoalChoices,
+    choose,
+    namespace_of,
+    padded_rows,
+    positive_part,
+    row_norms,
+)
+from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
 from morphgen.typing import Array
 
 GAP = 0.05
 """Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""
+
+
+class PushFormulas(StepFormulas[A]):
+    """Compares blocks with lines, y (k,) [m]; the tokens (k, 13) are those of the blocks."""
+
+    def __init__(self, config: PushConfig, line: A, tokens: A) -> None:
+        self._config, self._line, self._shape = config, line, tokens[..., 7:]
+
+    def evaluate(self, state: TaskState[A]) -> StepResult[A]:
+        """Compare the blocks with their lines; see ``evaluate_push``."""
+        return evaluate_push(self._config, self._line, state)
+
+    def observe(self, block_pose: A) -> dict[str, A]:
+        """Return the blocks and their lines."""
+        block = namespace_of(block_pose).concatenate([block_pose, self._shape], -1)
+        return {"object": block, "line": self._line[..., None]}
 
 
 class PushEnvs(TaskEnvs):
@@ -50,6 +72,8 @@ class PushEnvs(TaskEnvs):
             for pushes in sets
         ]
         self.line = self._final_line.clone()  # current y that the block must cross, shape (k,) [m]
+        tokens = box_tokens(self._size.new_zeros(len(self._size), 7), self._size)
+        self.formulas = PushFormulas(self._config, self.line, tokens)
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
@@ -78,14 +102,6 @@ class PushEnvs(TaskEnvs):
         free = space.free(starts, np.tile(block, (len(starts), 1)))
         return starts[int(free.argmax())], block
 
-    def evaluate(self, state: TaskState) -> StepResult:
-        """Compare the block with the line; see ``evaluate_push``."""
-        return evaluate_push(self._config, self.line, state)
-
-    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the block and the line."""
-        return {"object": box_tokens(block_pose, self._size), "line": self.line[:, None]}
-
     def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
         """Return a point behind the block, its centre, and its centre beyond the line."""
         centre = block_pose[:, :3]
@@ -93,21 +109,6 @@ class PushEnvs(TaskEnvs):
         behind[:, 1] -= self._size[:, 1] / 2 + GAP
         beyond[:, 1] = self.line + GAP
         return torch.stack([behind, centre, beyond], dim=1)
-
-    def numpy_row(self, row: int) -> NumpyRow:
-        """Return the formulas of an environment in NumPy."""
-        line: NDArray[np.float32] = self.line[row : row + 1].numpy()
-        token: NDArray[np.float32] = box_tokens(torch.zeros(7), self._size[row]).numpy()
-
-        def evaluate(state: TaskState) -> StepResult:
-            return evaluate_push(self._config, cast("torch.Tensor", line[0]), state)
-
-        def observe(block_pose: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-            block = token.copy()
-            block[:7] = block_pose
-            return {"object": block, "line": line.copy()}
-
-        return NumpyRow(evaluate, observe)
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the line."""
@@ -128,7 +129,7 @@ class PushEnvs(TaskEnvs):
         self.line.copy_(state["line"])
 
 
-def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> StepResult:
+def evaluate_push(config: PushConfig, line: A, state: TaskState[A]) -> StepResult[A]:
     """Compare blocks with the lines, y (k,) [m], that they must cross."""
     y = state.block_pose[..., 1]
     to_go = positive_part(line - y)
@@ -145,11 +146,11 @@ def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> S
 
 def push_terms(
     config: PushConfig,
-    to_go: torch.Tensor,
-    approach: torch.Tensor,
-    limit_violation: torch.Tensor,
-    success: torch.Tensor,
-) -> dict[str, torch.Tensor]:
+    to_go: A,
+    approach: A,
+    limit_violation: A,
+    success: A,
+) -> dict[str, A]:
     """Return the reward terms of push (paper, tables of reward terms), shape (k,) each.
 
     They depend on the distances of the block from the line and from the tool [m].

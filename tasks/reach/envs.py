@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import cast
 
 import numpy as np
 import torch
@@ -20,13 +18,32 @@ from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reset_options import unit_quaternion
 from morphgen.tasks.rows import GoalChoices, choose, padded_rows, row_norms
-from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
 from morphgen.typing import Array
 
 _STARTS, _ITERATIONS = 32, 60
 """Number of configurations from which inverse kinematics starts, and of its iterations."""
 _ARRIVED = 1e-3
 """Largest distance of a tool from a goal that it reaches [m, and of rotation matrices]."""
+
+
+class ReachFormulas(StepFormulas[A]):
+    """Compares tools with goals: poses (k, 7), and rotations (k, 3, 3) if these count."""
+
+    def __init__(self, config: ReachConfig, goal: A, goal_rotation: A | None) -> None:
+        self._config, self._goal, self._goal_rotation = config, goal, goal_rotation
+
+    def evaluate(self, state: TaskState[A]) -> StepResult[A]:
+        """Compare the tools with their goals; see ``evaluate_reach``."""
+        angle = None
+        tool, goal = state.tool_rotation, self._goal_rotation
+        if isinstance(tool, torch.Tensor) and isinstance(goal, torch.Tensor):
+            angle = angle_between(tool, goal)  # such goals are evaluated in torch alone
+        return evaluate_reach(self._config, self._goal, state, angle)
+
+    def observe(self, block_pose: A) -> dict[str, A]:
+        """Return the goals."""
+        return {"goal": self._goal}
 
 
 class ReachEnvs(TaskEnvs):
@@ -51,6 +68,7 @@ class ReachEnvs(TaskEnvs):
         """Joint positions that bring the tool to its goal, shape (k, J)."""
         self.needs_tool_rotation = self._config.goal == "pose"
         self._goal_rotation = torch.eye(3, device=device).repeat(len(env_spec_index), 1, 1)
+        self.formulas = ReachFormulas(self._config, self.goal, self.target_rotations())
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
@@ -70,10 +88,6 @@ class ReachEnvs(TaskEnvs):
             rotation = matrix_from_quaternion(self.goal[:, 3:])
             self._goal_rotation.copy_(torch.where(rows[..., None], rotation, self._goal_rotation))
         return q[:, 0], torch.zeros_like(self.goal)
-
-    def evaluate(self, state: TaskState) -> StepResult:
-        """Compare the tool with its goal; see ``evaluate_reach``."""
-        return evaluate_reach(self._config, self.goal, state, self._angle(state))
 
     def place(
         self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
@@ -107,32 +121,13 @@ class ReachEnvs(TaskEnvs):
         self._goal_rotation[row] = matrix_from_quaternion(self.goal[row, 3:])
         return q, block_pose
 
-    def _angle(self, state: TaskState) -> torch.Tensor | None:
-        """Return the angles between tools and goals, shape (k,); None for goals of positions."""
-        if not self.needs_tool_rotation:
-            return None
-        assert state.tool_rotation is not None
-        return angle_between(state.tool_rotation, self._goal_rotation)
-
     def target_rotations(self) -> torch.Tensor | None:
         """Return the goals' rotation matrices, shape (k, 3, 3); None for goals of positions."""
         return self._goal_rotation if self.needs_tool_rotation else None
 
-    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the goal."""
-        return {"goal": self.goal}
-
     def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
         """Return the position of the goal."""
         return self.goal[:, None, :3]
-
-    def numpy_row(self, row: int) -> NumpyRow | None:
-        """Return the formulas of an environment in NumPy; None for goals that are poses."""
-        if self.needs_tool_rotation:
-            return None
-        goal: NDArray[np.float32] = self.goal[row].numpy()
-        evaluate = partial(evaluate_reach, self._config, cast("torch.Tensor", goal))
-        return NumpyRow(evaluate, lambda block_pose: {"goal": goal.copy()})
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
@@ -164,8 +159,8 @@ def _reachable_configuration(
 
 
 def evaluate_reach(
-    config: ReachConfig, goal: torch.Tensor, state: TaskState, angle: torch.Tensor | None = None
-) -> StepResult:
+    config: ReachConfig, goal: A, state: TaskState[A], angle: A | None = None
+) -> StepResult[A]:
     """Compare tools with goal poses (k, 7); the angles between are None for goals of positions."""
     distance = row_norms(state.tool - goal[..., :3])
     return StepResult(
@@ -178,9 +173,7 @@ def evaluate_reach(
     )
 
 
-def is_near(
-    config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
-) -> torch.Tensor:
+def is_near(config: ReachConfig, distance: A, angle: A | None = None) -> A:
     """Return whether tools at distances (k,) [m] and angles (k,) [rad] are at their goals."""
     near = distance < config.near
     return near if angle is None else near & (angle < config.near_angle)
@@ -188,11 +181,11 @@ def is_near(
 
 def reach_terms(
     config: ReachConfig,
-    distance: torch.Tensor,
-    limit_violation: torch.Tensor,
-    acceleration: torch.Tensor,
-    angle: torch.Tensor | None = None,
-) -> dict[str, torch.Tensor]:
+    distance: A,
+    limit_violation: A,
+    acceleration: A,
+    angle: A | None = None,
+) -> dict[str, A]:
     """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours)."""
     terms = {
         "joint_limits": -config.joint_limit_weight * limit_violation,
@@ -216,9 +209,7 @@ def goal_terms(config: ReachConfig, achieved: torch.Tensor, desired: torch.Tenso
     return torch.stack([*reach_terms(config, distance, nothing, nothing, angle).values()]).sum(0)
 
 
-def anybody_score(
-    config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
-) -> torch.Tensor:
+def anybody_score(config: ReachConfig, distance: A, angle: A | None = None) -> A:
     """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
     far = -config.score_square * (distance * distance)
     return choose(is_near(config, distance, angle), config.score_near, far)

@@ -91,6 +91,8 @@ class MujocoState:
         self._q, self._qd = np.zeros((2, n, joints), np.float32)
         self._block_pose = np.zeros((n, 7), np.float32)
         self._exact_pose = np.zeros((n, 7))
+        self.joints = np.zeros((n, joints)), np.zeros((n, joints))
+        """Joint positions and velocities at the last ``read``, shape (n, J) each."""
         self.q, self.qd = torch.from_numpy(self._q), torch.from_numpy(self._qd)
         self.block_pose = torch.from_numpy(self._block_pose)
 
@@ -113,15 +115,12 @@ class MujocoState:
         angular[:] = angular + w * twice + np.cross(axis, twice)
         return torch.from_numpy(velocity.astype(np.float32))
 
-    def joints(self) -> tuple[Array, Array]:
-        """Return joint positions and velocities at the last ``read``, shape (n, J) each."""
-        return self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
-
     def read(self) -> None:
         """Update the tensors from the data."""
         self._positions.read()
         self._velocities.read()
-        self._q[:], self._qd[:] = self.joints()
+        self.joints = self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
+        self._q[:], self._qd[:] = self.joints
         if self._has_blocks:
             self._exact_pose = self._positions.flat[self._pose_at]
             quaternion = self._exact_pose[:, 3:]
@@ -344,7 +343,7 @@ class MujocoSimulation:
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
         with np.errstate(invalid="ignore", over="ignore"), MujocoWarnings():
             self._control.controls(
-                self._targets, *self._state.joints(), self._state.velocities, out=self._controls
+                self._targets, *self._state.joints, self._state.velocities, out=self._controls
             )
             refused = self._advance()
             self._state.read()

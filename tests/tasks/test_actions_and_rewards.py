@@ -17,7 +17,7 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.tasks.actions import JointTargets, decode_actions
+from morphgen.tasks.actions import JointMotion, decode_actions
 from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
@@ -29,8 +29,6 @@ from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import TaskState
-
-CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(
@@ -44,30 +42,28 @@ CPU = torch.device("cpu")
     ],
 )
 def test_invalid_actions_are_rejected_and_others_clipped(actions, kind, words):
-    numbers = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
+    numbers = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2))
     assert numbers.tolist() == [[1.0, -0.5]]
-    numbers = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
+    numbers = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3))
     assert numbers.tolist() == [[-1.0, 0.0, 1.0]]
     with pytest.raises(TaskError, match=words):
-        decode_actions(actions, kind, (1, 2), CPU)
+        decode_actions(actions, kind, (1, 2))
 
 
 def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     body = torch.tensor([1])
     mask = robot_tables.action_mask(fingers=False)[body]
-    targets = robot_tables.home[body]
-    moved_by = JointTargets(robot_tables, body, mask)
-    half = torch.minimum(targets + robot_tables.max_step[body] / 2, robot_tables.upper[body])
-    moves_tool = robot_tables.moves_tool[body]
-    assert torch.equal(
-        moved_by(targets, torch.full((1, robot_tables.max_links), 0.5)),
-        torch.where(moves_tool, half, targets),
-    )
-    for _ in range(400):
-        targets = moved_by(targets, torch.ones(1, robot_tables.max_links))
+    motion = JointMotion(robot_tables, body)
+    home = robot_tables.home[body]
+    motion.targets.copy_(home)
+    motion.act(0.5 * mask)
+    half = torch.minimum(home + robot_tables.max_step[body] / 2, robot_tables.upper[body])
     moved = robot_tables.moves_tool[1]
-    assert torch.equal(targets[0, moved], robot_tables.upper[1, moved])
-    assert torch.equal(targets[0, ~moved], robot_tables.home[1, ~moved])
+    assert torch.equal(motion.targets, torch.where(moved, half, home))
+    for _ in range(400):
+        motion.act(1.0 * mask)
+    assert torch.equal(motion.targets[0, moved], robot_tables.upper[1, moved])
+    assert torch.equal(motion.targets[0, ~moved], home[0, ~moved])
 
 
 def test_reach_reward_terms():
@@ -239,7 +235,7 @@ def test_at_its_goals_configuration_a_robot_succeeds_and_elsewhere_the_angle_is_
     envs = batch.groups["reach"]
     goal_q = envs.goal_configuration.clone()
     reset_envs(batch.simulation, torch.arange(4), goal_q)
-    batch.targets = goal_q.clone()
+    batch.targets.copy_(goal_q)
     step = batch.step(torch.zeros(batch.action_mask.shape))
     assert step.success.all()
     assert (step.angle < math.radians(1)).all()
