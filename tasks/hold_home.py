@@ -20,15 +20,11 @@ from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Scene
 from morphgen.typing import Array
 
-BULLET_MARGIN = 1e-3
-"""Distance by which PyBullet enlarges convex meshes of a URDF: links that touch push each other
-away [m]."""
-
 
 def hold_in_environment(robot: Robot, simulator: str) -> HoldRow:
     """Hold a robot at home and step its joints in an environment; see ``hold_row``."""
     name = f"{simulator} (environment)"
-    margin = BULLET_MARGIN if simulator == "pybullet" else 0.0
+    margin = SIMULATORS[simulator].contact_margin
 
     def hold(robot: Robot) -> HoldRow:
         return hold_row(name, simulator, robot, lambda: _simulated(robot, simulator), margin)

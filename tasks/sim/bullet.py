@@ -230,4 +230,5 @@ SIMULATOR = Simulator(
     lambda scenes, contacts, workers, _: BulletSimulation(scenes, contacts, processes=workers),
     native_step=("pybullet", "stepSimulation"),
     max_envs=128,  # an environment takes 36 MB
+    contact_margin=1e-3,  # by which it enlarges convex meshes of a URDF
 )
