@@ -57,7 +57,8 @@ def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
     else:
         bounds = _bins(actions)[:1], _bins(actions)[-1:]
         numbers = clamped(xp.asarray(actions, dtype=xp.float32), *bounds)
-    return numbers if on_host else xp.where(is_valid, numbers, xp.nan)
+    decoded: A = numbers if on_host else xp.where(is_valid, numbers, xp.nan)
+    return decoded
 
 
 def _bins(like: A) -> A:

@@ -155,7 +155,8 @@ class LinkJoints(Generic[A]):
 
     def __call__(self, values: A) -> A:
         """Return values of independent joints (n, J) at the links that they move, (n, L)."""
-        return at(values, self._joint) * self._has_joint
+        at_links: A = at(values, self._joint) * self._has_joint
+        return at_links
 
 
 def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:

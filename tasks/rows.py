@@ -21,6 +21,7 @@ from morphgen.errors import TaskError
 from morphgen.tasks.task import A, GoalSet
 
 T = TypeVar("T")
+_number: Any = np.float32  # a number of one environment, which counts as an array without axes
 
 
 def namespace_of(values: A) -> Any:  # noqa: ANN401 - a module
@@ -50,7 +51,7 @@ def row_sums(values: A) -> A:
     """
     if isinstance(values, torch.Tensor):
         return values.sum(dim=1, dtype=torch.float64).float()
-    total: Any = np.float32(sum(values.tolist()))
+    total: A = _number(sum(values.tolist()))
     return total
 
 
@@ -58,7 +59,7 @@ def row_norms(vectors: A) -> A:
     """Return the Euclidean norms of rows (n, 3), shape (n,); see ``row_sums``."""
     if isinstance(vectors, torch.Tensor):
         return vectors.double().square().sum(dim=1).sqrt().float()
-    length: Any = np.float32(math.hypot(*vectors.tolist()))
+    length: A = _number(math.hypot(*vectors.tolist()))
     return length
 
 
@@ -66,7 +67,7 @@ def choose(condition: A, value: float, otherwise: A | float = 0.0) -> A:
     """Return a value in the rows where a condition holds, and other values elsewhere, (n,)."""
     if isinstance(condition, torch.Tensor):
         return torch.where(condition, value, otherwise)
-    chosen: Any = value if condition else otherwise
+    chosen: A = _number(value if condition else otherwise)
     return chosen
 
 
@@ -74,7 +75,8 @@ def positive_part(values: A) -> A:
     """Return values, or 0 where they are negative."""
     if isinstance(values, torch.Tensor):
         return torch.clamp(values, min=0)
-    return np.maximum(values, np.float32(0))
+    positive: A = np.maximum(values, _number(0))
+    return positive
 
 
 def clamped(values: A, lower: A, upper: A) -> A:
@@ -97,7 +99,8 @@ def flat_index(columns: torch.Tensor, width: int) -> torch.Tensor:
 
 def at(table: A, index: A) -> A:
     """Return the elements of a table at flat indices, in the shape of the indices."""
-    return table.reshape(-1)[index]
+    elements: A = table.reshape(-1)[index]
+    return elements
 
 
 def padded_rows(

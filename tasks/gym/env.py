@@ -110,7 +110,7 @@ class NumpyStepper:
                 self._qd,
                 tool=self._tool(),
                 block_pose=self._block_pose,
-                diverged=np.bool_(diverged),
+                diverged=np.asarray(diverged)[()],
             )
         )
         observation = {"tokens": self._tokens(self._q)[self._rows]}

@@ -34,7 +34,9 @@ class PushFormulas(StepFormulas[A]):
     """Compares blocks with lines, y (k,) [m]; the tokens (k, 13) are those of the blocks."""
 
     def __init__(self, config: PushConfig, line: A, tokens: A) -> None:
-        self._config, self._line, self._shape = config, line, tokens[..., 7:]
+        self._config = config
+        self._line: A = line
+        self._shape: A = tokens[..., 7:]
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the blocks with their lines; see ``evaluate_push``."""

@@ -31,7 +31,9 @@ class ReachFormulas(StepFormulas[A]):
     """Compares tools with goals: poses (k, 7), and rotations (k, 3, 3) if these count."""
 
     def __init__(self, config: ReachConfig, goal: A, goal_rotation: A | None) -> None:
-        self._config, self._goal, self._goal_rotation = config, goal, goal_rotation
+        self._config = config
+        self._goal: A = goal
+        self._goal_rotation: A | None = goal_rotation
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the tools with their goals; see ``evaluate_reach``."""

@@ -27,7 +27,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import GAIN, LAG, SLACK, MotorForces
+from morphgen.tasks.sim.motor_law import GAIN, LAG
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
@@ -36,7 +36,7 @@ import pybullet
 from helpers.pybullet_states import PUSHING, client_of, reset, touching, wander
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
-from morphgen.tasks.sim.bullet_batch import FRICTION, OVERSPEED
+from morphgen.tasks.sim.bullet_batch import FRICTION, OVERSPEED, SLACK, MotorForces
 
 
 def touching_starts(scene, seed):
