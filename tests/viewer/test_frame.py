@@ -78,7 +78,7 @@ class Script:
 
 def test_a_script_opens_another_page_in_place(viewer):
     on = viewer()
-    with PlainClient(on.port, "?library=") as client:
+    with PlainClient(on.port, "?population=") as client:
         script = Script(client, on.port)
         client.shows("Grammars")
         (first,) = on.sessions.values()
@@ -94,24 +94,24 @@ def test_a_script_opens_another_page_in_place(viewer):
 
 def test_a_script_chooses_robots(viewer):
     on = viewer()
-    with PlainClient(on.port, f"?library=&chosen={A}") as client:
+    with PlainClient(on.port, f"?population=&chosen={A}") as client:
         script = Script(client, on.port)
         client.shows("1 chosen")
         assert script.send("choose", B) == 200
         client.shows("2 chosen")
         client.until(
             lambda: (
-                f"?library=&chosen={quote(A, safe='/=:')}&chosen={B}"
+                f"?population=&chosen={quote(A, safe='/=:')}&chosen={B}"
                 in dict(client.addresses).values()
             )
         )
-        script.send("open", "?gallery=robots/prims", visit=1)
+        script.send("open", "?gallery=", visit=1)
         client.until(lambda: any(n == 1 and query.endswith(B) for n, query in client.addresses))
         script.send("drop", A)
         script.send("download", "")
         client.shows("robots.zip")
         script.send("clear", "")
-        client.until(lambda: client.addresses[-1] == (1, "?gallery=robots/prims"))
+        client.until(lambda: client.addresses[-1] == (1, "?gallery="))
         script.send("choose", "x" * MAX_CHOSEN)
         client.shows("choose fewer")
         script.send("explode", "")
@@ -120,12 +120,12 @@ def test_a_script_chooses_robots(viewer):
 
 def test_only_the_script_of_a_page_can_change_it(viewer):
     on = viewer()
-    with PlainClient(on.port, "?library=") as client:
+    with PlainClient(on.port, "?population=") as client:
         script = Script(client, on.port)
         assert script.send("open", "?split=", token="x" * 32) == 404
         assert script.send("choose", A, token="../library") == 404
     client.websocket.close()
-    with PlainClient(on.port, "?library=") as other:
+    with PlainClient(on.port, "?population=") as other:
         other.shows("Grammars")
         assert script.send("open", "?split=") == 404
 
@@ -153,15 +153,15 @@ def test_chosen_robots_become_the_sides_of_a_split(shared_viewer):
         client.shows("test (2)")
 
 
-def test_a_page_opens_the_tabs_of_its_address(viewer):
-    with PlainClient(viewer().port, "?gallery=robots/prims&tab=A,B") as client:
+def test_a_page_opens_the_tabs_of_its_address(shared_viewer):
+    with PlainClient(shared_viewer.port, "?gallery=robots/prims&tab=A,B") as client:
         client.shows('?.openTabs(["A", "B"])')
         assert client.addresses[-1] == (0, "?gallery=robots/prims&tab=A,B")
 
 
 def test_the_dark_theme_is_remembered(viewer):
     on = viewer()
-    with PlainClient(on.port, "?library=", dark=True) as client:
+    with PlainClient(on.port, "?population=", dark=True) as client:
         script = Script(client, on.port)
         client.shows(">light</a>")  # the way back
         (theme, *_) = [m for m in client.messages if m["type"] == "ThemeConfigurationMessage"]

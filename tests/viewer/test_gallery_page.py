@@ -120,15 +120,15 @@ def test_a_range_that_cannot_be_used_is_refused(text, limits, message):
         ("role=train", "role=train was left out; expected all"),
     ],
 )
-def test_a_page_says_which_value_of_its_address_it_leaves_out(viewer, query, message):
-    with PlainClient(viewer().port, f"?gallery=robots/prims&{query}") as client:
+def test_a_page_says_which_value_of_its_address_it_leaves_out(shared_viewer, query, message):
+    with PlainClient(shared_viewer.port, f"?gallery=robots/prims&{query}") as client:
         client.shows(message)
         client.shows("30 robots · page 1 of 2")
 
 
-def test_an_empty_gallery_names_the_condition_that_excludes_all(viewer):
+def test_an_empty_gallery_names_the_condition_that_excludes_all(shared_viewer):
     query = "?gallery=robots/prims&search=lost&findings=without"
-    with PlainClient(viewer().port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.shows("No robot passes the filter")
         client.shows("<td >search: lost</td><td >no robot of 30</td>")
 
@@ -155,7 +155,7 @@ def test_a_histogram_counts_all_values_and_greys_those_outside_the_range():
     assert colours[0] != colours[-1]
 
 
-def test_a_gallery_shows_the_distributions_of_its_facts(viewer):
-    with PlainClient(viewer().port, "?gallery=robots/prims") as client:
+def test_a_gallery_shows_the_distributions_of_its_facts(shared_viewer):
+    with PlainClient(shared_viewer.port, "?gallery=robots/prims") as client:
         client.control("MultiSlider", "Reach (m)")
         client.shows("robots from")
