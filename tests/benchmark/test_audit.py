@@ -309,12 +309,6 @@ def test_a_row_has_the_size_of_its_robot_and_the_nearest_other_train_robot(rows)
             assert values[row.nearest[name].train] == pytest.approx(best, abs=1e-9)
 
 
-def test_the_nearest_of_a_test_robot_is_that_of_the_audit(rows):
-    neighbours = audit(combined(), LIBRARY).neighbours
-    nearest = {each.measure: (each.train, round(each.value, 6)) for each in neighbours}
-    assert {name: (each.train, each.value) for name, each in rows[-1].nearest.items()} == nearest
-
-
 def test_the_same_robot_at_another_task_is_no_other_train_robot():
     twin = member(TRAIN[0], "twin", task="reach")
     twin = replace(twin, derivation=twin.derivation.replace("size=0.1", "size=0.10"))

@@ -67,17 +67,6 @@ def test_a_split_keeps_the_version_that_made_it(written):
     assert (read_split(written), split_id(read_split(written))) == (SPLIT, split_id(SPLIT))
 
 
-def test_each_robot_has_one_line():
-    text = split_text(SPLIT)
-    for member in (*SPLIT.train, *SPLIT.test):
-        (line,) = [line for line in text.splitlines() if member.name in line]
-        assert member.derivation in line
-        assert member.robot_hash in line
-    fewer = replace(SPLIT, train=SPLIT.train[:1])
-    gone = set(text.splitlines()) - set(split_text(fewer).splitlines())
-    assert len(gone) == 2, "the robot's line and the id"
-
-
 def test_other_yaml_parsers_read_the_same_data():
     data = yaml.safe_load(split_text(SPLIT))
     assert data["id"] == split_id(SPLIT)
