@@ -16,7 +16,7 @@ import msgspec
 from msgspec import NODEFAULT
 
 from morphgen.errors import TaskError, nearest
-from morphgen.formats.records import Record, read_record
+from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields, require_numbers
 from morphgen.splits.split import Side
 from morphgen.tasks.actions import ActionKind
@@ -110,7 +110,8 @@ def _record_of(kind: type, given: frozenset[str]) -> type[msgspec.Struct]:
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], between: str) -> str:
     """Return which of our values others have not, as ``seed 3, not 4``; empty if they are equal."""
-    pairs = {name: (theirs.get(name), value) for name, value in ours.items()}
+    stored = dotted_values(theirs)
+    pairs = {name: (stored.get(name), value) for name, value in dotted_values(ours).items()}
     return "; ".join(
         f"{name} {_short(their)}{between}{_short(our)}"
         for name, (their, our) in pairs.items()
@@ -120,7 +121,7 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], between: str
 
 def _short(value: object) -> str:
     text = str(value)
-    return text if len(text) < 60 and "\n" not in text else f"of {len(text)} letters"
+    return text if len(text) < 200 and "\n" not in text else f"of {len(text)} letters"
 
 
 def policy_from(stored: object, where: str = "policy") -> PolicyConfig:

@@ -23,7 +23,7 @@ from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import MALFORMED, MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic, writing
-from morphgen.formats.records import Record, dotted_values, read_record
+from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
@@ -479,11 +479,11 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
 
 def require_same_config(stored: RunConfig, config: RunConfig, where: str) -> None:
     """Require that a stored run has this config."""
-    if wrong := differences(_flat(stored), _flat(config), ", not "):
+    if wrong := differences(_comparable(stored), _comparable(config), ", not "):
         raise TaskError(f"{where} has another run: {wrong}")
 
 
-def _flat(config: RunConfig) -> dict[str, Any]:
-    """Return the entries of a config by dotted name; a run may continue on another GPU."""
+def _comparable(config: RunConfig) -> dict[str, Any]:
+    """Return the entries of a config; a run may continue on another GPU."""
     device = config.device.partition(":")[0]
-    return dotted_values(config.as_data() | {"source": identity(config.source), "device": device})
+    return config.as_data() | {"source": identity(config.source), "device": device}

@@ -284,7 +284,7 @@ def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
     assert equal(weights(tmp_path / "first"), weights(tmp_path / "second"))
     assert read_checkpoint(tmp_path / "second")[1]["update"] == 1
     wider = replace(config, policy=replace(config.policy, network=mlp.Config(4, 16, 1)))
-    with pytest.raises(TaskError, match=r"network .*8.*, here .*16"):
+    with pytest.raises(TaskError, match=r"network\.mlp_width 8, here 16$"):
         train(tmp_path / "third", wider, execution=QUIET)
     assert not (tmp_path / "third").exists()
 
