@@ -348,10 +348,9 @@ def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
-    from morphgen.viewer import population
     from morphgen.viewer.app.app import serve
-    from morphgen.viewer.pages import population as page_population
-    from morphgen.viewer.pages import robot as page_robot
+    from morphgen.viewer.pages.robot import RobotPage
+    from morphgen.viewer.population import PopulationScene
 
     times: dict[str, list[float]] = {"robot": [], "population": []}
 
@@ -363,11 +362,11 @@ def _serve(told: Path) -> None:
 
         return call
 
-    update_scene = timed(page_robot.update_scene, times["robot"])
-    move = timed(population.move, times["population"])
+    update_scene = timed(RobotPage.update_scene, times["robot"])
+    move = timed(PopulationScene.move, times["population"])
     with (
-        patch.object(page_robot, "update_scene", update_scene),
-        patch.object(page_population, "move", move),
+        patch.object(RobotPage, "update_scene", update_scene),
+        patch.object(PopulationScene, "move", move),
     ):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)
