@@ -64,6 +64,8 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) ->
     if row.findings:
         tags += markup.tag(", ".join(row.findings[:2]), "error" if fault else "warning")
     facts = robot_rows.facts_line(row) or escape(row.category)
+    if row.licence:
+        facts += f"<br>{escape(row.licence)}"
     query = escape(Address("robot", (row.uri,)).query)
     return (
         f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}">'
@@ -123,7 +125,7 @@ def add_filter(gallery: Gallery) -> None:
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
     is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
     with gui.add_folder("Filter", expand_by_default=is_filtered):
-        for key in ("category", "role"):
+        for key in robot_rows.WORDS_OF_ROWS:
             choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
             _add_dropdown(gallery, key, key.capitalize(), choices)
         _add_dropdown(gallery, "findings", "Findings", (_ALL, "with", "without"))
@@ -296,7 +298,15 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
         gallery.thumbnails[uri] = thumbnail.image
     facts: dict[str, Any] = thumbnail.facts
     for rows in (gallery.rows, gallery.page_rows):
-        rows[:] = [replace(row, **facts) if row.uri == uri else row for row in rows]
+        rows[:] = [_completed(row, facts) if row.uri == uri else row for row in rows]
+
+
+def _completed(row: Row, facts: Mapping[str, Any]) -> Row:
+    """Return a row with the facts that it lacks, and with the findings of the robot itself."""
+    return replace(
+        row,
+        **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None},
+    )
 
 
 CONTROLS_WIDTH = 330.0  # width of the controls [pixels]

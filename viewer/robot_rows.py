@@ -14,6 +14,7 @@ from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import SUFFIXES, is_mjcf
 from morphgen.formats.resolve import file_stamp
+from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings
 from morphgen.grammar.robot_source import is_robot_folder
@@ -49,6 +50,7 @@ class Row:
     uri: str
     category: str = ""
     role: str = ""  # side of a split, or kind of a part
+    licence: str = ""  # licences of its parts, separated by commas
     task: str = ""
     dof: int | None = None
     links: int | None = None
@@ -59,18 +61,21 @@ class Row:
     picture_height: float | None = None  # shown at the robot's middle [m]
 
 
-FILTERS = ("search", "category", "role", "findings", *NUMBERS)
+FILTERS = ("search", "category", "role", "licence", "findings", *NUMBERS)
 """Keys of conditions on rows, as addresses have them: words that must all occur, a category, a
-role, ``with`` or ``without`` findings, and ranges ``LOW..HIGH``, which no unknown number is in."""
+role, a licence, ``with`` or ``without`` findings, and ranges ``LOW..HIGH``, which no unknown
+number is in."""
+WORDS_OF_ROWS = ("category", "role", "licence")  # facts that are texts
 ROUNDING = 1e-9  # browsers round the ends of a range
 
 
 def passes(row: Row, state: Mapping[str, str]) -> bool:
     """Return whether a row meets the conditions of an address; empty ones hold for every row."""
-    text = " ".join((row.name, row.category, row.role, row.task, *(row.findings or ()))).lower()
+    facts = (row.name, row.category, row.role, row.task, row.licence, *(row.findings or ()))
+    text = " ".join(facts).lower()
     if not all(word in text for word in state.get("search", "").lower().split()):
         return False
-    if not all(state.get(key, "") in ("", getattr(row, key)) for key in ("category", "role")):
+    if not all(state.get(key, "") in ("", *words(row, key)) for key in WORDS_OF_ROWS):
         return False
     if (findings := state.get("findings")) and bool(row.findings) != (findings == "with"):
         return False
@@ -112,7 +117,13 @@ def fact_range(rows: Iterable[Row], fact: str) -> tuple[float, float] | None:
 
 def fact_choices(rows: Iterable[Row], fact: str) -> list[str]:
     """Return the different values of a text fact, sorted, without the empty one."""
-    return sorted({getattr(row, fact) for row in rows} - {""})
+    return sorted({word for row in rows for word in words(row, fact)} - {""})
+
+
+def words(row: Row, fact: str) -> list[str]:
+    """Return the values of a text fact: one, or several licences."""
+    text: str = getattr(row, fact)
+    return text.split(", ")
 
 
 def facts_line(row: Row) -> str:
@@ -177,7 +188,7 @@ def split_rows(name: str, split: Split) -> list[Row]:
             member_uri(name, side, member),
             member.category,
             side,
-            member.task + (" with obstacles" if member.obstacles else ""),
+            task=member.task + (" with obstacles" if member.obstacles else ""),
             order=i,
         )
         for i, (side, member) in enumerate(members)
@@ -205,6 +216,7 @@ def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
 def part_rows(library: Library) -> list[Row]:
     """Return the arms, end-effectors and bodies of a library, each as a robot of its own."""
     rows: list[Row] = []
+    stored = stored_facts()
     for manifest in library.manifests():
         if manifest.kind in ("arm", "ee") and manifest.name != "none":
             uri = f"{WORDS}{manifest.kind}={manifest.name}"
@@ -213,7 +225,10 @@ def part_rows(library: Library) -> list[Row]:
         else:
             continue
         category = "template" if manifest.is_template else "real"
-        rows.append(Row(manifest.name, uri, category, manifest.kind, order=len(rows)))
+        known = known_facts(manifest, stored)
+        facts = {key: known.get(key) for key in ("dof", "reach", "mass")}
+        row = Row(manifest.name, uri, category, manifest.kind, manifest.licence, order=len(rows))
+        rows.append(replace(row, **facts))
     return rows
 
 
@@ -267,6 +282,7 @@ def _bundle_row(uri: str, folder: Path, order: int) -> Row:
             folder.name,
             uri,
             "composed" if "derivation" in card else "imported",
+            licence=", ".join(dict.fromkeys(part["licence"] for part in card.get("parts", ()))),
             findings=tuple(sorted(problems)),
             order=order,
             **{fact: card[fact] for fact in NUMBERS},

@@ -11,6 +11,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from morphgen.benchmark.licences import find_licence
+from morphgen.formats.ros_package import part_licences
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.robot import TOOL, Joint, Link, Robot
@@ -90,6 +92,16 @@ def summary(robot: Robot, reach: float | None) -> str:
     if mimics:
         facts.insert(2, f"{mimics} mimic joint{'s' if mimics > 1 else ''}")
     return " · ".join(facts)
+
+
+def licence_line(robot: Robot) -> str:
+    """Return a line with the licences of a robot's parts and their restrictions; HTML."""
+    licences = []
+    for licence in map(find_licence, part_licences(robot)):
+        licences.append(escape(licence.id))
+        if licence.restrictions:
+            licences[-1] += " " + markup.tag(", ".join(licence.restrictions), "warning")
+    return f"<br>licences of its parts: {', '.join(licences)}" if licences else ""
 
 
 def link_table(robot: Robot) -> str:

@@ -45,7 +45,10 @@ def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
         "root": root,
         "robot": escape(robot.name),
         "folders": " ".join(folders),
-        "licences": "\n".join(f"  <license>{escape(each)}</license>" for each in _licences(robot)),
+        "licences": "\n".join(
+            f"  <license>{escape(each)}</license>"
+            for each in part_licences(robot) or (_UNKNOWN_LICENCE,)
+        ),
     }
     texts = {
         f"urdf/{stem}.urdf": urdf_text(robot, lambda mesh: f"package://{package}/{files[mesh]}"),
@@ -60,8 +63,8 @@ def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
         path.write_text(text, encoding="utf-8")
 
 
-def _licences(robot: Robot) -> tuple[str, ...]:
-    """Return the licences of the robot's parts in their order; unknown for other robots."""
+def part_licences(robot: Robot) -> tuple[str, ...]:
+    """Return the licences of the robot's parts in their order; none for robots without."""
     parts = robot.provenance.get("parts")
     rows = parts if isinstance(parts, list) else []
     names = [
@@ -69,4 +72,4 @@ def _licences(robot: Robot) -> tuple[str, ...]:
         for part in rows
         if isinstance(part, Mapping) and "licence" in part
     ]
-    return tuple(dict.fromkeys(names)) or (_UNKNOWN_LICENCE,)
+    return tuple(dict.fromkeys(names))

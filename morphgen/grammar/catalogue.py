@@ -36,9 +36,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
     stored = stored_facts()
     rows: list[dict[str, object]] = []
     for manifest in library.manifests(cast(PartKind, kind)):
-        facts = stored.get(manifest.name, {})
-        if facts.get("digest") != source_digest(manifest):
-            facts = compute_facts(manifest)
+        facts = known_facts(manifest, stored) or compute_facts(manifest)
         source = manifest.source
         rows.append(
             {
@@ -57,6 +55,12 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
 def stored_facts() -> dict[str, dict[str, Any]]:
     """Return the stored facts by part, with the digest of the files that they are of."""
     return cast(dict[str, dict[str, Any]], json.loads(FACTS_FILE.read_text(encoding="utf-8")))
+
+
+def known_facts(manifest: Manifest, stored: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the stored facts of a part without loading it; empty if its files are others."""
+    facts = stored.get(manifest.name, {})
+    return facts if facts.get("digest") == source_digest(manifest) else {}
 
 
 def compute_facts(manifest: Manifest) -> dict[str, Any]:

@@ -2,7 +2,16 @@
 
 import pytest
 
-from morphgen.viewer.robot_rows import Row, facts_line, passes, select_page, sort_rows
+from morphgen.grammar.library import default_library
+from morphgen.viewer.robot_rows import (
+    Row,
+    fact_choices,
+    facts_line,
+    part_rows,
+    passes,
+    select_page,
+    sort_rows,
+)
 
 ROWS = [
     Row("b-arm", "b", "arms", "train", dof=6, reach=0.9, mass=20.0, findings=(), order=0),
@@ -66,6 +75,22 @@ def test_sorting_puts_unknown_values_last(key, order):
 )
 def test_pages(number, size, expected):
     assert select_page(range(7), number, size) == expected
+
+
+def test_parts_have_their_stored_facts_before_they_are_drawn():
+    rows = part_rows(default_library())
+    facts = [(row.dof, row.reach, row.mass, row.licence) for row in rows]
+    assert all(None not in each and each[-1] for each in facts)
+    wide = [row.name for row in sort_rows(rows, "-reach")]
+    assert wide.index("ur10") < wide.index("ur5") < wide.index("plane")
+    assert all(1 <= row.reach <= 2 for row in rows if passes(row, {"reach": "1..2"}))
+    assert passes(next(row for row in rows if row.name == "ur10"), {"reach": "1..2"})
+
+
+def test_a_robot_passes_with_each_of_its_licences():
+    row = Row("d", "d", licence="MIT, Apache-2.0")
+    assert fact_choices([row, Row("e", "e")], "licence") == ["Apache-2.0", "MIT"]
+    assert [passes(row, {"licence": each}) for each in ("MIT", "Apache-2.0", "BSD")] == [1, 1, 0]
 
 
 def test_known_facts_are_joined_in_one_line():

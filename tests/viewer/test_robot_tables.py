@@ -24,6 +24,7 @@ from morphgen.viewer.robot_tables import (
     is_about,
     joint_groups,
     joint_hint,
+    licence_line,
     link_card,
     link_table,
     slider_step,
@@ -31,6 +32,15 @@ from morphgen.viewer.robot_tables import (
 )
 from morphgen.viewer.scene.overlays import range_lines
 from morphgen.viewer.scene.stage import View, inertia_box, project_points
+
+
+def test_licences_of_parts_are_shown_with_their_restrictions():
+    assert licence_line(arm()) == ""
+    parts = [{"licence": each} for each in ("MIT", "CC-BY-NC-SA-4.0", "MIT")]
+    line = licence_line(replace(arm(), provenance={"parts": parts}))
+    assert re.sub("<[^>]*>", "", line) == (
+        "licences of its parts: MIT, CC-BY-NC-SA-4.0 non-commercial, share-alike"
+    )
 
 
 def test_joints_are_grouped_by_their_part():

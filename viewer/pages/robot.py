@@ -82,7 +82,10 @@ def summary(robot: Robot, links: str) -> str:
     """Return a robot's name and facts, followed by links as HTML."""
     distance = arm_reach(robot) if has_tool(robot) and robot.dof else None
     facts = robot_tables.summary(robot, distance)
-    return markup.framed(f"<h3>{escape(robot.name)}</h3>", markup.dim(facts + links))
+    return markup.framed(
+        f"<h3>{escape(robot.name)}</h3>",
+        markup.dim(facts + robot_tables.licence_line(robot) + links),
+    )
 
 
 def _location(session: Session, uri: str) -> str:
