@@ -294,6 +294,7 @@ def test_exports_have_the_same_spheres(ok, balls, tmp_path):
         assert b in ignored[a]
 
 
+@pytest.mark.slow
 def test_curobo_has_eight_spheres_for_a_link_by_default_and_keeps_those_of_a_link(
     ok, balls, tmp_path
 ):
@@ -305,6 +306,7 @@ def test_curobo_has_eight_spheres_for_a_link_by_default_and_keeps_those_of_a_lin
     assert spheres["left"] == [{"center": [0.0, 0.0, 0.05], "radius": 0.02}]
 
 
+@pytest.mark.slow
 def test_compose_gives_all_links_spheres(ok, tmp_path):
     ok("compose", "base=planar", "ee=cube", "--geometry", "sphere", "--no-picture", "--out", ".")
     spheres = spheres_of(read_bundle(tmp_path / "planar-cube"))
