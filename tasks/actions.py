@@ -36,6 +36,7 @@ _TOLERANCE = 1e-6
 def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
     """Return actions as fractions of the largest joint steps, in [-1, 1], of a ``shape`` (n, L).
 
+    In NumPy they are those of one environment, a number for each of its joints that obey.
     On a GPU, which is not read here, actions that are not finite or out of range become nan: their
     environments diverge.
     """
@@ -47,16 +48,16 @@ def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
     is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else xp.isfinite(actions)
     on_host = not isinstance(actions, torch.Tensor) or is_host(actions.device)
     if on_host and xp.count_nonzero(~is_valid):  # in NumPy faster than `all`
-        env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
-        where = f"environment {env}, link {link}"
+        *env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
+        where = f"environment {env[0]}, link {link}" if env else f"joint {link}"
         raise TaskError(
             f"{where}: {_INTEGERS}" if is_index else f"the action of {where} is not finite"
         )
+    bins = _bins(actions)
     if is_index:
-        numbers = _bins(actions)[xp.where(is_valid, actions, 0)]
+        numbers = bins[xp.where(is_valid, actions, 0)]
     else:
-        bounds = _bins(actions)[:1], _bins(actions)[-1:]
-        numbers = clamped(xp.asarray(actions, dtype=xp.float32), *bounds)
+        numbers = clamped(xp.asarray(actions, dtype=xp.float32), bins[:1], bins[-1:])
     decoded: A = numbers if on_host else xp.where(is_valid, numbers, xp.nan)
     return decoded
 

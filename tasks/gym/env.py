@@ -26,7 +26,7 @@ from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.tasks.actions import BINS, ActionKind, JointMotion, decode_actions
+from morphgen.tasks.actions import ActionKind, JointMotion, decode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
@@ -74,8 +74,9 @@ class NumpyStepper:
         self._tokens: LinkTokens[Array] = numpy_row(batch.observation.tokens)
         self._link_joints: LinkJoints[Array] = numpy_row(batch.observation.link_joints)
         self._tool_position = FramePosition(robot)
-        self._padded, self._kind = ActionPadding(batch), batch.action_kind
-        self._links, self._rows = batch.action_mask[0].numpy(), slice(len(robot.links))
+        self._kind, self._rows = batch.action_kind, slice(len(robot.links))
+        self._links = np.flatnonzero(batch.action_mask[0].numpy())
+        self._normalized = np.zeros(batch.action_mask.shape[1], np.float32)
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
         self._view_state()
@@ -99,8 +100,8 @@ class NumpyStepper:
 
     def step(self, action: Array) -> EnvStep:
         """Act for one control step."""
-        actions = self._padded(action)
-        self._motion.act(decode_actions(actions, self._kind, actions.shape)[0])
+        self._normalized[self._links] = decode_actions(action, self._kind, action.shape)
+        self._motion.act(self._normalized)
         diverged = self._simulate()
         steps = self._episode_step.item() + 1
         self._episode_step[0] = steps
@@ -158,21 +159,6 @@ def steps_in_numpy(batch: TaskBatch) -> bool:
     kind = type(envs)
     by_formulas = kind.evaluate is TaskEnvs.evaluate and kind.observe is TaskEnvs.observe
     return by_formulas and not envs.needs_tool_rotation and batch.device.type == "cpu"
-
-
-class ActionPadding:
-    """Pads an action for the task's joints to all links, whose others stay where they are."""
-
-    def __init__(self, batch: TaskBatch) -> None:
-        stay = BINS.index(0) if batch.action_kind == "discrete" else 0
-        self._stay = np.full(batch.action_mask.shape, stay)
-        self._links = np.flatnonzero(batch.action_mask[0].numpy())
-
-    def __call__(self, action: Array) -> Array:
-        """Return actions, shape (1, L)."""
-        actions = self._stay.astype(action.dtype)
-        actions[0, self._links] = action
-        return actions
 
 
 def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
@@ -435,7 +421,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     def _torch_step(self, action: NDArray[Any]) -> EnvStep:
         """Step the batch, which begins the next episode where one ends."""
         before = render_state(self.batch) if self.render_mode is not None else None
-        step = self.batch.step(torch.from_numpy(ActionPadding(self.batch)(action)))
+        actions = torch.zeros(self.batch.action_mask.shape, dtype=torch.from_numpy(action).dtype)
+        actions[0, list(self.action_links)] = torch.from_numpy(action)
+        step = self.batch.step(actions)
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
             self._final_physics = step.q, step.block_pose

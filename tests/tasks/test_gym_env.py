@@ -164,7 +164,7 @@ def rows(env, steps=2 * STEPS):
     return np.concatenate(numbers)
 
 
-@pytest.mark.parametrize(("how", "steps"), zip(COPIES, (3, 0, STEPS), strict=True))
+@pytest.mark.parametrize(("how", "steps"), [*zip(COPIES, (3, 0, STEPS), strict=True)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_copy_goes_on_as_the_original(kind, how, steps):
     env = KINDS[kind]()
