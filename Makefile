@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # A process a core, and in each one thread: torch's own would only get in each other's way.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
+# Tests start hundreds of processes, which read the bytecode of the first instead of compiling again.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n auto
 
 .PHONY: demo test test-all check docs dist view format clean
 

@@ -41,7 +41,7 @@ class Runner:
         """
         if self.process is None:
             self.process = subprocess.Popen(
-                [sys.executable, __file__],
+                [sys.executable, "-P", __file__],  # -P: modules beside it are not packages
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 cwd=self.folder,
