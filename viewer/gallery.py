@@ -14,6 +14,7 @@ import viser
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
+from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
@@ -68,7 +69,8 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) ->
         facts += f"<br>{escape(row.licence)}"
     query = escape(Address("robot", (row.uri,)).query)
     return (
-        f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}">'
+        f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}" '
+        f'aria-keyshortcuts="Space">'
         f'{image}<div class="text"><div class="name">{escape(row.name)}</div>'
         f"{markup.dim(facts)}{tags}</div></a>{'' if fault else markup.choose_box(row.uri)}</div>"
     )
@@ -106,7 +108,11 @@ def draw_cards(gallery: Gallery) -> None:
         f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
         for notice in gallery.notices
     ]
-    gallery.grid.content = markup.framed(*notices, summary, content)
+    html = markup.framed(*notices, summary, content)
+    if gallery.session.width > NARROW:
+        gallery.grid.content = html
+    else:
+        gallery.session.run_script(call("cards", html))
 
 
 _ALL = "all"
@@ -311,6 +317,8 @@ def _completed(row: Row, facts: Mapping[str, Any]) -> Row:
 
 CONTROLS_WIDTH = 330.0  # width of the controls [pixels]
 CANVAS_WIDTH = 120.0  # width that viser keeps free for its scene between the panels [pixels]
+MIN_WIDTH = 240.0  # width of the panel of cards at least [pixels]
+NARROW = 576  # width of a window below which viser has one panel, at the bottom [pixels]
 _PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
     "first": lambda number: 1,
     "prev": lambda number: number - 1,
@@ -330,7 +338,8 @@ def open_panels(
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
     panel.dock_left()
-    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, 400.0))
+    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, MIN_WIDTH))
+    panel.visible = gallery.session.width > NARROW
     return panel
 
 

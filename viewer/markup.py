@@ -34,7 +34,9 @@ def button_link(address: Address, text: str) -> str:
 
 def choose_box(uri: str, label: str = "") -> str:
     """Return a check box that puts a robot into the tray, with a label behind it."""
-    box = f'<input type="checkbox" data-choose="{escape(uri)}">'
+    stop = "" if label else ' tabindex="-1"'  # the card around it is a stop of the Tab key
+    name = f'aria-label="choose {escape(uri)}"'
+    box = f'<input type="checkbox" data-choose="{escape(uri)}" {name}{stop}>'
     return f'<label class="choose" title="choose">{box} {escape(label)}</label>'
 
 

@@ -68,9 +68,9 @@ class Script:
         (source,) = client.until(lambda: [s for s in client.sources if "?.connect(" in s][-1:])
         self.token = json.JSONDecoder().raw_decode(source.split("(", 1)[1])[0]
 
-    def send(self, action, value, visit=0, token=None, *, dark=False):
+    def send(self, action, value, visit=0, token=None, *, dark=False, width=1400):
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        state = f"visit={visit}&dark={'yes' if dark else ''}"
+        state = f"visit={visit}&dark={'yes' if dark else ''}&width={width}"
         path = f"/morphgen/{token or self.token}?{action}={quote(value)}&{state}"
         connection.request("GET", path)
         return connection.getresponse().status
@@ -116,6 +116,14 @@ def test_a_script_chooses_robots(viewer):
         client.shows("choose fewer")
         script.send("explode", "")
         client.shows("no action of the tray")
+
+
+def test_a_narrow_window_has_its_cards_above_the_panel(shared_viewer):
+    with PlainClient(shared_viewer.port, "?split=") as client:
+        script = Script(client, shared_viewer.port)
+        assert script.send("open", "?gallery=robots/prims", visit=1, width=420) == 200
+        (html, *_) = client.until(lambda: [s for s in client.sources if "?.cards(" in s])
+        assert html.count('class=\\"card\\"') == 24
 
 
 def test_only_the_script_of_a_page_can_change_it(viewer):

@@ -54,6 +54,23 @@ def test_thumbnails_are_rendered_by_workers_and_broken_robots_show_an_error(see)
 
 
 @pytest.mark.slow
+def test_controls_have_names_and_the_space_bar_ticks_a_card(see):
+    page = see("?gallery=robots/prims")
+    card = page.locator("a.card").nth(1)
+    card.wait_for()
+    page.get_by_role("textbox", name="Search", exact=True).wait_for()
+    page.get_by_role("heading", level=1, name="robots/prims").wait_for(state="attached")
+    card.focus()
+    page.keyboard.press("Space")
+    box = page.get_by_role("checkbox", name="choose robots/prims/prims-000001")
+    page.wait_for_url(re.compile("chosen=robots/prims/prims-000001"))
+    assert box.is_checked()
+    page.keyboard.press("Tab")  # to the next card, not to the box
+    assert page.evaluate("document.activeElement.className") == "card"
+    assert page.failures == []
+
+
+@pytest.mark.slow
 def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, viewer):
     on = viewer()
     page = see("?gallery=robots/prims", on=on)

@@ -23,7 +23,7 @@ from morphgen.viewer.scene import stage as scene_stage
 PANEL_WIDTH = 520.0  # width of the panel [pixels]
 EMPTY = (
     "<h2>Compare two to four robots</h2>Pick them here, or tick the box of cards in a gallery and "
-    "press <i>compare</i> in the tray."
+    "press <i>compare</i> below."
 )
 ONE_ROBOT = "Add a second robot to see how similar they are."
 GAP = 0.35  # distance between the bounding boxes of two robots [m]

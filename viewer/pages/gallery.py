@@ -170,7 +170,7 @@ def section_links(files: FileAccess, page: str = "library") -> str:
         (
             *("Splits", [*own, *split_names()]),
             *(("split", "population"), ("library", *_TITLES)),
-            "none yet: choose robots in a gallery, then split in the tray",
+            "none yet: choose robots in a gallery, then press split",
         ),
         (
             *("Grammars", grammar_names()),

@@ -109,7 +109,9 @@ class PopulationPage:
         self._add_sliders()
         self._selection = gui.add_html("")
         select = gui.add_button_group("Select", ("all", "none", "invert"))
-        choose = gui.add_button("Choose", icon=viser.Icon.CHECKBOX, hint="add them to the tray")
+        choose = gui.add_button(
+            "Choose", icon=viser.Icon.CHECKBOX, hint="add them to the chosen robots"
+        )
         session.on_change(self._arrange, self._show_arrangement, "arrange")
         session.on_change(home, lambda: self._sliders.set({}))
         session.on_change(select, lambda: self._change_selection(select.value))

@@ -69,6 +69,7 @@ def show(session: Session) -> None:
         )
     texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):
+        panel.visible = True  # on a narrow window, too
         texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
     with tabs.add_tab("Similarity", viser.Icon.GRID_DOTS):
         measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
