@@ -1,6 +1,8 @@
 """The gallery pages: cards, the filter and its values in the address, histograms, new splits."""
 
+import os
 import re
+import signal
 
 import pytest
 
@@ -73,9 +75,14 @@ def test_controls_have_names_and_the_space_bar_ticks_a_card(see):
 @pytest.mark.slow
 def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, viewer):
     on = viewer()
-    page = see("?gallery=robots/prims", on=on)
-    page.locator(".card img").first.wait_for()
-    for process in list(on.workers._pool._processes.values()):
+    page = see("?gallery=robots/prims&search=00000", on=on)
+    page.wait_for_function("document.querySelectorAll('.card img').length == 10")
+    processes = list(on.workers._pool._processes.values())
+    for process in processes:  # stopped, so that they cannot draw all before they are killed
+        os.kill(process.pid, signal.SIGSTOP)
+    page.goto(f"http://127.0.0.1:{on.port}/?gallery=robots/prims")
+    page.locator(".card .empty").first.wait_for()
+    for process in processes:
         process.kill()
     page.get_by_text("A worker died").wait_for()
     page.wait_for_function("document.querySelectorAll('.card img').length == 24")
