@@ -24,7 +24,7 @@ from morphgen.viewer.robot_files import (
     measure_picture,
     thumbnail_of_picture,
 )
-from morphgen.viewer.robot_rows import FILTERS, UNITS, Row, passes
+from morphgen.viewer.robot_rows import FILTERS, UNITS, WORDS_OF_ROWS, Row, passes
 
 SCALES = ("common", "own")  # of pictures: one for all, or each robot fills its own
 
@@ -131,9 +131,10 @@ def add_filter(gallery: Gallery) -> None:
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
     is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
     with gui.add_folder("Filter", expand_by_default=is_filtered):
-        for key in robot_rows.WORDS_OF_ROWS:
+        for key in WORDS_OF_ROWS:
             choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
-            _add_dropdown(gallery, key, key.capitalize(), choices)
+            label = _role_name(gallery) if key == "role" else key
+            _add_dropdown(gallery, key, label.capitalize(), choices)
         _add_dropdown(gallery, "findings", "Findings", (_ALL, "with", "without"))
         for fact in robot_rows.NUMBERS:
             _add_range(gallery, fact)
@@ -213,10 +214,23 @@ def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str])
     if value and value not in keys:
         valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
         gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
-    labels = [f"{k[1:]}, largest first" if key == "sort" and k[0] == "-" else k for k in keys]
+    labels = [_sort_label(gallery, k) for k in keys] if key == "sort" else keys
     if len(keys) > 1:
         gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
         bind(session, key, gallery.controls[key], tuple(keys))
+
+
+def _role_name(gallery: Gallery) -> str:
+    """Return what the roles of rows are: kinds of parts, or sides of a split."""
+    return "kind of part" if gallery.noun == "part" else "side"
+
+
+def _sort_label(gallery: Gallery, key: str) -> str:
+    """Return the text of an order, such as ``reach, largest first``."""
+    name = key.removeprefix("-")
+    last = {"order": "last first"} | dict.fromkeys(("name", *WORDS_OF_ROWS), "Z to A")
+    text = _role_name(gallery) if name == "role" else name
+    return f"{text}, {last.get(name, 'largest first')}" if key != name else text
 
 
 def _add_range(gallery: Gallery, fact: str) -> None:

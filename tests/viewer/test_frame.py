@@ -144,6 +144,12 @@ def test_pages_without_a_subject_list_what_there_is(shared_viewer, page):
         client.shows(f"{page}=extrapolation/arms/reach" if page != "gallery" else "robots/prims")
 
 
+def test_playback_without_a_task_offers_tasks(shared_viewer):
+    with PlainClient(shared_viewer.port, f"?play=&chosen={B}") as client:
+        client.shows("Play which task?")
+        client.shows(f'href="?play=push&amp;robot={B}"')
+
+
 def test_compare_without_robots_offers_a_picker(shared_viewer):
     on = shared_viewer
     with PlainClient(on.port, "?compare=") as client:

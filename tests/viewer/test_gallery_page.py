@@ -25,6 +25,13 @@ def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):
 def test_the_library_counts_parts(shared_viewer):
     with PlainClient(shared_viewer.port, "?library=") as client:
         client.shows(" parts · page 1 of")
+        client.control("Dropdown", "Kind of part")
+        (orders,) = [
+            message["props"]["options"]
+            for message in client.messages
+            if message["type"] == "GuiDropdownMessage" and message["props"]["label"] == "Sort by"
+        ]
+        assert {"name, Z to A", "reach, largest first", "kind of part, Z to A"} <= {*orders}
 
 
 def card_names(client):

@@ -68,6 +68,7 @@ def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
         length = shown["length (m)"]
         assert (length["min"], length["max"]) == (0.1, 0.5)
         assert shown["wrist"]["step"] == 1.0
+        assert [mark["label"] for mark in shown["mount yaw (rad)"]["_marks"]] == ["-6.28", "6.28"]
         client.shows('"?compose=base=pedestal%20arm=arm3%20arm.length=0.4"')
         client.change(client.control("Slider", "length (m)"), 0.3)
         client.shows('"?compose=base=pedestal%20arm=arm3"')  # the default

@@ -62,7 +62,7 @@ def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
 
 def test_episode_is_saved_opened_and_exported_as_video(see, viewer, folder, picture, tmp_path):
     on = viewer()
-    page = see(f"?play=reach&robot={CUBE}&robot=words:base=gantry ee=cube&seed=1", on=on)
+    page = see(f"?play=reach&robot={CUBE}&robot=words:base=gantry ee=cube&policy=ik&seed=1", on=on)
     wait_for_end(page)
     saved = download(page, "Save episode")
     assert saved.suggested_filename == "reach-planar-cube-1.npz"
@@ -96,7 +96,7 @@ def test_robot_that_cannot_do_the_task_shows_the_reason(see, viewer):
     page = see(f"?play=push&robot={CUBE}")
     page.get_by_text(re.compile("robot 'planar-cube' can hardly push")).wait_for()
     choose(page, "task", "reach")
-    page.wait_for_url(re.compile(r"play=reach.*policy=ik"))
+    page.wait_for_url(re.compile(r"play=reach.*policy=zero-shot&"))
     wait_for_end(page)
     assert page.get_by_text("can hardly push").count() == 0
 

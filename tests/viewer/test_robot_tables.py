@@ -205,6 +205,7 @@ def test_a_finding_is_about_the_links_and_joints_that_it_names():
 def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):
     on = viewer()
     with PlainClient(on.port, ARM) as client:
+        client.shows("no Compose: it is not made of parts")
         client.shows("no self-collision")
         frame = client.until(
             lambda: next((m for m in client.messages if m.get("name") == "/robot/1"), None)

@@ -12,6 +12,7 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
+from morphgen.rl.baselines import baselines_for
 from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.rl.runs.training import train
 from morphgen.viewer.app.address import Address, parse_address
@@ -217,6 +218,19 @@ def test_rollout_is_restored_from_its_url():
         rollout_address(RolloutConfig("push", (), "zero")), [("it", "robots/one")]
     )
     assert default.robots == ("robots/one",)
+
+
+@pytest.mark.parametrize(
+    ("query", "policy"),
+    [
+        ("?play=reach", "zero-shot"),
+        ("?play=reach&obstacles=yes", "zero-shot-obstacles"),
+        ("?play=push", "zero-shot-push"),
+        ("?play=push&obstacles=yes", baselines_for("push")[0]),
+    ],
+)
+def test_a_rollout_opens_with_the_shipped_policy_of_its_task(query, policy):
+    assert parse_rollout(parse_address(query), []).policy == policy
 
 
 @pytest.mark.parametrize(

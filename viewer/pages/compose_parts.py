@@ -311,6 +311,7 @@ def _add_slider(
         high,
         1.0 if parameter.integer else slider_step(low, high),
         min(max(value, low), high),
+        marks=tuple((end, f"{end:.3g}") for end in (low, high)),
         hint=parameter.summary or name,
     )
     session.on_change(slider, lambda: change(slider.value), key)

@@ -13,9 +13,9 @@ import numpy as np
 import viser
 from viser import uplot
 
-from morphgen.errors import MorphgenError, nearest
+from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.rl.baselines import baselines_for
-from morphgen.rl.shipped_policies import is_named, policies_for
+from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_policy
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup
@@ -51,6 +51,9 @@ ACTIONS = ("replace", "add", "only")  # replace the first robot, add one, or rem
 def show(session: Session) -> None:
     """Build the page."""
     subject = session.address.subject
+    if not subject and "policy" not in session.address.state:
+        show_tasks(session)
+        return
     start = parse_time(session.address.state.get("t", ""))
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
@@ -67,6 +70,17 @@ def show(session: Session) -> None:
         page.add_rollout_controls(config, trained_on)
         page.start(config, start)
     page.add_downloads()
+
+
+def show_tasks(session: Session) -> None:
+    """Build the page that asks for the task of a rollout, of the chosen robots if there are any."""
+    session.open_panel(PANEL_WIDTH, markup.breadcrumbs(("play", None)), left=True)
+    robots = (session.address.robots or session.chosen)[:MAX_PLAYED]
+    tasks = [markup.button_link(Address("play", (task,), robots=robots), task) for task in TASKS]
+    hint = markup.dim("robots, policy and simulator can be chosen then")
+    html = f"<h2>Play which task?</h2><p>{' '.join(tasks)}</p>{hint}"
+    session.client.gui.add_html(markup.framed(html))
+    session.show_address("play")
 
 
 class PlayPage:
@@ -146,7 +160,7 @@ class PlayPage:
             task, dropdown = handles["task"].value, handles["policy"]
             policy = dropdown.value
             if is_named(policy) and policy not in policies_for(task):
-                policy = baselines_for(task)[0]
+                policy = default_policy(task, obstacles=handles["obstacles"].value)
             dropdown.options = _policies(session.files, task, policy)
             dropdown.value = policy
             restart()
@@ -299,11 +313,19 @@ def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
     return RolloutConfig(
         task,
         (address.robots or (robot,))[:MAX_PLAYED],
-        state.get("policy") or baselines_for(task)[0],
+        state.get("policy") or default_policy(task, obstacles=bool(state.get("obstacles"))),
         seed,
         bool(state.get("obstacles")),
         simulator,
     )
+
+
+def default_policy(task: str, *, obstacles: bool) -> str:
+    """Return the shipped policy that does a task with any robot, or else the first baseline."""
+    try:
+        return zero_shot_policy(task, "position", obstacles=obstacles).name
+    except TaskError:
+        return baselines_for(task)[0]
 
 
 def rollout_address(config: RolloutConfig) -> Address:

@@ -32,7 +32,7 @@ from morphgen.model.kinematics import (
     random_configurations,
     solve_pose_ik,
 )
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables
@@ -115,7 +115,12 @@ def _links(robot: Robot, uri: str) -> str:
     if has_tool(robot) and robot.dof:
         play = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
         links.append(f"see it {' · '.join(play)}")
-    return f"<br>{' · '.join(links)}"
+    reasons = [] if robot.provenance.get("derivation") else ["Compose: it is not made of parts"]
+    if not has_tool(robot):
+        reasons.append(f"{' and '.join(TASKS)}: no link has the name {TOOL}")
+    elif not robot.dof:
+        reasons.append(f"{' and '.join(TASKS)}: no joint moves")
+    return f"<br>{' · '.join(links)}" + "".join(f"<br>no {escape(each)}" for each in reasons)
 
 
 class RobotPage:
