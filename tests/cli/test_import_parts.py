@@ -142,6 +142,7 @@ def test_a_module_of_robot_descriptions_names_its_file(refused, tmp_path, monkey
     )
     (folder / "lost_description.py").write_text("raise OSError('no network')\n")
     monkeypatch.syspath_prepend(str(tmp_path / "packages"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # nothing else may be written
     for module in [name for name in sys.modules if name.startswith("robot_descriptions")]:
         monkeypatch.delitem(sys.modules, module)
     found = find_description("robot_descriptions:toy_description")
