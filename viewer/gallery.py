@@ -108,11 +108,11 @@ def draw_cards(gallery: Gallery) -> None:
         f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
         for notice in gallery.notices
     ]
-    html = markup.framed(*notices, summary, content)
+    shown = markup.framed(*notices, summary, content)
     if gallery.session.width > NARROW:
-        gallery.grid.content = html
+        gallery.grid.content = shown
     else:
-        gallery.session.run_script(call("cards", html))
+        gallery.session.run_script(call("cards", shown))
 
 
 _ALL = "all"

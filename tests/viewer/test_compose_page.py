@@ -97,6 +97,7 @@ def test_the_grammar_is_redrawn_while_typing_and_marks_errors_in_place(see, pict
     whole = text.input_value()
     text.fill(whole.replace("uniform(0.1, 0.5)", "uniform(0.4, 0.5)"))
     page.get_by_text(re.compile(r"changed: ")).wait_for()
+    assert text.evaluate("each => each.scrollWidth <= each.clientWidth")  # long rules wrap
     wrong = whole.replace("->", "-> nosuchpart |", 1)
     text.fill(wrong)
     mark = page.locator("#morphgen-mark")
@@ -135,5 +136,5 @@ def test_robots_are_mutated_and_adopted(see, viewer, picture):
     page.reload()
     adopt.nth(8).wait_for(state="attached")
     assert "/offspring8" in nodes(on)
-    page.get_by_role("heading", name=adopted).wait_for()
+    page.get_by_role("heading", level=3, name=adopted).wait_for()
     assert page.failures == []

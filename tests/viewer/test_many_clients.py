@@ -58,7 +58,7 @@ def test_thirty_clients_see_their_own_pages_and_leave_nothing(see, viewer, capfd
     def look():
         pages = [see(robot_query(i), on=on) for i in range(27, 30)]
         for i, page in zip(range(27, 30), pages, strict=True):
-            page.get_by_role("heading", name=robot_name(i)).wait_for()
+            page.get_by_role("heading", level=3, name=robot_name(i)).wait_for()
             page.get_by_text(re.compile("no self-collision")).wait_for()
         assert len(on.sessions) == 30
         assert len({id(session.client) for session in on.sessions.values()}) == 30

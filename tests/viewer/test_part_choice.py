@@ -58,6 +58,15 @@ def sliders(client, last):
     return {props["label"]: props for props in messages}
 
 
+def test_a_typed_number_draws_that_robot_and_a_grammar_is_saved(shared_viewer):
+    with PlainClient(shared_viewer.port, "?compose=planar_arm") as client:
+        client.change(client.control("Number", "robot number"), 2)
+        client.shows("planar_arm-000002")
+        client.until(lambda: client.addresses[-1][1] == "?compose=planar_arm&seed=0&number=2")
+        client.change(client.control("Button", "Save the grammar"))
+        client.shows("planar_arm.grammar")
+
+
 def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
     with PlainClient(
         shared_viewer.port, "?compose=arm=arm3 base=pedestal arm.length=0.4"

@@ -254,6 +254,7 @@ class GrammarTab:
         with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
             self._start = gui.add_dropdown("start from", _starts(source), initial_value=source)
             self._text = gui.add_text("grammar", text, multiline=True)
+            save = gui.add_button("Save the grammar", icon=viser.Icon.DOWNLOAD)
             self._fault = gui.add_html("")
             self._too_long = gui.add_html("")
             self._seed = gui.add_number("seed", seed, min=0, step=1)
@@ -265,6 +266,9 @@ class GrammarTab:
         session.on_change(self._start, lambda: self.load(self._start.value))
         session.on_change(self._text, lambda: self.show(self.mode), "grammar")
         session.on_change(buttons, lambda: self._draw(buttons.value))
+        session.on_change(save, self._send)
+        for number in (self._seed, self._number):
+            session.on_change(number, lambda: self.show("drawn"), "number")
         session.on_change(self._num_parts, self._show_parts, "parts")
 
     @property
@@ -341,6 +345,10 @@ class GrammarTab:
         is_here = place is not None and place["origin"] == self._name
         line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
         self._session.run_script(call("mark", line, column))
+
+    def _send(self) -> None:
+        """Let the browser save the text as a file."""
+        self._session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
 
     def _draw(self, action: str) -> None:
         """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""

@@ -125,6 +125,8 @@ class PlayPage:
         session = self.session
         session.address = rollout_address(config)
         session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+        if self._scene is not None:  # not the pose of another seed until the new start is there
+            self._scene.root.visible = False
         self.player.load(lambda: Rollout(config, session.files, session.set_status), start=start)
 
     def add_rollout_controls(self, config: RolloutConfig, trained_on: Robots) -> None:
