@@ -226,7 +226,7 @@ def part_rows(library: Library) -> list[Row]:
             continue
         category = "template" if manifest.is_template else "real"
         known = known_facts(manifest, stored)
-        facts = {key: known.get(key) for key in ("dof", "reach", "mass")}
+        facts: dict[str, Any] = {key: known.get(key) for key in ("dof", "reach", "mass")}
         row = Row(manifest.name, uri, category, manifest.kind, manifest.licence, order=len(rows))
         rows.append(replace(row, **facts))
     return rows

@@ -267,8 +267,8 @@ class GrammarTab:
         session.on_change(self._text, lambda: self.show(self.mode), "grammar")
         session.on_change(buttons, lambda: self._draw(buttons.value))
         session.on_change(save, self._send)
-        for number in (self._seed, self._number):
-            session.on_change(number, lambda: self.show("drawn"), "number")
+        for field in (self._seed, self._number):
+            session.on_change(field, lambda: self.show("drawn"), "number")
         session.on_change(self._num_parts, self._show_parts, "parts")
 
     @property
