@@ -12,7 +12,7 @@ from helpers.scenes import robot
 from helpers.stub_simulation import StubSimulation
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines import BASELINES, ik
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.inference import STEPS_UNREAD, run_episodes
@@ -370,13 +370,12 @@ def _distance(points, box):
 def test_baselines_plan_around_the_current_obstacles(build_layouts, monkeypatch):
     batch = build_layouts("reach", "reach", layouts="eval")
     controller, scenes = InverseKinematics(0), []
-    new_planner = InverseKinematics._new_planner
 
-    def recorded(self, task, robot_index, scene):
+    def recorded(scene):
         scenes.append(scene.obstacles)
-        return new_planner(self, task, robot_index, scene)
+        return FreeSpace(scene)
 
-    monkeypatch.setattr(InverseKinematics, "_new_planner", recorded)
+    monkeypatch.setattr(ik, "FreeSpace", recorded)
     for _ in range(6):
         batch.reset()
         controller.act(batch)

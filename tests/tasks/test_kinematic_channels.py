@@ -84,13 +84,13 @@ def test_the_dls_step_of_small_errors_reaches_the_goal(specs):
     batch = batch_from_specs(specs, 2, sim="kinematic", observe=observation_config(["dls"]))
     batch.reset()
     q = batch.q
-    batch.groups["reach"].goal[:, :3] = batch._observation.tool_positions(q) + torch.tensor(
+    batch.groups["reach"].goal[:, :3] = batch.observation.tool_positions(q) + torch.tensor(
         [0.003, 0, 0.002]
     )
     dls = torch.atanh(batch.observe()["dls"][..., 1])  # the gain 1, in largest steps
     step = batch.robot_tables.max_step[batch.env_robot_index]
     joints = torch.gather(dls, 1, batch.robot_tables.link_of_joint[batch.env_robot_index]) * step
-    error = batch.groups["reach"].goal[:, :3] - batch._observation.tool_positions(q + joints)
+    error = batch.groups["reach"].goal[:, :3] - batch.observation.tool_positions(q + joints)
     assert (torch.linalg.vector_norm(error, dim=1) < 0.001).all()
 
 
@@ -185,7 +185,7 @@ def test_push_observes_the_block_from_the_nearest_point_of_the_robot(tmp_path):
     offset = observation["jacobian"][..., 7 + 13 * P : 10 + 13 * P]
     moving = observation["jacobian"][..., 6] > 0
     distance = torch.linalg.vector_norm(offset[moving] / POSITION_SCALE, dim=-1)
-    tool = batch._observation.tool_positions(batch.q)
+    tool = batch.observation.tool_positions(batch.q)
     to_block = torch.linalg.vector_norm(tool - batch.simulation.block_pose[:, :3], dim=1)
     assert (distance <= to_block.max() + 1e-4).all()
     assert (distance > 0).all()
