@@ -15,7 +15,15 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import ToolTargets
 from morphgen.tasks.random_numbers import EpisodeRandom
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.task import STANDARD_FIELDS, EnvSpec, StepResult, Task, TaskEnvs, TaskState
+from morphgen.tasks.task import (
+    STANDARD_FIELDS,
+    EnvSpec,
+    StepFormulas,
+    StepResult,
+    Task,
+    TaskEnvs,
+    TaskState,
+)
 from morphgen.typing import Array
 
 
@@ -31,6 +39,20 @@ def _require_start(task: str, start: object, k: int, num_joints: int) -> None:
         raise _wrong_type(task, "begin", start, expected)
     _require_shape(task, "begin: the joint positions", start[0], (k, num_joints))
     _require_shape(task, "begin: the poses of the block", start[1], (k, 7))
+
+
+def _require_methods(task: str, envs: TaskEnvs) -> None:
+    """Require ``evaluate`` and ``observe``, or the formulas that ``TaskEnvs`` calls for them."""
+    kind = type(envs)
+    lacking = [
+        name for name in ("evaluate", "observe") if getattr(kind, name) is getattr(TaskEnvs, name)
+    ]
+    if lacking and not isinstance(getattr(envs, "formulas", None), StepFormulas):
+        raise TaskError(
+            f"task {task!r}: {kind.__name__} has no {' and no '.join(lacking)}; expected "
+            f"{'this method' if len(lacking) == 1 else 'these methods'}, or `formulas`: "
+            "StepFormulas, which have both"
+        )
 
 
 def _require_result(task: str, result: object, k: int) -> None:
@@ -117,6 +139,7 @@ class TaskGroups:
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
             if not isinstance(envs, TaskEnvs):
                 raise _wrong_type(name, "make_envs", envs, "TaskEnvs")
+            _require_methods(name, envs)
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps

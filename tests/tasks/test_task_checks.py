@@ -13,7 +13,7 @@ from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.task import GOAL, ObservationField, Task
+from morphgen.tasks.task import GOAL, ObservationField, Task, TaskEnvs
 
 EXTRA = ObservationField("extra", 1, GOAL.mask)
 
@@ -36,7 +36,7 @@ def make(monkeypatch, tmp_path):
     """Return a function that makes two environments of a task with changed parts, and steps."""
     monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
 
-    def step(fields=(GOAL, EXTRA), make_envs=HoverEnvs, sample=Reach.sample, **methods):
+    def step(fields=(GOAL, EXTRA), made=None, make_envs=True, sample=Reach.sample, **methods):
         envs = type("Envs", (HoverEnvs,), methods)
         kind = type(
             "Hover",
@@ -46,7 +46,7 @@ def make(monkeypatch, tmp_path):
                 "config_type": HoverConfig,
                 "fields": fields,
                 "sample": sample,
-                "make_envs": lambda self, *args: envs(*args) if make_envs else None,
+                "make_envs": lambda self, *args: made or (envs(*args) if make_envs else None),
             },
         )
         TASKS.register(kind())
@@ -134,6 +134,21 @@ def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
     with pytest.raises(TaskError, match=f"task {message}"):
         TASKS.register(type("Hover", (Task,), parts)())
     assert parts["name"] not in TASKS
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({}, "Bare has no evaluate and no observe; expected these methods, or `formulas`"),
+        ({"evaluate": print}, "Bare has no observe; expected this method, or"),
+        ({"observe": print}, "Bare has no evaluate; expected this method, or"),
+        ({"formulas": None}, "Bare has no evaluate and no observe"),
+    ],
+)
+def test_environments_without_formulas_need_methods(make, parts, message):
+    bare = type("Bare", (TaskEnvs,), {"begin": HoverEnvs.begin, **parts})
+    with pytest.raises(TaskError, match=f"task 'hover': {message}"):
+        make(made=bare())
 
 
 def test_a_run_of_an_unknown_task_is_named():
