@@ -10,6 +10,7 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.tasks.rows import (
+    all_true,
     at,
     clamped,
     flat_index,
@@ -47,7 +48,7 @@ def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
         raise TaskError(_INTEGERS)
     is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else xp.isfinite(actions)
     on_host = not isinstance(actions, torch.Tensor) or is_host(actions.device)
-    if on_host and xp.count_nonzero(~is_valid):  # in NumPy faster than `all`
+    if on_host and not all_true(is_valid):
         *env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
         where = f"environment {env[0]}, link {link}" if env else f"joint {link}"
         raise TaskError(
@@ -57,7 +58,9 @@ def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
     if is_index:
         numbers = bins[xp.where(is_valid, actions, 0)]
     else:
-        numbers = clamped(xp.asarray(actions, dtype=xp.float32), bins[:1], bins[-1:])
+        # Bounds without axes: for NumPy, arrays with one number and plain numbers take longer.
+        lowest, highest = bins[0, ...], bins[-1, ...]
+        numbers = clamped(xp.asarray(actions, dtype=xp.float32), lowest, highest)
     decoded: A = numbers if on_host else xp.where(is_valid, numbers, xp.nan)
     return decoded
 

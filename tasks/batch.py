@@ -31,7 +31,7 @@ from morphgen.tasks.task_groups import TaskGroups
 _FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class Step(StepResult[torch.Tensor]):
     """Result of a control step for n environments; where an episode ended, the next has begun.
 

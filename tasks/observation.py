@@ -9,6 +9,7 @@ from typing import Any, Generic
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from morphgen.encoding.tokens import FREQUENCIES, POSITION
 from morphgen.errors import TaskError, nearest
@@ -17,7 +18,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import KinematicChannels
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
-from morphgen.tasks.rows import at, duplicate, flat_index, namespace_of
+from morphgen.tasks.rows import at, duplicate, flat_index, namespace_of, numpy_row
 from morphgen.tasks.scenes.obstacles import LayoutSide, layouts_of, place_boxes
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Block, Scene
@@ -116,11 +117,11 @@ class LinkTokens(Generic[A]):
         gains, is_movable = tables.position_gain[rows, links], tables.movable_links[rows, links]
         joint = gains.abs().argmax(dim=2)  # each link follows one independent joint
         self._constant: Any = tables.tokens[env_robot_index]
-        self._joint: Any = flat_index(joint, tables.max_joints)
-        self._gain: Any = torch.gather(gains, 2, joint[..., None])[..., 0]
-        self._offset: Any = tables.position_offset[rows, links]
-        self._wraps: Any = tables.wraps[rows, links]
-        self._frequencies: Any = torch.from_numpy(FREQUENCIES[None]).float().to(rows.device)
+        self._joint: Any = flat_index(joint, tables.max_joints)[..., None]
+        self._gain: Any = torch.gather(gains, 2, joint[..., None])
+        self._offset: Any = tables.position_offset[rows, links][..., None]
+        self._wraps: Any = tables.wraps[rows, links][..., None]
+        self._frequencies: Any = torch.from_numpy(FREQUENCIES[None, None]).float().to(rows.device)
         self._is_movable: Any = is_movable[..., None]
         self._some_wrap, self._all_movable = bool(self._wraps.any()), bool(is_movable.all())
         first = flat_index(links, tables.max_links)[..., None] * self._constant.shape[2]
@@ -128,13 +129,24 @@ class LinkTokens(Generic[A]):
         self._sines: Any = first + half
         self._cosines: Any = self._sines + len(FREQUENCIES)
 
+    def numpy_row(self) -> LinkTokens[NDArray[Any]]:
+        """Return the tokens of the first environment in NumPy; see ``rows.numpy_row``.
+
+        Its tables have a number for each code: a product with broadcasting takes NumPy ten times as
+        long.
+        """
+        row: LinkTokens[NDArray[Any]] = numpy_row(self)
+        for name in ("_joint", "_gain", "_offset", "_wraps", "_frequencies", "_is_movable"):
+            setattr(row, name, np.broadcast_to(vars(row)[name], row._sines.shape).copy())
+        return row
+
     def __call__(self, q: A) -> A:
         """Return the tokens (n, L, 48) at independent joint positions (n, J)."""
         xp = namespace_of(q)
         x = at(q, self._joint) * self._gain + self._offset
         if self._some_wrap:
             x = xp.where(self._wraps, x - 2 * xp.ceil((x - 1) / 2), x)
-        angles = x[..., None] * self._frequencies
+        angles = x * self._frequencies
         sines, cosines = xp.sin(angles), xp.cos(angles)
         if not self._all_movable:
             sines, cosines = sines * self._is_movable, cosines * self._is_movable

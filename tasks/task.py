@@ -34,7 +34,7 @@ A = TypeVar("A", "torch.Tensor", NDArray[Any])
 """Tensors of a batch with an axis of rows, or NumPy values of one environment without it."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # every step makes one: a frozen one takes four times as long
 class TaskState(Generic[A]):
     """State after a step for its evaluation: rows of k environments; positions in root frames."""
 
@@ -52,7 +52,7 @@ class TaskState(Generic[A]):
     """Rotation matrix of the tool, shape (k, 3, 3); None if no task ``needs_tool_rotation``."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # as TaskState
 class StepResult(Generic[A]):
     """Result of a step: rows of k environments."""
 

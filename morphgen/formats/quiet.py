@@ -46,20 +46,22 @@ def log_mujoco_warnings() -> None:
 class MujocoWarnings:
     """Collects MuJoCo's warnings, of all threads, instead of writing them to ``MUJOCO_LOG.TXT``.
 
-    A class, because simulations enter it in every step: a generator takes twice as long.
+    A class, because simulations enter the same one in every step: a generator takes twice as long.
     """
+
+    def __init__(self) -> None:
+        """Find MuJoCo's functions."""
+        import mujoco
+
+        self._get, self._set = mujoco.get_mju_user_warning, mujoco.set_mju_user_warning
 
     def __enter__(self) -> list[str]:
         """Begin; return the list that receives the warnings."""
-        import mujoco
-
         warnings: list[str] = []
-        self._previous = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(warnings.append)
+        self._previous = self._get()
+        self._set(warnings.append)
         return warnings
 
     def __exit__(self, *error: object) -> None:
         """Restore what was done with warnings before."""
-        import mujoco
-
-        mujoco.set_mju_user_warning(self._previous)
+        self._set(self._previous)

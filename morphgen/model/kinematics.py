@@ -308,7 +308,8 @@ class FramePosition:
         row = {k: i for i, k in enumerate(robot.movable_joints)}
         target = robot.frame(frame)
         T_joint_next = target.T_link_frame
-        self._joints: list[tuple[tuple[float, ...], int | None, float, float, bool]] = []
+        motions: list[tuple[int | None, float, float, bool]] = []
+        transforms: list[tuple[float, ...]] = []
         for k in reversed(robot.joint_chain(target.link)):
             joint = robot.joints[k]
             if joint.is_movable:
@@ -316,12 +317,14 @@ class FramePosition:
                 leader = int(np.abs(gain).argmax()) if gain.any() else None
                 factor = 0.0 if leader is None else float(gain[leader])
                 T_joint_axis = Pose(quaternion=rotation.from_z(joint.unit_axis))
-                rows = _rows(T_joint_axis.inverse() @ T_joint_next)
+                transforms.append(_rows(T_joint_axis.inverse() @ T_joint_next))
                 slides = joint.kind == "prismatic"
-                self._joints.append((rows, leader, factor, float(offsets[row[k]]), slides))
+                motions.append((leader, factor, float(offsets[row[k]]), slides))
                 T_joint_next = T_joint_axis
             T_joint_next = joint.T_parent_joint @ T_joint_next
-        self._root = _rows(T_joint_next)
+        transforms.append(_rows(T_joint_next))
+        self._point = transforms[0][3::4]  # in the axes of the last joint, or of the root
+        self._joints = list(zip(motions, transforms[1:], strict=True))
 
     def __call__(self, q: Sequence[Any] | Array) -> tuple[Any, Any, Any]:
         """Return x, y and z in the root frame [m] at independent joint positions.
@@ -329,32 +332,27 @@ class FramePosition:
         q: A number for each independent joint, or an array (dof, n), which gives arrays (n,).
         """
         cos, sin = (np.cos, np.sin) if isinstance(q, np.ndarray) else (math.cos, math.sin)
-        x: Any = 0.0
-        y: Any = 0.0
-        z: Any = 0.0
-        for rows, leader, gain, offset, slides in self._joints:
-            x, y, z = _transform(rows, x, y, z)
+        x: Any
+        x, y, z = self._point
+        for (leader, gain, offset, slides), T in self._joints:
             position = offset if leader is None else gain * q[leader] + offset
             if slides:
                 z = z + position
             else:
                 c, s = cos(position), sin(position)
                 x, y = c * x - s * y, s * x + c * y
-        return _transform(self._root, x, y, z)
+            xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz = T
+            x, y, z = (
+                xx * x + xy * y + xz * z + tx,
+                yx * x + yy * y + yz * z + ty,
+                zx * x + zy * y + zz * z + tz,
+            )
+        return x, y, z
 
 
 def _rows(T: Pose) -> tuple[float, ...]:
     """Return the first three rows of a homogeneous matrix, 12 numbers."""
     return tuple(T.matrix[:3].ravel().tolist())
-
-
-def _transform(rows: tuple[float, ...], x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
-    xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz = rows
-    return (
-        xx * x + xy * y + xz * z + tx,
-        yx * x + yy * y + yz * z + ty,
-        zx * x + zy * y + zz * z + tz,
-    )
 
 
 def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:

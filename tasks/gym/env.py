@@ -7,7 +7,6 @@ precision: all of its formulas are those of the batch, for arrays of NumPy.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from functools import partial
 from inspect import currentframe
@@ -50,6 +49,7 @@ from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.sim.motor_law import TensorView
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -71,7 +71,7 @@ class NumpyStepper:
         robot = batch.specs[0].robot
         self._formulas: StepFormulas[Array] = numpy_row(_envs(batch).formulas)
         self._motion: JointMotion[Array] = numpy_row(batch.motion)
-        self._tokens: LinkTokens[Array] = numpy_row(batch.observation.tokens)
+        self._tokens: LinkTokens[Array] = batch.observation.tokens.numpy_row()
         self._link_joints: LinkJoints[Array] = numpy_row(batch.observation.link_joints)
         self._tool_position = FramePosition(robot)
         self._kind, self._rows = batch.action_kind, slice(len(robot.links))
@@ -79,6 +79,7 @@ class NumpyStepper:
         self._normalized = np.zeros(batch.action_mask.shape[1], np.float32)
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
+        self._diverged = TensorView()
         self._view_state()
         self._constant: NumpyObservation = {}
         self._requested: Callable[[], NumpyObservation] = dict
@@ -129,12 +130,12 @@ class NumpyStepper:
         q, block_pose = self._q.copy(), self._block_pose.copy()
         simulation = self._batch.simulation
         mask = simulation.step(self._batch.targets)
-        diverged = bool(mask.item())
+        diverged = bool(self._diverged(mask)[0])
         if diverged:
             simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(block_pose[None]))
             self._motion.previous_qd[:] = 0
-        current = simulation.q, simulation.qd, simulation.block_pose
-        if not all(map(operator.is_, current, self._tensors)):
+        seen, simulated = self._tensors, (simulation.q, simulation.qd, simulation.block_pose)
+        if not (seen[0] is simulated[0] and seen[1] is simulated[1] and seen[2] is simulated[2]):
             self._view_state()  # a simulator may replace its tensors
         return diverged
 

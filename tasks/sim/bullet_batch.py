@@ -27,7 +27,7 @@ from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.processes import sigint_blocked
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import GAIN, clamp, farthest_targets, is_within
+from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets, is_within
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 from morphgen.typing import Array
 
@@ -69,6 +69,9 @@ _LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
 SLACK = 0.2
 """Additional motor force, as a fraction of the spring's plus the damper's force: the inertia
 differs away from home, and rotation about several axes takes some force."""
+_SLACK, _SPRING, _DAMPER = map(constant, (SLACK, BANDWIDTH**2, 2 * BANDWIDTH))
+_RESPONSE, _BANDWIDTH, _TWO = map(constant, (TIMESTEP * BANDWIDTH, BANDWIDTH, 2))
+_TIMESTEP, _SUBSTEPS, _PERIOD = map(constant, (TIMESTEP, SUBSTEPS, SUBSTEPS * TIMESTEP))
 
 
 def consecutive(indices: NDArray[np.intp]) -> NDArray[np.intp] | slice:
@@ -132,10 +135,10 @@ class MotorForces:
         Errors [rad or m] and velocities are those at the beginning, and at the end without
         contacts, shape (m,) each.
         """
-        springs = [BANDWIDTH**2 * clamp(e, self._farthest) for e in errors]
-        dampers = [2 * BANDWIDTH * v for v in velocities]
+        springs = [_SPRING * clamp(e, self._farthest) for e in errors]
+        dampers = [_DAMPER * v for v in velocities]
         begin, end = (np.abs(k - d) for k, d in zip(springs, dampers, strict=True))
-        accelerations = np.maximum(begin, end) + SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
+        accelerations = np.maximum(begin, end) + _SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
         forces = self._pull * accelerations[self._row]
         if self._has_mimic_joints:
             fastest = np.maximum(np.abs(velocities[0]), np.abs(velocities[1]))
@@ -460,9 +463,11 @@ class Share:
     num_envs: int  # number of environments of all processes
 
 
-_FINAL_RESPONSE = 1 - (1 - VELOCITY_GAIN) ** SUBSTEPS
+_FINAL_RESPONSE = constant(1 - (1 - VELOCITY_GAIN) ** SUBSTEPS)
 """Fraction of a velocity change that motors have made at the end of a control step."""
-_MEAN_RESPONSE = 1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1)) / SUBSTEPS
+_MEAN_RESPONSE = constant(
+    1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1)) / SUBSTEPS
+)
 """Mean of that fraction over the physics steps of a control step."""
 
 
@@ -577,14 +582,14 @@ class BulletBatch:
             raise SimulationError(f"{reason}; expected a reset before the next step")
         desired = self._targets[self._source] * self._gain + self._offset
         ends, last = self._undisturbed(desired)
-        mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
+        mean = (ends - self._positions) / _PERIOD
         commanded = self._measured + (mean - self._measured) / _MEAN_RESPONSE
         commanded = clamp(commanded, self._fastest)
         velocities: list[float] = commanded.tolist()
         limits = self._forces.limits(
             (desired - self._positions, desired - ends), (self._velocities, last)
         )
-        forces: list[float] = (limits / SUBSTEPS).tolist()
+        forces: list[float] = (limits / _SUBSTEPS).tolist()
         states: list[tuple[float, float]] = []
         self._num_steps += 1
         for loaded, span in zip(self._loaded, self._spans, strict=True):
@@ -624,9 +629,9 @@ class BulletBatch:
         q, v = self._positions, self._velocities
         fastest, slowest = self._fastest, -self._fastest
         for _ in range(SUBSTEPS):
-            v = v + TIMESTEP * BANDWIDTH * (BANDWIDTH * (desired - q) - 2 * v)
+            v = v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v)
             v = np.minimum(np.maximum(v, slowest), fastest)
-            q = q + TIMESTEP * v
+            q = q + _TIMESTEP * v
         return q[self._leaders] * self._gain + self._offset, v[self._leaders] * self._gain
 
     def _find_diverged(self) -> None:

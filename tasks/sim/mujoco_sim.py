@@ -31,6 +31,7 @@ from morphgen.tasks.sim.motor_law import (
     TensorView,
     all_finite,
     clamp,
+    constant,
     farthest_targets,
     is_within,
     mask_of,
@@ -71,42 +72,42 @@ class MujocoState:
         n, joints = len(worlds), max(world.robot.dof for world in worlds)
         blocks = [i for i, world in enumerate(worlds) if world.block is not None]
         poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
-        self._positions = GatheredArrays([*(env_data.qpos for env_data in data), *poses])
-        self._velocities = GatheredArrays([env_data.qvel for env_data in data])
-        self._warnings = GatheredArrays([env_data.warning.number for env_data in data])
-        self._q_at = np.full((n, joints), -1)
-        self._qd_at = np.full((n, joints), -1)
+        positions = [*(env_data.qpos for env_data in data), *poses]
+        velocities = [*(env_data.qvel for env_data in data), np.zeros(1)]
+        warnings = [env_data.warning.number for env_data in data]
+        self._numbers = GatheredArrays([*positions, *velocities, *warnings])  # one call reads all
+        begin, first = self._numbers.begin, len(positions)
+        self._begin = (begin[first : first + n + 1] - begin[first]).tolist()
+        self.velocities = self._numbers.flat[begin[first] : begin[first + n + 1]]
+        """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
+        self._warnings = self._numbers.flat[begin[first + n + 1] : -1].reshape(n, -1)
+        self._joints_at = np.full((2, n, joints), -1)
         self._pose_at = np.full((n, 7), -1)
         self._velocity_at = np.full((n, 6), -1)
         for i, world in enumerate(worlds):
             dof = world.robot.dof
-            self._q_at[i, :dof] = self._positions.begin[i] + world.q_at
-            self._qd_at[i, :dof] = self._velocities.begin[i] + world.qd_at
+            self._joints_at[0, i, :dof] = begin[i] + world.q_at
+            self._joints_at[1, i, :dof] = begin[first + i] + world.qd_at
             if world.block_moves:
-                self._velocity_at[i] = self._velocities.begin[i] + world.block_qd_at + np.arange(6)
+                self._velocity_at[i] = begin[first + i] + world.block_qd_at + np.arange(6)
         for k, i in enumerate(blocks):
-            self._pose_at[i, :3] = self._positions.begin[n + 2 * k] + np.arange(3)
-            self._pose_at[i, 3:] = self._positions.begin[n + 2 * k + 1] + np.arange(4)
+            self._pose_at[i, :3] = begin[n + 2 * k] + np.arange(3)
+            self._pose_at[i, 3:] = begin[n + 2 * k + 1] + np.arange(4)
         self._has_blocks = bool(blocks)
-        self._q, self._qd = np.zeros((2, n, joints), np.float32)
+        self._joints = np.zeros((2, n, joints), np.float32)
         self._block_pose = np.zeros((n, 7), np.float32)
         self._exact_pose = np.zeros((n, 7))
-        self.joints = np.zeros((n, joints)), np.zeros((n, joints))
-        """Joint positions and velocities at the last ``read``, shape (n, J) each."""
-        self.q, self.qd = torch.from_numpy(self._q), torch.from_numpy(self._qd)
+        self.joints = np.zeros((2, n, joints))
+        """Joint positions and velocities at the last ``read``, shape (2, n, J)."""
+        self.q, self.qd = map(torch.from_numpy, self._joints)
         self.block_pose = torch.from_numpy(self._block_pose)
-
-    @property
-    def velocities(self) -> Array:
-        """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
-        return self._velocities.flat
 
     @property
     def block_velocity(self) -> torch.Tensor:
         """Linear and angular velocities of the blocks in the world at the last ``read``, (n, 6)."""
         if not self._has_blocks:
             return torch.zeros(len(self._velocity_at), 6)
-        velocity = self._velocities.flat[self._velocity_at]
+        velocity = self._numbers.flat[self._velocity_at]
         quaternion, angular = self._exact_pose[:, 3:], velocity[:, 3:]
         # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
         # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
@@ -117,25 +118,22 @@ class MujocoState:
 
     def read(self) -> None:
         """Update the tensors from the data."""
-        self._positions.read()
-        self._velocities.read()
-        self.joints = self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
-        self._q[:], self._qd[:] = self.joints
+        self._numbers.read()
+        self.joints = self._numbers.flat[self._joints_at]
+        self._joints[:] = self.joints
         if self._has_blocks:
-            self._exact_pose = self._positions.flat[self._pose_at]
+            self._exact_pose = self._numbers.flat[self._pose_at]
             quaternion = self._exact_pose[:, 3:]
             quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
             self._block_pose[:] = self._exact_pose
 
     def faults(self) -> dict[int, str]:
-        """Return the environments that diverged, each with the reason: contacts or velocities."""
-        self._warnings.read()
-        if is_within(self._velocities.flat, MAX_SPEED) and is_within(self._warnings.flat, 0):
+        """Return the environments that diverged up to the last ``read``, each with the reason."""
+        warnings = self._warnings
+        if is_within(self.velocities, MAX_SPEED) and is_within(warnings, 0):
             return {}
-        warnings = self._warnings.flat[:-1].reshape(len(self._q), -1)
-        speeds = np.abs(self._velocities.flat)
-        begin = self._velocities.begin
-        slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
+        speeds = np.abs(self.velocities)
+        slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(self._begin)]
         full = np.asarray(warnings[:, _FULL].any(axis=1))
         diverged = ~np.array(slow) | warnings.any(axis=1)
         return {
@@ -144,9 +142,12 @@ class MujocoState:
         }
 
 
-BY_ERROR = CONTROL_STEP[1, 0] / CONTROL_PERIOD
-BY_VELOCITY = (CONTROL_STEP[1, 1] - 1) / CONTROL_PERIOD
+BY_ERROR = constant(CONTROL_STEP[1, 0] / CONTROL_PERIOD)
+BY_VELOCITY = constant((CONTROL_STEP[1, 1] - 1) / CONTROL_PERIOD)
 """Mean acceleration in a control step per unit of initial error and initial velocity."""
+_STIFFNESS = constant(GAIN * BANDWIDTH**2)
+_PASSIVE_DELAY = constant(PASSIVE * 2 / BANDWIDTH)
+"""Acceleration per error, and passive damping per acceleration of an error, of a joint alone."""
 
 
 class PositionControl:
@@ -220,7 +221,7 @@ class PositionControl:
             self._leaders, self._gains * force[self._slots], minlength=mean_acceleration.size
         )
         np.multiply(leader_forces.reshape(self._shape), self._compliance, out=out)
-        out += q + error - PASSIVE * 2 / BANDWIDTH * qd - mean_acceleration / (GAIN * BANDWIDTH**2)
+        out += q + error - _PASSIVE_DELAY * qd - mean_acceleration / _STIFFNESS
         np.multiply(self._damping.flat, velocities, out=self._applied)
 
 
@@ -229,7 +230,7 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_view", "_pool"}
+_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_view", "_warnings", "_pool"}
 """Attributes that ``_view_data`` makes."""
 
 
@@ -289,7 +290,7 @@ class MujocoSimulation:
             self._work.append(
                 (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
             )
-        self._view = TensorView()
+        self._view, self._warnings = TensorView(), MujocoWarnings()
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -341,10 +342,9 @@ class MujocoSimulation:
         if not all_finite(self._targets):
             require_finite(self.scenes, "targets", self._targets)
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
-        with np.errstate(invalid="ignore", over="ignore"), MujocoWarnings():
-            self._control.controls(
-                self._targets, *self._state.joints, self._state.velocities, out=self._controls
-            )
+        with np.errstate(invalid="ignore", over="ignore"), self._warnings:
+            q, qd = self._state.joints
+            self._control.controls(self._targets, q, qd, self._state.velocities, out=self._controls)
             refused = self._advance()
             self._state.read()
         faults = self._state.faults() | refused
