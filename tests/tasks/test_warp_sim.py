@@ -175,7 +175,8 @@ def test_a_solver_that_stops_at_its_last_iteration_has_not_diverged(aside):
     scenes = [push_scene()]
     sim = simulation(scenes)
     (group,) = sim._groups
-    group.model.opt.iterations, group.model.opt.tolerance = 1, wp.zeros(1, dtype=float)
+    group.model.opt.iterations = 1
+    group.model.opt.tolerance = wp.zeros(1, dtype=float, device="cpu")  # by default on a GPU
     q, poses = homes(sim)
     poses[0, 0] += aside
     sim.reset(torch.tensor([True]), q, poses)
