@@ -408,7 +408,10 @@ def many_links(count):
         ({"tip": f"{TIP}<visual><geometry>{FOUR}</geometry></visual>"}, None, SCALE, {"usd"}),
         ({}, ('box size="0.1 0.1 0.1"', 'sphere radius="0"'), NO_SIZE, {"mujoco (urdf)"}),
         ({}, many_links(126), "fails on robots with more than 127 links", {"pybullet"}),
-        ({}, many_links(150), "fails on robots with more than 127 links", {"pybullet"}),
+        pytest.param(  # far beyond the limit
+            *({}, many_links(150), "fails on robots with more than 127 links", {"pybullet"}),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_what_a_loader_refuses_is_named(changes, edit, words, loaders, tmp_path):

@@ -235,8 +235,14 @@ def robot_faults(drawn: Sample, category):
     return faults
 
 
-@pytest.mark.parametrize("n", [1, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("category", CATEGORIES)
+@pytest.mark.parametrize(
+    ("category", "n"),
+    [  # the Panda has many meshes to load
+        pytest.param(name, n, marks=[pytest.mark.slow] * (n > 1 or name == "panda_variations"))
+        for name in CATEGORIES
+        for n in (1, 100)
+    ],
+)
 def test_robots_have_the_counts_of_the_benchmark_and_loaders_agree(category, n, tmp_path):
     grammar = shipped(category)
     for index in range(n):

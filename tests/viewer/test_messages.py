@@ -49,6 +49,7 @@ def test_malformed_message_closes_only_its_connection(shared_viewer, capfd, mess
 
 def test_a_text_message_closes_its_connection(shared_viewer):
     with PlainClient(shared_viewer.port) as client:
+        client.shows("Grammars")  # a closed connection has no page to open
         client.websocket.send("text")
         assert client.until_closed() == (1008, "expected a binary message")
 
