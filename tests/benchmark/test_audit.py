@@ -222,7 +222,7 @@ def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
     seen = []
     with show_progress(lambda *now: seen.append(now)):
         one = audit(example_split, LIBRARY)
-    assert seen == [(i, 25) for i in range(1, 26)]  # 13 robots and 12 rows of comparisons
+    assert seen == [(i, 26) for i in range(1, 27)]  # 13 robots, and their rows of the matrix
     assert audit(example_split, LIBRARY, jobs=2) == one
 
 
