@@ -17,14 +17,14 @@ def demo(args: argparse.Namespace) -> int:
     """Run the commands until one fails; return its exit code."""
     from morphgen.formats.bundle import PICTURE  # which a broken installation may lack
 
-    bundle = args.out / "ur5-plane"
+    bundle, parser = args.out / "ur5-plane", build_parser()
     for words in (
         ["compose", "arm=ur5", "ee=plane", "--out", str(args.out)],
         ["check", str(bundle), "--strict"],
         ["conform", str(bundle)],
     ):
         print(f"$ morphgen {shlex.join(words)}", flush=True)
-        parsed = parse(build_parser(), words)
+        parsed = parse(parser, words)
         if code := int(parsed.run(parsed) or 0):
             return code
     print(f"The robot is in {bundle}; its picture is {bundle / PICTURE}")

@@ -26,6 +26,7 @@ from morphgen.grammar.robot_source import RobotSource, is_robot_file
 from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Robot
 
+DEFAULT_CONFIGURATIONS = 1000
 COLUMNS = {
     "link": "",
     "primitives": "",
@@ -121,9 +122,8 @@ def _folder(
     args: argparse.Namespace, source: RobotSource | None, robot: Robot, *, several: bool
 ) -> Path:
     """Return the folder of the bundle."""
-    folder = bundle_folder(
-        *((args.out, robot.name) if several else (args.out.parent, args.out.name))
-    )
+    parent, name = (args.out, robot.name) if several else (args.out.parent, args.out.name)
+    folder = bundle_folder(parent, name)
     if source is not None and source.path is not None:
         path = source.path.resolve()
         # A robot may be named by its bundle, or by a file in it.
@@ -146,13 +146,14 @@ def _fit_robot(
         print(_report_text(report))
     if folder is None:
         return report.as_dict()
-    with status(args, f"comparing collisions in {args.configurations} configurations"):
-        of_primitives, of_hulls = fit.agreement(args.configurations, args.seed)
+    configurations = args.configurations or DEFAULT_CONFIGURATIONS
+    with status(args, f"comparing collisions in {configurations} configurations"):
+        of_primitives, of_hulls = fit.agreement(configurations, args.seed)
     fitted = replace(fit.robot, name=folder.name)  # a bundle's folder has the name of its robot
     findings = check(fitted, tool_required=source is not None)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:
-        print(_agreement_text(of_primitives, of_hulls, args.configurations))
+        print(_agreement_text(of_primitives, of_hulls, configurations))
         print(folder)
     return report.as_dict() | {
         "agreement": of_primitives.as_dict(),

@@ -29,6 +29,8 @@ from morphgen.grammar.robot_source import import_robot, read_source
 from morphgen.model.robot import Joint, Robot
 
 PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
+_PARTS = Path("parts")
+"""Folder of the manifests that ``morphgen import --part`` writes by default."""
 
 
 def compose(args: argparse.Namespace) -> int:
@@ -270,7 +272,7 @@ def _import(
         )
     part = None
     if args.part:  # refuses before the bundle is replaced
-        part = part_manifest(robot, folder / URDF, args.part, args.parts, licence)
+        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, licence)
     data, text, code = write_checked(robot, args)
     if part is None:
         return data, text, code

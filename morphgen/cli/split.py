@@ -71,7 +71,6 @@ def goals(args: argparse.Namespace) -> int:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
-
         split, _ = read_split_or_folder(args.words[0])
         results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
     else:
@@ -484,7 +483,6 @@ def new(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
     if args.subcommand is None and not args.hold_out:
         args.parser.error("the following arguments are required: --hold-out, or COMMAND")
-
     # Smaller splits are parts of the largest.
     total = args.train[-1] + args.test if args.train else None
     choice = opt.given(args, NewSplit.__annotations__)
@@ -513,11 +511,6 @@ def new(args: argparse.Namespace) -> None:
         lines.append(f"  {limits}")
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))
-
-
-def _names(text: str) -> tuple[str, ...]:
-    """Read names that are separated by commas; a type for argparse."""
-    return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 def _summary(split: Split, path: Path) -> list[str]:

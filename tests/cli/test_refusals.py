@@ -45,6 +45,7 @@ compose base=gantry ee=plane ee.sise=1 => no parameter 'sise'; did you mean 'siz
 compose base=gantry ee=plane ee.size=5m => ee.size=5: out of range; expected 0.02 to 1 m (unit
 compose base=gantry ee=plane --library nowhere => nowhere does not exist
 compose chain baeds=5 => no symbol 'baeds'; did you mean 'beads'?
+compose chain bead.radius=2m => bead.radius=2: out of range; expected 0.005 to 0.05 m
 compose chian beads=5 => 'chian' is neither a grammar nor of the form key=value; did you mean
 show nowhere.urdf => nowhere.urdf: no such file
 show folder => folder holds no robot; expected a bundle
@@ -62,8 +63,10 @@ conform folder => folder holds no robot; expected a bundle
 conform . --samples 0 => argument --samples: 0: expected a whole number, 1 to 100000
 import nowhere.xacro => nowhere.xacro: no such file
 import x.xacro --arg length => --arg length: expected NAME=VALUE
+import x.xacro --arg =1 => --arg =1: expected NAME=VALUE
 import a.xml --part arm => --part: name the robot's licence by --licence, such as MIT
 import a.xml --licence MIT => --licence: only with --part
+import a.xml --parts parts => --parts: only with --part
 import a.xml --part arm --licence MIT --name 1st => digits and underscores, no digit first; import
 import a.xml --part ee --licence MIT => no frame 'tool', which is the flange or the tool of a
 import a.xml --part arm --licence MIT --tool left --name z1 => morphgen has a part of this name;
@@ -89,14 +92,21 @@ fit text.stl => text.stl
 fit bare.urdf => robot 'r': no link has a shape
 fit plane --missing => --missing: only with --all
 fit plane --max-primitives 0 => 0 primitives: expected 1 to 32
+fit plane --max-primitives 33 => 33 primitives: expected 1 to 32
 fit plane --max-primitives 2 --iou 2 => IoU 2.0: expected more than 0, at most 1
+fit plane --max-primitives 2 --iou 0 => IoU 0.0: expected
+fit plane --max-primitives 2 --iou nan => IoU nan: expected
 fit plane --iou 0.9 => --iou: only with --max-primitives
+fit plane --configurations 1000 => --configurations: only with --out
 fit plane --iou 0.9 --spheres 4 => --iou: only without --spheres
 fit plane --spheres 4 --enclose => --enclose: only without --spheres
 fit plane --cover 0.9 => --cover: only with --spheres
 fit plane --spheres 40 => 40 spheres: expected 1 to 32 per link
 fit plane --spheres 4 --cover 1 => cover 1: expected more than 0, at most
 fit --all --max-primitives 2 --seed 3 => --max-primitives --seed: only without --all
+fit --all --out made => --out: only without --all
+fit --all --enclose --visual => --enclose --visual: only without --all
+fit --all --iou 0.5 --seed 1 => --iou --seed: only without --all
 fit --all --no-picture --configurations 5 => --no-picture --configurations: only without
 fit plane --out .. => name
 fit plane --out made/.hidden => name '.hidden': use letters
@@ -106,6 +116,8 @@ tokens --layout --out x.npz => name a robot
 tokens --layout --max-links 5 => name a robot
 tokens plane --out x.txt => --out x.txt: expected a name that ends in .npz
 tokens plane --out no/x.npz => --out no/x.npz: there is no folder no
+tokens plane --out folder.npz => --out folder.npz: it is a folder
+tokens base=gantry ee=plane --max-links 6 => has 7 links, more than max_links 6
 tokens nowhere.grammar => nowhere.grammar: no such file
 tokens chian => 'chian' is not a part; did you mean 'chain'?
 tokens ./folder.npz => folder.npz holds no robot
@@ -116,16 +128,19 @@ similarity prims prims => is one robot
 similarity prims stick --heatmap x.png --map ./x.png => x.png: is named for two files
 similarity prims stick --heatmap a.jpg => --heatmap a.jpg: expected a name that ends in .png
 similarity prims stick --map no/a.png => --map no/a.png: there is no folder no
+similarity prims stick --csv a.png => --csv a.png: expected a name that ends in .csv
 similarity a b --measure cosin => argument --measure: invalid choice: 'cosin'; did you
 sample cubse => unknown grammar 'cubse'; did you mean 'cubes'? valid: arm3, arm5
 sample chain -n 2.5 => argument -n: 2.5: expected a whole number, 1 or more
 sample cubes --seed -1 => argument --seed: -1: expected
 sample cubes --where mas<3 => --where:1:1: unknown property 'mas'; did you mean 'mass'
 sample cubes --where mass< => --where:1:6: found the end, expected '('
+grammar check cubse => unknown grammar 'cubse'
 derive nowhere => robot 'nowhere': there is no such bundle or URDF, and 'nowhere' is
 derive ./nowhere => nowhere: no such file or folder
 derive ur5-plane ur10-plane => ur5-plane and ur10-plane: expected one robot
 derive ur5-plane --replay => --replay: ur5-plane has no URDF yet; expected a robot's
+mutate nowhere/robot => nowhere/robot: no such file or folder
 mutate . => is not in a set made by morphgen sample (no
 trian => argument COMMAND: invalid choice: 'trian'; did you mean 'train'?
 split shw => argument COMMAND: invalid choice: 'shw'; did you mean 'show'?
@@ -137,7 +152,9 @@ split => the following arguments are required
 split new => are required: --hold-out, or COMMAND; see
 split new interpolation => the following arguments are required
 EXTRAPOLATION stick,nlnk --test-category chain => 'nlnk'; did you mean 'nlink'?
+EXTRAPOLATION stick, --test-category chain => unknown grammar ''
 CUBES --task pusch => unknown task 'pusch'; did you mean 'push'?
+CUBES --task push,push => expected one or more, all different
 CUBES --train 3,x => argument --train: x: expected a whole number, 1 or more
 CUBES --train '' => --train: say how many robots to train on
 CUBES --name ../x => name '../x': use letters, digits
@@ -152,16 +169,21 @@ split show x.yaml => x.yaml: no such file
 split audit folder => folder is no built split: it has no build.json
 split audit broken.yaml => broken.yaml:
 split audit some.yaml --near 1 => --near 1: expected a tree distance and a cosine, such as
+split audit some.yaml --near a,b => --near a,b: expected a tree distance and a cosine
 split audit some.yaml --near 2,0.5 => --near 2,0.5: a tree distance is from 0 to 1
 split build some.yaml --light --picture => choose one of light and picture
 split build some.yaml --out file => cannot write file/mine/some: Not a directory
 split build some.yaml --goal-seed 1 => --goal-seed: only with --goals
 split verify folder => folder is no built split: it has no build.json; morphgen split build
+split verify nowhere => nowhere: no such file, and no split of this name
+split stats nowhere => nowhere: no such file, and no split of this name
 split stats wrong.yaml => robot 'planar-cube': the library has no part 'cubw'
 split difficulty a.yaml => a.yaml: no such file
 split difficulty wrong.yaml --csv a.csv => robot 'planar-cube': the library has no part 'cubw'
 split difficulty some.yaml some.yaml => 'mine/some' is also in some.yaml
 split difficulty some.yaml --csv none/a.csv => --csv none/a.csv: there is no folder none
+split difficulty some.yaml --csv folder.csv => --csv folder.csv: it is a folder
+split difficulty some.yaml --jobs 0 => 0: expected a whole number
 split difficulty some.yaml --csv some.yaml => --csv some.yaml: expected a name that ends in .csv
 split difficulty some.yaml --study none => none: no episodes.csv.gz
 RELEASE extrapolation/arms/reach => --licence-allow CC-BY-NC-ND-4.0
@@ -186,6 +208,7 @@ train interpolation/arm3/reach --envs 9 => fewer than the 10 robots
 RUN --agent me-tff => did you mean 'me-tf'?
 RUN --agent se+magic => after se come switches
 RUN --steps 31 => an update takes 32 transitions
+RUN --device tpu => unknown device 'tpu'
 RUN --set gama=1 => did you mean 'gamma'?
 RUN --set gamma=much => expected a number
 RUN --set gamma=2 => gamma 2: expected 0 to 1
@@ -218,6 +241,7 @@ eval nothing => no checkpoint, and no folder of a run
 eval nothing --goal-seed 1 => --goal-seed: only with --split
 eval ik => name its robots with --split
 eval ik --split interpolation/arm3/reach --out folder.csv => folder.csv: it is a folder
+eval ik --out none/scores.csv => there is no folder none
 eval ik --split planar-cube task=reach --mode stochastic => --mode is for policies
 eval ik --split planar-cube task=reach --on test => is one robot and not a split: it has no
 eval random --split prims task=push --goal pose => is for task reach; the tasks of the robots: push
@@ -226,6 +250,8 @@ eval scripted --split planar-cube task=reach => no robot is there to push
 eval zero-shot --split interpolation/arm3/push => policy zero-shot was trained on reach, not on push
 eval zero --split some.yaml --method a => --method: only with --submission
 SUBMIT a.json --on train => leave --on train out
+SUBMIT none/a.json => there is no folder none
+SUBMIT folder => --submission folder: it is a folder
 SUBMIT a.json --episodes 2 => expected 34 or more
 SUBMIT a.json --seed 3 => evaluation.seed: 3; expected 0
 SUBMIT a.json --sim pybullet => expected 'mujoco'
@@ -249,6 +275,7 @@ play push => see morphgen play --help
 play push prims --policy magic => unknown policy
 play push prism => did you mean 'prims'?
 play push prims --out film.avi => the name of a video ends in .mp4 or .gif
+play push prims --out no/film.mp4 => there is no folder no
 play push prims --policy ik => valid: scripted, zero, random
 play push prims --policy zero-shot => policy 'zero-shot' is for reach, not for push
 play reach arm3-stick --policy scripted => valid: ik, jacobian, zero, random
@@ -514,6 +541,8 @@ def test_interrupted_process_leaves_no_partial_bundle_or_temporary_folder(tmp_pa
 
 UNSOUND = {
     "unknown part": "robot -> base arm\nbase -> fixed\narm -> nosuch\n",
+    "unused value": "let unused = uniform(1, 2)\nrobot -> base arm3\nbase -> fixed\n",
+    "unreachable": "robot -> base arm3\nbase -> fixed\nother -> stick\n",
     "never ending": "robot -> base loop\nbase -> fixed\nloop -> arm3 loop\n",
 }
 
