@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
@@ -116,6 +117,19 @@ def test_a_bundle_is_fitted_link_by_link(run, ok, meshed, tmp_path):
     assert {link["link"] for link in card["primitives"]["links"]} == set(rows) - {"mean"}
 
 
+@pytest.mark.slow
+def test_visual_option_replaces_visuals_and_keeps_their_colour(run, meshed, tmp_path):
+    words = ("fit", meshed, "--visual", "--out", "made", "--no-picture", "--configurations", "1")
+    assert run(*words)[0] == 0
+    assert meshes_of(tmp_path / "made", "visual") == []
+    assert not (tmp_path / "made" / "meshes").exists()
+    base = read_bundle(tmp_path / "made").link("base")
+    assert [shape.rgba for shape in base.visuals] == [(1.0, 0.0, 0.0, 1.0)]
+    assert [shape.geometry for shape in base.visuals] == [
+        shape.geometry for shape in base.collisions
+    ]
+
+
 def urdf_of(folder, *files):
     """``robot.urdf``: links with one mesh each, side by side."""
     links = "".join(
@@ -192,6 +206,16 @@ FIGURES = {
 }
 
 
+@pytest.fixture
+def angle(tmp_path):
+    """``angle.stl``, an L of two boxes that touch."""
+    tall, wide = trimesh.creation.box((0.1, 0.1, 0.4)), trimesh.creation.box((0.2, 0.1, 0.1))
+    tall.apply_translation((0.05, 0.05, 0.2))
+    wide.apply_translation((0.2, 0.05, 0.05))
+    trimesh.boolean.union([tall, wide]).export(tmp_path / "angle.stl")
+    return Path("angle.stl")
+
+
 def test_mesh_fit_prints_a_table_and_the_primitive(ok, box, tmp_path):
     before = tree(tmp_path)
     out = ok("fit", box)
@@ -206,7 +230,7 @@ def test_mesh_fit_prints_a_table_and_the_primitive(ok, box, tmp_path):
 
 
 @pytest.mark.slow
-def test_mesh_fit_as_json_is_in_metres(ok, box):
+def test_mesh_fit_as_json_is_in_metres(run, ok, box):
     out = ok("fit", box, "--json", "--seed", "3")
     data = json.loads(out)
     assert out.count("\n") == 1
@@ -217,6 +241,28 @@ def test_mesh_fit_as_json_is_in_metres(ok, box):
     assert np.linalg.norm(primitive["quaternion"]) == pytest.approx(1.0)
     assert set(data["quality"]) == FIGURES
     assert data["quality"]["iou"] > 0.97
+    again = json.loads(run("fit", box, "--json", "--seed", "3")[1])
+    assert {**again, "seconds": 0} == {**data, "seconds": 0}
+
+
+@pytest.mark.slow
+def test_more_primitives_are_fitted_until_the_iou_is_reached(ok, angle):
+    out = ok("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
+    data = json.loads(out)
+    assert [set(each) & {"box", "cylinder", "sphere"} for each in data["primitives"]] == [
+        {"box"}
+    ] * 2
+    assert data["quality"]["iou"] > 0.95
+    out = ok("fit", angle, "--max-primitives", "3", "--iou", "0.3", "--json")
+    assert len(json.loads(out)["primitives"]) == 1
+
+
+def test_enclosing_primitives_cover_the_whole_mesh(ok, angle):
+    out = ok("fit", angle, "--enclose", "--json")
+    data = json.loads(out)
+    assert data["quality"]["coverage"] == 1.0
+    assert data["quality"]["gap_p95"] < 1e-8
+    assert data["quality"]["iou"] < 0.8
 
 
 def test_mesh_fit_does_not_accept_out(refused, box):

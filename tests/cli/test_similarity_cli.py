@@ -171,6 +171,19 @@ def test_tokens_are_printed_link_by_link(ok, bundle):
     assert out.splitlines()[-1] == "arm: (6, 48), indices over 22"
 
 
+def test_robot_can_be_given_as_urdf_or_parts(run, robot_urdf):
+    code, out, _ = run("tokens", robot_urdf(arm()))
+    assert (code, len(rows_of(out))) == (0, 6)
+    assert {row[3] for row in rows_of(out)} == {""}
+    code, out, _ = run("tokens", *WORDS, "ee.size=0.2")
+    assert (code, len(rows_of(out))) == (0, 7)
+    assert rows_of(out)[-1][3:6] == ["tool", "box 0.01 x 0.2 x 0.2", "fixed"]
+    code, out, _ = run("tokens", "chain", "beads=2")
+    assert (code, len(rows_of(out))) == (0, 10)
+    drawn = [row[4].split()[0] for row in rows_of(out) if row[4]]
+    assert {*drawn} == {"cylinder", "sphere"}
+
+
 def test_options_may_stand_between_parts(run):
     assert run("tokens", WORDS[0], "--max-links", 7, WORDS[1])[0] == 0
 

@@ -5,8 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from helpers.commands import tree
+from morphgen.grammar.library import LIBRARY_VARIABLE
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split, split_names
 
@@ -185,6 +187,18 @@ def test_duplicate_train_robots_are_reported(run):
     repeated = 5 - len({member.robot_hash for member in split.train})
     assert repeated > 2
     assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
+
+
+def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch):
+    Path("lib").mkdir()
+    Path("lib/mine.grammar").write_text("robot -> gantry plane(size=uniform(0.1, 0.3))\n")
+    words = ("split", "new", "interpolation", "--grammar", "mine", "--train", 2)
+    assert run(*words, "--library", "lib", "--out", "a.yaml")[0] == 0
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(Path("lib").absolute()))
+    assert run(*words, "--out", "b.yaml")[0] == 0
+    assert Path("a.yaml").read_bytes() == Path("b.yaml").read_bytes()
+    data = yaml.safe_load(Path("a.yaml").read_text())
+    assert list(data["made"]["grammar"]) == ["mine"]
 
 
 def test_existing_split_file_is_never_replaced(run, refused):

@@ -74,6 +74,19 @@ def test_max_links_defaults_to_the_size_of_the_robot(run, ok, tmp_path):
 
 
 @pytest.mark.slow
+def test_policy_with_tool_position_is_evaluated_and_played(run):
+    words = (*RUN, "--steps", "32", "--no-tensorboard", "--out", "run")
+    assert run(*words, "--tool-position")[0] == 0
+    assert read_checkpoint(Path("run"))[1]["layout"]["tool"]
+    code, _, err = run(*words, "--resume")
+    assert (code, "tool_position" in err) == (2, True)
+    code, out, _ = run("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    assert (code, "planar-cube" in out) == (0, True)
+    code, out, _ = run("play", "reach", "planar-cube", "--policy", "run", "--sim", "mujoco")
+    assert (code, out[:11]) == (0, "episode 1: ")
+
+
+@pytest.mark.slow
 def test_the_goal_of_the_training_is_that_of_all_commands_on_its_policy(run, tmp_path):
     quick = ("--steps", "32", "--no-tensorboard")
     assert run(*RUN, *quick, "--goal", "pose")[0] == 0
@@ -149,6 +162,26 @@ def test_training_uses_the_goals_stored_with_a_split(run, split_yaml):
     code, _, err = run(*words, "--out", "b", "--train-goals", "300")
     assert (code, "--train-goals 300" in err, str(home.resolve()) in err) == (2, True, True)
     assert not Path("b").exists()
+
+
+@pytest.mark.slow
+def test_train_goals_option_does_not_change_evaluation_goals(run):
+    """Evaluation goals do not depend on the number of training goals."""
+    goal_counts = []
+    for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
+        assert run(*RUN, "--steps", "32", "--no-tensorboard", "--out", name, *more)[0] == 0
+        config = read_config(Path(name))
+        (setting,) = specs_of(config.source, GoalConfig(tasks=config.tasks))
+        goal_counts.append(len(setting.goals.q))
+        assert {task.num_goals for task in config.tasks} == {goal_counts[-1]}
+    assert goal_counts == [100, 150]
+    _, out, _ = run("eval", "b", "--episodes", "1", "--json")
+    _, chance, _ = run("eval", "a", "--episodes", "1", "--json")
+    randoms = [
+        {each["random"] for mode_scores in json.loads(one).values() for each in mode_scores}
+        for one in (out, chance)
+    ]
+    assert randoms[0] == randoms[1]
 
 
 def test_every_training_switch_has_an_option(run, tmp_path):
