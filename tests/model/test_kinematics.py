@@ -93,8 +93,9 @@ def test_one_robot_agrees_with_mujoco(index):
         for k in robot.movable_joints:
             joint = data.joint(robot.joints[k].name)
             np.testing.assert_allclose(axes[row, k + 1], joint.xaxis, atol=1e-9)
-            # MuJoCo's anchor stays behind when the joint slides.
-            apart = np.cross(anchors[row, k + 1] - joint.xanchor, joint.xaxis)
+            apart = anchors[row, k + 1] - joint.xanchor
+            if robot.joints[k].kind == "prismatic":  # MuJoCo's anchor stays behind when it slides
+                apart = np.cross(apart, joint.xaxis)
             np.testing.assert_allclose(apart, 0, atol=1e-9)
     still = [0, *(k + 1 for k, joint in enumerate(robot.joints) if not joint.is_movable)]
     assert not axes[:, still].any()
@@ -126,6 +127,13 @@ def test_a_batch_agrees_with_its_robots(dtype, atol):
     )
     for i, robot in enumerate(ROBOTS):
         rows, links = (index == i).numpy(), len(robot.links)
+        alone = (
+            batched.forward_kinematics(tree, index[rows], q[rows]),
+            *batched.frame_jacobian(chain, index[rows], q[rows]),
+        )
+        for together, result in zip((T_link, T_tool, J), alone, strict=True):
+            within = 1e-14 if dtype == torch.float64 else atol
+            np.testing.assert_allclose(together[rows], result.numpy(), atol=within)
         T = forward_kinematics(robot, drawn(i))
         expected_T, expected_J = frame_jacobian(robot, drawn(i))
         assert tree.is_link[i].tolist() == [k < links for k in range(len(tree.is_link[i]))]
