@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Generic, Literal
 
-import numpy as np
 import torch
 
 from morphgen.errors import TaskError
@@ -14,6 +13,7 @@ from morphgen.tasks.rows import (
     at,
     clamped,
     flat_index,
+    is_integral,
     limit_violation,
     namespace_of,
     row_sums,
@@ -29,45 +29,51 @@ ActionKind = Literal["continuous", "discrete"]
 BINS = (-1.0, -1 / 2, -1 / 4, -1 / 8, -1 / 16, 0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Normalized actions that the discrete ones index, exponentially spaced about zero (AnyBody)."""
 _INTEGERS = f"discrete actions are integers from 0 to {len(BINS) - 1}"
-_NUMPY_BINS = np.array(BINS, np.float32)
 _TOLERANCE = 1e-6
 """Excess of a bin over the normalized action that it encodes which float32 rounding allows."""
 
 
-def decode_actions(actions: A, kind: ActionKind, shape: tuple[int, ...]) -> A:
-    """Return actions as fractions of the largest joint steps, in [-1, 1], of a ``shape`` (n, L).
+class ActionDecoder(Generic[A]):
+    """Decodes actions to fractions of the largest joint steps, in [-1, 1].
 
-    In NumPy they are those of one environment, a number for each of its joints that obey.
     On a GPU, which is not read here, actions that are not finite or out of range become nan: their
     environments diverge.
     """
-    if actions.shape != shape:
-        raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {tuple(shape)}")
-    xp, is_index = namespace_of(actions), kind == "discrete"
-    if is_index and actions.dtype in (xp.float32, xp.float64):
-        raise TaskError(_INTEGERS)
-    is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else xp.isfinite(actions)
-    on_host = not isinstance(actions, torch.Tensor) or is_host(actions.device)
-    if on_host and not all_true(is_valid):
-        *env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
-        where = f"environment {env[0]}, link {link}" if env else f"joint {link}"
-        raise TaskError(
-            f"{where}: {_INTEGERS}" if is_index else f"the action of {where} is not finite"
-        )
-    bins = _bins(actions)
-    if is_index:
-        numbers = bins[xp.where(is_valid, actions, 0)]
-    else:
-        # Bounds without axes: for NumPy, arrays with one number and plain numbers take longer.
-        lowest, highest = bins[0, ...], bins[-1, ...]
-        numbers = clamped(xp.asarray(actions, dtype=xp.float32), lowest, highest)
-    decoded: A = numbers if on_host else xp.where(is_valid, numbers, xp.nan)
-    return decoded
 
+    def __init__(self, kind: ActionKind, device: torch.device) -> None:
+        """Put the constants on a device, so that no step copies them."""
+        self._is_index = kind == "discrete"
+        self._bins: Any = torch.tensor([BINS], device=device)
+        # In NumPy these have no axes: arrays with one number and plain numbers take longer.
+        self._lowest: Any = self._bins[:, 0]
+        self._highest: Any = self._bins[:, -1]
 
-def _bins(like: A) -> A:
-    """Return ``BINS`` as an array of the same kind, on the same device."""
-    return _bins_on(like.device) if isinstance(like, torch.Tensor) else _NUMPY_BINS
+    def __call__(self, actions: A, shape: tuple[int, ...]) -> A:
+        """Return the fractions of actions of a ``shape`` (n, L).
+
+        In NumPy they are those of one environment, a number for each of its joints that obey.
+        """
+        if actions.shape != shape:
+            raise TaskError(f"actions have shape {tuple(actions.shape)}; expected {tuple(shape)}")
+        xp, is_index = namespace_of(actions), self._is_index
+        if is_index and not is_integral(actions):
+            raise TaskError(_INTEGERS)
+        is_valid = (actions >= 0) & (actions < len(BINS)) if is_index else xp.isfinite(actions)
+        on_host = not isinstance(actions, torch.Tensor) or is_host(actions.device)
+        if on_host and not all_true(is_valid):
+            *env, link = xp.stack(xp.where(~is_valid))[:, 0].tolist()
+            where = f"environment {env[0]}, link {link}" if env else f"joint {link}"
+            raise TaskError(
+                f"{where}: {_INTEGERS}" if is_index else f"the action of {where} is not finite"
+            )
+        if is_index:  # torch takes small integers for masks, or refuses them
+            index = xp.asarray(xp.where(is_valid, actions, 0), dtype=xp.int64)
+            numbers = at(self._bins, index)
+        else:
+            numbers = xp.asarray(actions, dtype=xp.float32)
+            numbers = clamped(numbers, self._lowest, self._highest)
+        decoded: A = numbers if on_host else xp.where(is_valid, numbers, xp.nan)
+        return decoded
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,7 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.tasks.actions import ActionKind, JointMotion, decode_actions
+from morphgen.tasks.actions import ActionDecoder, ActionKind, JointMotion
 from morphgen.tasks.observation import (
     BatchObservation,
     EpisodeLayouts,
@@ -31,7 +31,7 @@ from morphgen.tasks.task_groups import TaskGroups
 _FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
-@dataclass(eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)  # not frozen, as no dataclass can be whose base is not
 class Step(StepResult[torch.Tensor]):
     """Result of a control step for n environments; where an episode ended, the next has begun.
 
@@ -84,6 +84,7 @@ class TaskBatch:
         action_mask: Links whose joint obeys actions, shape (n, L), bool.
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
         episode_step: Control steps since the episode began, shape (n,), int64.
+        decode_actions: Function that decodes actions of a shape (n, L).
         motion: Motion of the joints, of which these are tensors:
         targets: Targets of the independent joints, shape (n, J) [rad or m].
         previous_action: Normalized actions of the last step, shape (n, L); 0 in a new episode.
@@ -137,6 +138,7 @@ class TaskBatch:
             robot_tables.action_mask(fingers=False)[index],
         )
         self.max_episode_steps = self.groups.max_episode_steps
+        self.decode_actions: ActionDecoder[torch.Tensor] = ActionDecoder(kind, device)
         self.motion: JointMotion[torch.Tensor] = JointMotion(robot_tables, index)
         self.targets, self.previous_action = self.motion.targets, self.motion.previous_action
         self.previous_qd = self.motion.previous_qd
@@ -269,7 +271,7 @@ class TaskBatch:
             TaskError: If the actions are invalid.
         """
         mask = self.action_mask
-        normalized = decode_actions(actions.to(self.device), self.action_kind, mask.shape)
+        normalized = self.decode_actions(actions.to(self.device), mask.shape)
         self.motion.act(torch.where(mask, normalized, 0.0))
         targets = self.targets[:, : self._num_sim_joints].contiguous()
         return BeforePhysics(targets, self.q, self.simulation.block_pose.clone())

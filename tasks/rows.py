@@ -72,18 +72,26 @@ def choose(condition: A, value: float, otherwise: A | float = 0.0) -> A:
 
 
 def positive_part(values: A) -> A:
-    """Return values, or 0 where they are negative."""
+    """Return values (n,), or 0 where they are negative."""
     if isinstance(values, torch.Tensor):
         return torch.clamp(values, min=0)
-    positive: A = max(_number(0), values)  # a call of NumPy takes ten times as long
+    positive: A = max(values, _number(0))  # nan stays; a call of NumPy takes ten times as long
     return positive
 
 
 def clamped(values: A, lower: A, upper: A) -> A:
-    """Return values within bounds of the same shape."""
-    xp = namespace_of(values)
-    within: A = xp.minimum(xp.maximum(values, lower), upper)  # np.clip takes four times as long
+    """Return values within bounds that have their shape or broadcast to it."""
+    if isinstance(values, torch.Tensor):
+        return torch.clamp(values, lower, upper)
+    within: A = np.minimum(np.maximum(values, lower), upper)  # np.clip takes four times as long
     return within
+
+
+def is_integral(values: A) -> bool:
+    """Return whether an array has integers or flags."""
+    if isinstance(values, torch.Tensor):
+        return not (values.is_floating_point() or values.is_complex())
+    return values.dtype.kind in "iub"
 
 
 def all_true(flags: A) -> bool:

@@ -34,7 +34,7 @@ A = TypeVar("A", "torch.Tensor", NDArray[Any])
 """Tensors of a batch with an axis of rows, or NumPy values of one environment without it."""
 
 
-@dataclass(eq=False)  # every step makes one: a frozen one takes four times as long
+@dataclass(eq=False)  # not frozen: every step makes one, which would take four times as long
 class TaskState(Generic[A]):
     """State after a step for its evaluation: rows of k environments; positions in root frames."""
 
@@ -52,7 +52,7 @@ class TaskState(Generic[A]):
     """Rotation matrix of the tool, shape (k, 3, 3); None if no task ``needs_tool_rotation``."""
 
 
-@dataclass(eq=False)  # as TaskState
+@dataclass(eq=False)  # not frozen, as TaskState
 class StepResult(Generic[A]):
     """Result of a step: rows of k environments."""
 
@@ -74,7 +74,8 @@ class StepFormulas(ABC, Generic[A]):
     """The formulas of a task's step, for tensors of k environments and for NumPy arrays alike.
 
     They use operators, functions that torch and NumPy share, and those of ``morphgen.tasks.rows``.
-    Arrays that they need are attributes, which ``TaskEnvs`` updates in place.
+    Arrays that they need are attributes with a row per environment, which ``TaskEnvs`` updates in
+    place.
     """
 
     @abstractmethod
@@ -234,8 +235,8 @@ class TaskEnvs(ABC):
     needs_tool_rotation: bool = False
     """Whether ``evaluate`` needs ``TaskState.tool_rotation``."""
     formulas: StepFormulas[torch.Tensor]
-    """What ``evaluate`` and ``observe`` return, unless a task has its own of these in torch.
-    ``TaskEnv`` steps one environment in NumPy with them, several times as fast."""
+    """Formulas that ``evaluate`` and ``observe`` call. With them ``TaskEnv`` steps one environment
+    in NumPy, several times as fast; without them, a task must override both methods."""
 
     @abstractmethod
     def begin(

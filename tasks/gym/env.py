@@ -25,7 +25,7 @@ from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
 from morphgen.model.kinematics_torch import frame_pose
-from morphgen.tasks.actions import ActionKind, JointMotion, decode_actions
+from morphgen.tasks.actions import ActionDecoder, ActionKind, JointMotion
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
@@ -70,11 +70,12 @@ class NumpyStepper:
         self._batch, self._unpadded = batch, unpadded
         robot = batch.specs[0].robot
         self._formulas: StepFormulas[Array] = numpy_row(_envs(batch).formulas)
+        self._decode: ActionDecoder[Array] = numpy_row(batch.decode_actions)
         self._motion: JointMotion[Array] = numpy_row(batch.motion)
         self._tokens: LinkTokens[Array] = batch.observation.tokens.numpy_row()
         self._link_joints: LinkJoints[Array] = numpy_row(batch.observation.link_joints)
         self._tool_position = FramePosition(robot)
-        self._kind, self._rows = batch.action_kind, slice(len(robot.links))
+        self._rows = slice(len(robot.links))
         self._links = np.flatnonzero(batch.action_mask[0].numpy())
         self._normalized = np.zeros(batch.action_mask.shape[1], np.float32)
         self._episode_step = batch.episode_step.numpy()
@@ -101,7 +102,7 @@ class NumpyStepper:
 
     def step(self, action: Array) -> EnvStep:
         """Act for one control step."""
-        self._normalized[self._links] = decode_actions(action, self._kind, action.shape)
+        self._normalized[self._links] = self._decode(action, action.shape)
         self._motion.act(self._normalized)
         diverged = self._simulate()
         steps = self._episode_step.item() + 1

@@ -17,18 +17,20 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.tasks.actions import JointMotion, decode_actions
+from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import curriculum_line, evaluate_push, push_terms
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import anybody_score, evaluate_reach, is_near, reach_terms
-from morphgen.tasks.rows import limit_violation
+from morphgen.tasks.rows import limit_violation, numpy_row, positive_part
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import TaskState
+
+CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(
@@ -39,15 +41,33 @@ from morphgen.tasks.task import TaskState
         (torch.tensor([[0, 11]]), "discrete", "environment 0, link 1: .* 0 to 10"),
         (torch.tensor([[0, -1]]), "discrete", "from 0 to 10"),
         (torch.tensor([[0.0, 1.0]]), "discrete", "integers from 0"),
+        (torch.tensor([[0.0, 1.0]], dtype=torch.float16), "discrete", "integers from 0"),
     ],
 )
 def test_invalid_actions_are_rejected_and_others_clipped(actions, kind, words):
-    numbers = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2))
+    decoders = {name: ActionDecoder(name, CPU) for name in ("continuous", "discrete")}
+    numbers = decoders["continuous"](torch.tensor([[2.0, -0.5]]), (1, 2))
     assert numbers.tolist() == [[1.0, -0.5]]
-    numbers = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3))
+    numbers = decoders["discrete"](torch.tensor([[0, 5, 10]]), (1, 3))
     assert numbers.tolist() == [[-1.0, 0.0, 1.0]]
     with pytest.raises(TaskError, match=words):
-        decode_actions(actions, kind, (1, 2))
+        decoders[kind](actions, (1, 2))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int8", "int16", "int32", "int64"])
+def test_discrete_actions_are_integers_of_any_size(dtype):
+    decode = ActionDecoder("discrete", CPU)
+    actions = torch.tensor([[0, 5, 10]], dtype=getattr(torch, dtype))
+    assert decode(actions, (1, 3)).tolist() == [[-1.0, 0.0, 1.0]]
+    assert numpy_row(decode)(actions[0].numpy(), (3,)).tolist() == [-1.0, 0.0, 1.0]
+    with pytest.raises(TaskError, match="integers from 0 to 10"):
+        numpy_row(decode)(np.zeros(3, np.float16), (3,))
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 2.0, np.nan])
+def test_the_positive_part_is_the_same_in_numpy(value):
+    batch = positive_part(torch.tensor([value]))[0].item()
+    np.testing.assert_equal(float(positive_part(np.float32(value))), batch)
 
 
 def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
