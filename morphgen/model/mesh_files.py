@@ -376,10 +376,10 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
     if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
         raise ValueError(f"more than {_MAX_TOKENS} words")
     text = data.decode("utf-8", "replace").replace("\r\n", "\n").replace("\\\n", " ")
+    _require_short_lines(text)  # first: lines are split below
     faces = re.finditer(r"^[ \t]*f[ \t]([^#\n]*)", text, re.M)
     triangles = sum(max(len(face[1].split()) - 2, 0) for face in faces)
     require_faces(triangles)
-    _require_short_lines(text)
     mixes_corners = re.search(r"^f[^\n]*//", text, re.M) and re.search(r"^f[^\n]*\d/\d", text, re.M)
     if mixes_corners or _OBJ_ODD.search(text):
         text = "\n".join(_plain_obj(text))

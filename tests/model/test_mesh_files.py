@@ -435,6 +435,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "less.ply": (ply([], PLY_VERTICES.replace("4", "-4")), "counts -4 of element 'vertex'"),
     "face.obj": ("v 0 0 0\nf" + " 1" * 40_000 + "\n", "a line has more than 65536 characters"),
+    "fan.obj": ("v 0 0 0\nf" + " 1" * 1_100_000 + "\n", "a line has more than 65536 characters"),
     "faces.obj": ("v 0 0 0\n" + ("f" + " 1" * 30_000 + "\n") * 40, "1199920 triangles"),
     "index.obj": ("v 0 0 0\nf 1 2 99999999999\n", "is out of bounds"),
     "zero.obj": ("v 0 0 0\nv 0 0 1\nv 0 1 1\nf 0 1 2\n", "index '0' of a face"),
