@@ -152,7 +152,7 @@ def _drawn_splits(
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]
     train = list(parallel_map(factory, recipes, jobs))
     # Sizes between the smallest and the largest split cannot violate what both obey.
-    sides = [train[:size] for size in {request.train[0]: 0, request.train[-1]: 0}]
+    sides = [train[:size] for size in sorted({request.train[0], request.train[-1]})]
     library = factory.library
     parsed = [[RuledRobot.of(each, library) for each in side] for side in sides]
 

@@ -61,7 +61,7 @@ class _Condition:
     ``arm3.length=0.3..0.4``, bounds included. Patterns have shell wildcards.
     """
 
-    owner: str  # kind of the part, or of a range also its name, with wildcards; empty for any
+    owner: str  # kind of the part; for a range also its name, with wildcards; empty for any part
     key: str = ""  # `MANUFACTURER`, a parameter, or empty for the name of the part
     pattern: str = ""  # name of the part, or of the manufacturer in any case
     bounds: tuple[float, float] | None = None  # of a range [SI unit of the parameter]

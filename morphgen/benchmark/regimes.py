@@ -196,10 +196,8 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     - Hold-out: see ``morphgen.benchmark.hold_out``, which tests all robots of a split.
     - All regimes: a train robot has its task.
     """
-    sides = (
-        [RuledRobot.of(member, library) for member in side] for side in (split.train, split.test)
-    )
-    train, test = sides
+    train = [RuledRobot.of(member, library) for member in split.train]
+    test = [RuledRobot.of(member, library) for member in split.test]
     return tuple(
         Finding(code, "error", f"test robot {robot.name}", why, fix)
         for robot in test
@@ -212,7 +210,7 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True)
 class RuledRobot:
-    """What the rules of the regimes see of a robot."""
+    """A robot with the properties that the rules of the regimes compare."""
 
     name: str
     category: str
@@ -222,7 +220,7 @@ class RuledRobot:
 
     @classmethod
     def of(cls, robot: Member | Candidate, library: Library) -> RuledRobot:
-        """Return that of a member, or of a candidate, which has no task yet."""
+        """Return the robot of a member, or of a candidate, which has no task yet."""
         if isinstance(robot, Candidate):
             return cls(robot.name, robot.category, "", robot.derivation, library)
         derivation = parse_derivation(robot.derivation, f"derivation of {robot.name!r}")
@@ -251,11 +249,13 @@ class RuledRobot:
 
 Violation = tuple[str, str, str]
 """Code, reason and fix of what a test robot violates."""
-Provenance = Mapping[str, object]
 
 
 def regime_violations(
-    regime: Regime, provenance: Provenance, test: RuledRobot, train: Sequence[RuledRobot]
+    regime: Regime,
+    provenance: Mapping[str, object],
+    test: RuledRobot,
+    train: Sequence[RuledRobot],
 ) -> Iterator[Violation]:
     """Yield how a test robot violates the rule of a regime; see ``regime_findings``.
 

@@ -1,1 +1,1 @@
-"""What a policy sees of a robot, how robots compare, and the hash of a robot."""
+"""Encodings of a robot: tokens for policies, features for similarity measures, and its hash."""
