@@ -63,7 +63,7 @@ class SurveyedRobot:
     robot_hash: str  # hash of the robot; see `morphgen.encoding.robot_hash`
     stats: RobotStats
     features: Features = field(compare=False, repr=False)
-    """What the similarity measures compare."""
+    """Features of the robot, which the similarity measures compare."""
 
 
 Pairs = Literal["sides", "train", "all"]
@@ -370,6 +370,8 @@ def train_similarity(survey: SplitSurvey, index: int) -> Array:
     similarity = survey.similarity[: len(split.train), index]
     if index >= len(split.train):
         return similarity
+    if np.isnan(similarity[index]).all():
+        raise ValueError("the survey does not compare train robots; expected pairs='train'")
     own = split.train[index].robot_hash
     is_other = np.array([member.robot_hash != own for member in split.train])
     return np.where(is_other[:, None], similarity, np.nan)

@@ -117,23 +117,23 @@ def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
     if any(isinstance(each, Fault) or each.robot_hash != m.robot_hash for m, each in pairs):
         return  # robots differ from the split: the caller of this module lists them
     try:
-        lines = csv.DictReader(read_text(path).splitlines())
-        columns, found = tuple(lines.fieldnames or ()), list(lines)
+        header, *lines = csv.reader(read_text(path).splitlines() or [""])
     except (MorphgenError, OSError, csv.Error) as error:
         yield f"cannot be read: {error}"
         return
-    if columns[: len(STRUCTURAL)] != STRUCTURAL:
+    if tuple(header[: len(STRUCTURAL)]) != STRUCTURAL:
         yield f"it has other columns; expected {', '.join(STRUCTURAL)}"
         return
     rows = survey_difficulty(survey)
-    if len(found) != len(rows):
-        yield f"it has {len(found)} robots, not {len(rows)}"
+    if len(lines) != len(rows):
+        yield f"it has {len(lines)} robots, not {len(rows)}"
         return
     names = [member.name for member in split.train]
-    for i, (line, row) in enumerate(zip(found, rows, strict=True)):
-        if None in line or None in line.values():  # what `DictReader` has for too many or few
-            yield f"line {i + 2} has not {len(columns)} cells"
+    for i, (cells, row) in enumerate(zip(lines, rows, strict=True)):
+        if len(cells) != len(header):
+            yield f"line {i + 2} has {len(cells)} cells, not {len(header)}"
             continue
+        line = dict(zip(header, cells, strict=True))
         similarity = dict(zip(names, train_similarity(survey, i), strict=True))
         for why in _row_differences(line, row, similarity):
             yield f"line {i + 2}: {why}"

@@ -20,6 +20,7 @@ from morphgen.benchmark.survey import (
     robot_stats,
     split_difficulty,
     statistics,
+    survey_difficulty,
     survey_split,
     train_similarity,
 )
@@ -364,3 +365,5 @@ def test_robots_that_changed_or_cannot_be_composed_are_refused():
     missing = replace(other, derivation=other.derivation.replace("plane", "planf"))
     with pytest.raises(BenchmarkError, match=r"'mine/some': robot 'other': .* no part 'planf'"):
         split_difficulty(combined([*TRAIN, missing]), LIBRARY)
+    with pytest.raises(ValueError, match="expected pairs='train'"):
+        survey_difficulty(survey_split(combined(), LIBRARY))

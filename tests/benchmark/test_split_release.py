@@ -151,6 +151,7 @@ def test_releases_of_earlier_versions_have_no_difficulty_and_pass_verify(folder)
         (r"(plane,push,[^c]*cube,)[\d.]+", r"\1nan", "cosine of planar-plane is 'nan', not '0."),
         (r"(planar-plane,push,.*)planar-cube", r"\1gantry-plane", "workspace_nearest of planar-"),
         (r"(planar-plane,push,.*)planar-cube", r"\1x" + "y" * 999, "planar-plane is 'xyyy"),
+        ("planar-cube,push,false", "planar-cube,push", "line 3 has 13 cells, not 14"),
         (r"\n[^\n]*\n\Z", r"\n", "it has 3 robots, not 4"),
         ("cosine_nearest", "cosine_farthest", "it has other columns; expected split, side, robot"),
         (r"\A", "x" * 200_000, "cannot be read: field larger than field limit"),
