@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from morphgen.errors import MeshError
+from morphgen.formats.data_files import parse_yaml
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Geometry, Mesh, Shape, dimensions
 from morphgen.model.inertia import bounding_box, inertial_from_density, with_inertia
@@ -40,10 +40,9 @@ DEFAULT_DENSITY = 1000.0  # density of a link whose source gives no mass [kg/m^3
 
 @cache
 def _rows() -> Mapping[str, Mapping[str, str]]:
-    loaded: Mapping[str, Mapping[str, str]] = yaml.safe_load(
-        (Path(__file__).parent / "findings.yaml").read_text(encoding="utf-8")
-    )
-    return loaded
+    path = Path(__file__).with_name("findings.yaml")
+    rows: Mapping[str, Mapping[str, str]] = parse_yaml(path.read_text("utf-8"), str(path))
+    return rows
 
 
 def found(row: str, where: str, **values: Any) -> Finding:  # noqa: ANN401
