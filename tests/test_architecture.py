@@ -151,8 +151,9 @@ def test_top_level_import_loads_no_heavy_package(statement):
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "numpy", "scipy", "lxml", "yaml"})
 
 
-def test_reading_manifests_loads_no_simulator():
-    loaded = modules_after("import morphgen.grammar.library")
+@pytest.mark.parametrize("module", ["grammar.library", "cli.lists"])
+def test_reading_manifests_loads_no_simulator(module):
+    loaded = modules_after(f"import morphgen.{module}")
     assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
 
 

@@ -7,16 +7,18 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from morphgen.cli.progress import note, track
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
 from morphgen.grammar.library import Library, default_library
-from morphgen.grammar.robot_source import RobotSource, find_robots, read_source
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.task import TaskConfig
+
+if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
+    from morphgen.grammar.robot_source import RobotSource
 
 T = TypeVar("T")
 
@@ -72,6 +74,8 @@ def sources_of(
     args: argparse.Namespace, refuse: Callable[[str, FormatError], object] | None = None
 ) -> list[RobotSource]:
     """Return the sources of the robots that the arguments name, one or several."""
+    from morphgen.grammar.robot_source import find_robots
+
     sources = find_robots(args.words, library_of(args), refuse)
     if args.root is not None and (composed := [s for s in sources if s.path is None]):
         raise FormatError(
@@ -83,6 +87,8 @@ def sources_of(
 
 def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
     """Return the robots that the arguments name, one or several, with their sources."""
+    from morphgen.grammar.robot_source import read_source
+
     library, sources = library_of(args), sources_of(args)
     return [
         (source, read_source(source, library, args.root))

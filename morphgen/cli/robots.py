@@ -1,4 +1,4 @@
-"""``morphgen compose``, ``list`` and ``show``: make robots and print their facts."""
+"""``morphgen compose``, ``show`` and ``import``: make robots and print their facts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from tabulate import tabulate
-
 from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
@@ -21,14 +19,12 @@ from morphgen.fitting.collision_geometry import with_geometry
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import NamedDescription, find_description
-from morphgen.grammar.catalogue import catalogue
 from morphgen.grammar.compose import compose as compose_parts
 from morphgen.grammar.part import part_manifest, write_part
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import import_robot, read_source
 from morphgen.model.robot import Joint, Robot
 
-PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
 _PARTS = Path("parts")
 """Folder of the manifests that ``morphgen import --part`` writes by default."""
 
@@ -72,13 +68,6 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> Written:
     lines += [f"  {path.name}{'/' if path.is_dir() else ''}" for path in files]
     data = {"folder": str(folder), "card": read_json(folder / CARD)}
     return data, "\n".join(lines), int(any(each.severity == "error" for each in findings))
-
-
-def list_parts(args: argparse.Namespace) -> None:
-    """Print a table with a row per part."""
-    with status(args, "reading the parts"):
-        rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
 
 
 def show(args: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""``morphgen sample``, ``derive`` and ``mutate``: robots from grammars, and their derivations."""
+"""``morphgen grammar``, ``sample``, ``derive`` and ``mutate``: grammars and their robots."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-from tabulate import tabulate
 
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
@@ -28,8 +26,6 @@ from morphgen.grammar.grammar_file import (
     Grammar,
     find_grammar,
     grammar_from_text,
-    grammar_names,
-    grammar_summary,
     grammar_text,
     load_grammar,
 )
@@ -50,12 +46,6 @@ from morphgen.grammar.robot_source import find_robots
 from morphgen.grammar.sampling import mutate as mutations
 from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT, MAX_DERIVATION_TEXT, MAX_TEXT
 from morphgen.grammar.values import parse_conditions
-
-
-def list_grammars(args: argparse.Namespace) -> None:
-    """Print the names and summaries."""
-    rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
 
 
 def _grammar(args: argparse.Namespace) -> Grammar:

@@ -292,7 +292,7 @@ def test_internal_errors_keep_their_traceback(monkeypatch):
     def fail(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("morphgen.cli.robots.catalogue", fail)
+    monkeypatch.setattr("morphgen.cli.lists.catalogue", fail)
     with pytest.raises(ZeroDivisionError):
         main(["list"])
 
