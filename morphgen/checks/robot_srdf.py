@@ -62,7 +62,7 @@ def collision_matrix(
     penetrations = checker.penetrations(q)
     at_home = next(penetrations)
     collisions = Counter(pair for depths in penetrations for pair in depths)
-    adjacent = adjacent_pairs(loose)  # as in MoveIt, links on fixed joints are not merged
+    adjacent = set(adjacent_pairs(loose))  # as in MoveIt, links on fixed joints are not merged
     reasons: dict[Pair, Reason] = dict.fromkeys(robot.ignore_pairs, "User")
     for pair in pairs:
         if pair in adjacent:
