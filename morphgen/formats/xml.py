@@ -9,7 +9,7 @@ import codecs
 import re
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -335,8 +335,12 @@ class Schema(Record, frozen=True, dict=True):
         }
 
 
-@lru_cache(maxsize=8)
 def read_schema(name: str) -> Schema:
     """Return the schema of a format."""
+    return _schemas()[name]
+
+
+@cache
+def _schemas() -> dict[str, Schema]:
     path = Path(__file__).with_name("schemas.yaml")
-    return read_record(parse_yaml(path.read_text("utf-8"), str(path))[name], Schema, str(path))
+    return read_record(parse_yaml(path.read_text("utf-8"), str(path)), dict[str, Schema], str(path))

@@ -197,6 +197,7 @@ def test_a_numeric_expression_is_evaluated(expression, value):
         ("lenght", "did you mean 'length'"),
         ("1 / 0", "division by zero"),
         ("1e400", "not a finite number"),
+        ("2**1023 + (2**1023 - 1)", "too large"),
         ("True", "not a finite number"),
         ("'long'", "not a finite number"),
         ("", "invalid syntax"),

@@ -17,6 +17,7 @@ from morphgen.formats.xacro.evaluator import (
     BUILTINS,
     MATH,
     MAX_BITS,
+    MAX_DEPTH,
     MAX_LENGTH,
     MAX_SIZE,
     MAX_WORK,
@@ -186,7 +187,7 @@ def test_the_page_documents_every_function_and_bound():
     words = set(re.findall(r"\w+", page))
     assert set(BUILTINS) - words == set()
     bounds = (
-        f"{MAX_LENGTH:,} characters, {MAX_WORK:,} steps",
+        f"{MAX_LENGTH:,} characters, {MAX_WORK:,} steps, {MAX_DEPTH} levels",
         f"{MAX_SIZE:,} characters and entries; {MAX_BITS} bits",
         f"| {xacro_process.MAX_FILE >> 20} MiB |",
         f"| {MAX_INCLUDE_DEPTH} |",

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 
 from morphgen.errors import MALFORMED, FormatError, nearest, shortened
 
-MAX_REASON = 400  # longest reason in an error [characters]; expressions can be long
+_MAX_REASON = 400  # longest reason in an error [characters]; expressions can be long
 MAX_BITS = 1024  # largest whole number of an expression [bits]: what a float can hold
 MAX_SIZE = 200_000
 """Largest text, list or dictionary of an expression [characters and entries, nested ones too]."""
@@ -142,7 +142,7 @@ OPERATORS: Mapping[type, Callable[[Value, Value], object]] = {
     ast.BitOr: operator.or_,
     ast.BitXor: operator.xor,
 }
-"""Binary operators by the name of their node."""
+"""Binary operators by the type of their node."""
 
 
 def _range(*bounds: int) -> list[int]:
@@ -350,7 +350,7 @@ class _Evaluation:
         self._inner = dict(inner or {})
         """Arguments and variables of comprehensions; they hide ``names``."""
 
-    def value(self, node: ast.AST | None) -> Value:
+    def value(self, node: ast.AST) -> Value:
         """Return the value of a node."""
         match node:
             case ast.Constant(value):
@@ -374,7 +374,7 @@ class _Evaluation:
                 return self._result(value) if isinstance(chosen, slice) else value
         return self._composite(node)
 
-    def _composite(self, node: ast.AST | None) -> Value:
+    def _composite(self, node: ast.AST) -> Value:
         match node:
             case ast.IfExp(test, then, other):
                 return self.value(then if self.value(test) else other)
@@ -383,7 +383,7 @@ class _Evaluation:
             case ast.Compare():
                 return self._compare(node)
             case ast.Slice(low, high, step):
-                return slice(*map(self.value, (low, high, step)))
+                return slice(*(end and self.value(end) for end in (low, high, step)))
             case ast.List(items):
                 return self._result(list(map(_data, self._items(items))))
             case ast.Tuple(items):
@@ -392,7 +392,7 @@ class _Evaluation:
                 return self._dict(node)
             case ast.ListComp() | ast.GeneratorExp():
                 return self._comprehension(node)
-        return None  # an end that a slice does not have
+        raise _refused(node, self._text)
 
     def _spend(self, work: int) -> None:
         """Subtract work from the remaining work."""
@@ -587,7 +587,8 @@ class Expression:
 def _require_allowed(node: ast.AST, text: str) -> None:
     is_allowed = isinstance(node, _ALLOWED)
     if isinstance(node, ast.Constant):
-        is_allowed = type(node.value) in _SCALARS and checked(node.value) == node.value
+        checked(node.value)
+        is_allowed = type(node.value) in _SCALARS
     elif isinstance(node, ast.Attribute):
         is_allowed = not node.attr.startswith("__")
     elif isinstance(node, ast.comprehension):
@@ -616,11 +617,18 @@ def evaluate_number(text: str, values: Mapping[str, float]) -> float:
     It may use xacro's functions (``pi``, ``sin``, ``max``, ``radians``, ...).
     """
     try:
-        result = expression(text.strip()).evaluate({**NAMES, **values})
+        result = expression(text.strip()).evaluate(NAMES, values)
+        number = float(result) if type(result) in (int, float) else math.nan
     except MALFORMED as error:
-        reason = shortened(" ".join(f"{error or type(error).__name__}".split()), MAX_REASON)
         hint = nearest(error.name, values) if isinstance(error, NameError) and error.name else ""
-        raise FormatError(f"{text!r}: {reason}{hint}") from error
-    if isinstance(result, bool) or not isinstance(result, int | float) or not math.isfinite(result):
+        raise FormatError(f"{text!r}: {reason_of(error)}{hint}") from error
+    if not math.isfinite(number):
         raise FormatError(f"{text!r} is {result!r}, not a finite number")
-    return float(result)
+    return number
+
+
+def reason_of(error: BaseException, suffix: str = "") -> str:
+    """Return the message of an error in one line, or the name of its type if it has none."""
+    return shortened(
+        " ".join(f"{str(error) or type(error).__name__} {suffix}".split()), _MAX_REASON
+    )

@@ -24,17 +24,17 @@ from xml.sax.saxutils import escape, quoteattr
 
 import yaml
 
-from morphgen.errors import MALFORMED, FormatError, nearest, shortened
+from morphgen.errors import MALFORMED, FormatError, nearest
 from morphgen.formats.data_files import read_bytes, yaml_problem
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro.evaluator import (
-    MAX_REASON,
     MAX_SIZE,
     NAMES,
     Function,
     Namespace,
     RefusedError,
     expression,
+    reason_of,
     size_of,
 )
 from morphgen.formats.xml import parse_xml
@@ -155,7 +155,7 @@ MAX_TEXT = 20_000_000  # largest text that the substitutions of an expansion may
 
 _NAME = "morphgen.formats._xacro"
 _log = logging.getLogger("morphgen.formats.xacro.expand")
-_LOCK = threading.RLock()  # held by an expansion: the state of xacro is that of its module
+_LOCK = threading.Lock()  # held by an expansion: the state of xacro is that of its module
 
 
 def _safe_eval(
@@ -614,4 +614,4 @@ def _reason(error: BaseException) -> str:
         return "macros or properties refer to each other endlessly or too deeply"
     if isinstance(error, MemoryError):
         return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
-    return shortened(" ".join(f"{error or type(error).__name__} {suffix}".split()), MAX_REASON)
+    return reason_of(error, suffix)
