@@ -78,7 +78,7 @@ def quality(
         raise FitError(f"none of {len(points)} sample points lies in the solid")
     intersection = np.count_nonzero(in_primitives & in_solid)
 
-    union = trimesh.boolean.union([_tessellated(shape) for shape in primitives])
+    union = _union(primitives)
     outer = _surface_points(union, surface_points, rng)
     to_solid = solid.distance(outer)
     protrusion = np.where(solid.contains(outer), 0.0, to_solid)
@@ -176,21 +176,30 @@ def _sobol(n: int, rng: np.random.Generator) -> Array:
     return np.asarray(sampler.random_base2(max(n - 1, 1).bit_length()))
 
 
+def _union(primitives: Sequence[Shape]) -> trimesh.Trimesh:
+    """Return the triangles of the outer surface of primitives in the link frame."""
+    meshes = [_tessellated(shape) for shape in primitives]
+    # Manifold rounds to single precision, which one primitive does not need.
+    return meshes[0] if len(meshes) == 1 else trimesh.boolean.union(meshes, check_volume=False)
+
+
 def _tessellated(shape: Shape) -> trimesh.Trimesh:
     """Return the triangles of a primitive in the link frame."""
     mesh: trimesh.Trimesh
-    if isinstance(shape.geometry, Sphere):
-        mesh = trimesh.creation.icosphere(_SUBDIVISIONS, shape.geometry.radius)
-        return mesh.apply_transform(shape.T_link_shape.matrix)
+    # Meshes are made in unit size: trimesh welds vertices that are less than 1e-8 apart.
     match _solid_primitive(shape):
         case Box(size):
-            mesh = trimesh.creation.box(size)
+            mesh = trimesh.creation.box().apply_scale(size)
         case Cylinder(radius, length):
-            mesh = trimesh.creation.cylinder(radius, length, _SECTIONS)
+            mesh = trimesh.creation.cylinder(1.0, 1.0, _SECTIONS)
+            mesh.apply_scale((radius, radius, length))
+        case Capsule(radius, 0.0):
+            mesh = trimesh.creation.icosphere(_SUBDIVISIONS).apply_scale(radius)
         case Capsule(radius, length):
-            mesh = trimesh.creation.capsule(length, radius, (_SECTIONS, _SECTIONS))
+            mesh = trimesh.creation.capsule(length / radius, 1.0, (_SECTIONS, _SECTIONS))
             # trimesh has one end of the axis at the origin.
             mesh.apply_translation(-mesh.bounds.mean(axis=0))
+            mesh.apply_scale(radius)
     return mesh.apply_transform(shape.T_link_shape.matrix)
 
 

@@ -77,9 +77,9 @@ def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
     area = 2 * (0.44 * 0.2 + 0.2 * 0.1 + 0.1 * 0.44)
     end, strips = 0.2 * 0.1 * 0.04, 2 * (0.2 + 0.1) * 0.04 * 0.02
     assert measures.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
-    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-7)
+    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
     assert measures.gap_mean == measures.gap_p95 == 0
-    assert measures.hausdorff == pytest.approx(0.04, abs=1e-7)
+    assert measures.hausdorff == pytest.approx(0.04, abs=1e-9)
 
 
 def test_a_sphere_in_a_cube_does_not_cover_the_corners():
@@ -135,11 +135,24 @@ def test_protrusion_of_a_thin_skin_equals_its_thickness():
     assert measures.hausdorff == pytest.approx(math.sqrt(3) * skin, abs=1e-7)
 
 
+@pytest.mark.parametrize(
+    "geometry",
+    [Capsule(0.01, 0.03), Capsule(0.001, 0.1), Cylinder(1e-4, 0.1), Cylinder(0.05, 1e-6)],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_thin_primitives_are_measured(geometry, count):
+    shape = Shape(geometry)
+    measures = quality(solid_of([CUBE]), [shape] * count)
+    corner = signed_distance([shape], np.full((1, 3), 0.1))
+    assert measures.hausdorff == pytest.approx(corner[0])
+    assert measures.protrusion_share == 0
+
+
 def test_disjoint_shapes_have_no_overlap():
     measures = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
     assert measures.iou == measures.coverage == 0
     assert measures.volume_ratio == pytest.approx(1, rel=1e-3)
-    assert measures.hausdorff == pytest.approx(0.5, abs=1e-7)
+    assert measures.hausdorff == pytest.approx(0.5, abs=1e-9)
     assert 0.3 < measures.gap_mean == pytest.approx(measures.protrusion_mean, rel=0.02)
 
 

@@ -618,7 +618,9 @@ def evaluate_number(text: str, values: Mapping[str, float]) -> float:
     """
     try:
         result = expression(text.strip()).evaluate(NAMES, values)
-        number = float(result) if type(result) in (int, float) else math.nan
+        number = math.nan
+        if isinstance(result, int | float) and not isinstance(result, bool):
+            number = float(result)
     except MALFORMED as error:
         hint = nearest(error.name, values) if isinstance(error, NameError) and error.name else ""
         raise FormatError(f"{text!r}: {reason_of(error)}{hint}") from error
