@@ -64,6 +64,15 @@ def test_the_actors_learning_rate_follows_the_kl_divergence(scale, kl, expected)
     assert next_actor_lr_scale(SMALL, scale, kl) == 1
 
 
+def test_desired_kl_changes_only_the_actors_learning_rate():
+    trainer = learner(learning_rate=5e-3, desired_kl=1e-6)
+    trainer.iterate()
+    rate = trainer.iterate().learning_rate
+    actor, critic = (group["lr"] for group in trainer.optimiser.param_groups)
+    assert critic == pytest.approx(5e-3 * 3 / 4)
+    assert rate == actor == pytest.approx(critic / KL_FACTOR)
+
+
 @pytest.mark.parametrize(("factor", "explained"), [(1.0, 1), (0.0, 0), (0.5, 0.75), (-1.0, -3)])
 def test_explained_variance_by_hand(factor, explained):
     returns = torch.tensor([[1.0, 2.0], [3.0, 6.0]])

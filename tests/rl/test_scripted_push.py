@@ -1,5 +1,6 @@
 """The scripted push: its plans, its contacts with the block, and episodes of it."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,9 +11,11 @@ from helpers.goal_sets import draw_spec
 from helpers.resets import reset_envs
 from helpers.scenes import ball, robot
 from helpers.simulators import PYBULLET
+from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import Link
+from morphgen.rl.baselines import scripted_push
 from morphgen.rl.baselines.scripted_push import (
     MAX_PLANS,
     RISE,
@@ -23,9 +26,11 @@ from morphgen.rl.baselines.scripted_push import (
     find_contacts,
     overhang,
 )
+from morphgen.splits.split_file import read_split
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.env_specs import member_spec
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import Block, Scene
@@ -60,10 +65,43 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     assert planner.plan(q, block, steps_left=across - 1) is None
 
 
+def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
+    """A patched overhang penalises configurations near the end of the first plan."""
+    setting = draw_spec(robot(PLANE), PUSH, obstacles=False, seed=0, cache=tmp_path)
+    planner = planner_of(setting)
+    q, block = setting.goals.q[0], setting.goals.blocks[0]
+    first = planner.plan(q, block).path[-1]
+
+    def near(configurations):
+        return np.abs(configurations - first).max(axis=-1) < 1.0
+
+    def said(space, configurations, blocks, edge):
+        assert blocks.shape == (len(configurations), 7)
+        assert (blocks[:, 1] >= block[1]).all()
+        return near(configurations).astype(float)
+
+    monkeypatch.setattr(scripted_push, "overhang", said)
+    assert near(first)
+    assert not near(planner.plan(q, block).path[-1])
+
+
 def test_the_planner_rejects_other_tasks(tmp_path):
     setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
         planner_of(setting)
+
+
+@pytest.mark.slow
+def test_obstructed_arms_push_below_the_middle(tmp_path):
+    """Starts of YuMi without a straight path behind the block."""
+    members = read_split("extrapolation/arms/push").train
+    member = next(each for each in members if each.name == "yumi")
+    setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
+    planner = planner_of(setting)
+    space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
+    for q, block in zip(setting.goals.q[3:5], setting.goals.blocks[3:5], strict=True):
+        end = planner.plan(q, block).path[-1]
+        assert find_contacts(space, end[None], block, edge).overhang[0] < 0.05
 
 
 def test_the_tool_can_turn_around():
@@ -91,6 +129,15 @@ def test_contacts_are_found_where_the_robot_touches_the_block():
     assert low.width == pytest.approx(0.5, abs=0.12)
     assert low.overhang.max() == 0
     assert found(0.35).overhang.min() > 0.5
+
+
+def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
+    plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
+    wide = ball(0.2).with_links([plate])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.width[0] == 1
 
 
 @pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
