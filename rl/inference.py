@@ -31,7 +31,6 @@ from morphgen.rl.runs.checkpoint import Interface, policy_interface, read_checkp
 from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS, require_device
 from morphgen.tasks.scenes.env_specs import GoalConfig
@@ -39,8 +38,8 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD, is_host
 from morphgen.tasks.task import TaskConfig
 
 if TYPE_CHECKING:
+    from morphgen.tasks.gym.env import TaskEnv
     from morphgen.tasks.render.renderer import Frame
-
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
@@ -213,16 +212,20 @@ def make_env_and_controller(
 
     Unless ``config`` is given, the task has the constants that the controller is evaluated with.
     """
-    interface = vars(spec.interface)
-    if spec.learner is not None and kind not in (None, spec.interface.kind):
-        raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
+    # Evaluations of batches need neither Gymnasium nor the renderer with its video encoder.
+    from morphgen.tasks.gym.env import TaskEnv
+
+    interface, policy = vars(spec.interface), None
+    if spec.learner is not None:
+        if kind not in (None, spec.interface.kind):
+            raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
+        policy = Policy(spec.learner, "deterministic", seed)
     if kind is not None:
         interface = interface | {"kind": kind}
     options = {"config": spec.task_config, "layouts": "eval", **interface, **options}
     env = TaskEnv(spec.task, robot, **options)
-    if spec.learner is None:
+    if policy is None:
         return env, BASELINES[spec.name].make(seed)
-    policy = Policy(spec.learner, "deterministic", seed)
     try:
         policy.require(env.batch.observe())
     except TaskError:

@@ -199,7 +199,7 @@ def _digest(content: object, where: str) -> str:
         if not isinstance(value, dict | list | tuple):
             digest.update(_leaf(value, f"{where}: {path} is"))
             return
-        if level > MAX_LEVELS:
+        if level == MAX_LEVELS:
             raise TaskError(f"{where}: more than {MAX_LEVELS} levels of containers")
         digest.update(f"{'d' if isinstance(value, dict) else 'l'}{len(value)};".encode())
         for key, each in _entries(value, where):

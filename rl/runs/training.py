@@ -102,8 +102,8 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         "processes": learner.processes.size,
     }
     processes = len(state["generators"]["actions"])
-    stored = {**asdict(PPOConfig(**state["config"])), **state, "processes": processes}
-    _require_same(stored, ours)
+    stored = {**asdict(PPOConfig(**state["config"])), "processes": processes}
+    _require_same(stored | {name: state[name] for name in ("updates", "device")}, ours)
     n, rank, batch = learner.batch.num_envs, learner.processes.rank, state["batch"]
     if processes > 1:  # a checkpoint has the environments of all processes, one after another
         own = slice(rank * n, (rank + 1) * n)

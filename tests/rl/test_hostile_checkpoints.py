@@ -106,6 +106,7 @@ CASES = [
     ("learner/optimiser/state/1000000", {}, "state of an unknown parameter 1000000"),
     ("learner/optimiser/state/0", 7, "optimiser.state[0]: invalid value 7; expected keys and"),
     ("learner/batch", nested(12, 10), "more than 1,000,000 values"),
+    ("learner/batch", nested(18, 1), "more than 20 levels of containers"),
     ("learner/batch", nested(100, 1), "more than 20 levels of containers"),
     ("learner/batch", {1.5: 0}, "a key of an unexpected type: float"),
     ("learner/update", 2**300, "learner.update is a number of 301 bits"),
