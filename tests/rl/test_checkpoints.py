@@ -91,3 +91,15 @@ def test_a_constant_missing_in_an_old_checkpoint_has_its_default():
     del checkpoint["policy"]["network"]["mlp_width"], checkpoint["config"]["desired_kl"]
     resume_learner(again, checkpoint)
     assert equal(weights(made), weights(again))
+
+
+def test_load_networks_loads_only_the_networks():
+    pre = learner()
+    pre.iterate()
+    fine = learner(OnALine(16), gamma=0.9)
+    load_networks(fine, stored(state_of(pre)))
+    assert equal(weights(pre), weights(fine))
+    assert fine.update == 0
+    assert not fine.optimiser.state
+    fine.iterate()
+    assert not equal(weights(pre), weights(fine))

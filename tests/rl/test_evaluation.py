@@ -148,6 +148,24 @@ def test_se_policies_are_scored_on_their_own_robot_and_together_on_others(tmp_pa
     assert test.score == pytest.approx(np.mean([each.score for each in alone]))
 
 
+@pytest.mark.parametrize(("in_rounds", "whole"), [(True, 8), (False, 6)])
+def test_progress_counts_finished_and_partial_episodes(monkeypatch, in_rounds, whole):
+    if in_rounds:
+        monkeypatch.setattr(evaluation, "MAX_ENVS_PER_ROBOT", 2)
+    else:  # in batches
+        at_most(4, monkeypatch)
+    seen = []
+    config = replace(EVAL, episodes=3)
+    with show_progress(lambda *now: seen.append(now)):
+        evaluate_baseline("zero", small_source(), config)
+    parts = [done for done, _ in seen]
+    assert {total for _, total in seen} == {whole}
+    assert len(parts) == 600
+    assert 0 < parts[0] < 0.05
+    assert parts == sorted(set(parts))
+    assert parts[-1] == whole
+
+
 def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp_path):
     config, learner = read_checkpoint(run)
     learner["layout"]["obstacles"] = 0

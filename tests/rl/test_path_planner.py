@@ -113,6 +113,20 @@ def test_immovable_joints_keep_their_position():
     assert_free(space, start, path)
 
 
+def test_a_tree_stays_on_its_side_of_a_wall():
+    wall = Block((0.2, 10.0, 0.4), Pose((0.0, 0.0, 0.2)))
+    planner, start = planner_of(wall), np.array([-1.0, 0.0])
+
+    def nodes(attempt=0):
+        _, tree = planner.plan_rrt(start, NO_GOALS, attempt=attempt, iterations=100)
+        return np.array(tree.nodes)
+
+    assert nodes()[:, 0].max() < -0.19
+    assert np.ptp(nodes(), axis=0).min() > 0.5
+    assert np.array_equal(nodes(), nodes())
+    assert not np.array_equal(nodes(), nodes(attempt=1))
+
+
 def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
     """A wall without a gap hides the cheaper one of two goals, so the path leads to the other."""
     walls = (
