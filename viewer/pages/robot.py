@@ -36,7 +36,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables
-from morphgen.viewer.app.address import Address
+from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.viser_internals import control_id
@@ -297,7 +297,8 @@ class RobotPage:
 
     def _hover(self, text: str) -> None:
         """Draw the axis and range of the joint whose slider has the pointer or the focus."""
-        self.show_range(int(text) if text.isdecimal() and int(text) < self.robot.dof else None)
+        row = parse_count(text, self.robot.dof)
+        self.show_range(row if row < self.robot.dof else None)
 
     def show_range(self, row: int | None) -> None:
         """Draw the axis and the range of a joint, given by its index in q; None removes them."""
