@@ -14,11 +14,12 @@ from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import SUFFIXES, is_mjcf
 from morphgen.formats.resolve import file_stamp
+from morphgen.formats.ros_package import part_licences
 from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings
 from morphgen.grammar.robot_source import is_robot_folder
-from morphgen.splits.split import SIDES, Split
+from morphgen.splits.split import Split, sided_members
 from morphgen.viewer.robot_uri import (
     DERIVATION,
     WORDS,
@@ -181,7 +182,6 @@ def robot_subfolders(folder: Path) -> list[str]:
 
 def split_rows(name: str, split: Split) -> list[Row]:
     """Return the members of a split, train robots first."""
-    members = [(side, member) for side in SIDES for member in split.side(side)]
     return [
         Row(
             member.name,
@@ -191,7 +191,7 @@ def split_rows(name: str, split: Split) -> list[Row]:
             task=member.task + (" with obstacles" if member.obstacles else ""),
             order=i,
         )
-        for i, (side, member) in enumerate(members)
+        for i, (side, member) in enumerate(sided_members(split))
     ]
 
 
@@ -282,7 +282,7 @@ def _bundle_row(uri: str, folder: Path, order: int) -> Row:
             folder.name,
             uri,
             "composed" if "derivation" in card else "imported",
-            licence=", ".join(dict.fromkeys(part["licence"] for part in card.get("parts", ()))),
+            licence=", ".join(part_licences(card)),
             findings=tuple(sorted(problems)),
             order=order,
             **{fact: card[fact] for fact in NUMBERS},

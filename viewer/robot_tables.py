@@ -97,7 +97,7 @@ def summary(robot: Robot, reach: float | None) -> str:
 def licence_line(robot: Robot) -> str:
     """Return a line with the licences of a robot's parts and their restrictions; HTML."""
     licences = []
-    for licence in map(find_licence, part_licences(robot)):
+    for licence in map(find_licence, part_licences(robot.provenance)):
         licences.append(escape(licence.id))
         if licence.restrictions:
             licences[-1] += " " + markup.tag(", ".join(licence.restrictions), "warning")

@@ -47,7 +47,7 @@ def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
         "folders": " ".join(folders),
         "licences": "\n".join(
             f"  <license>{escape(each)}</license>"
-            for each in part_licences(robot) or (_UNKNOWN_LICENCE,)
+            for each in part_licences(robot.provenance) or (_UNKNOWN_LICENCE,)
         ),
     }
     texts = {
@@ -63,9 +63,12 @@ def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
         path.write_text(text, encoding="utf-8")
 
 
-def part_licences(robot: Robot) -> tuple[str, ...]:
-    """Return the licences of the robot's parts in their order; none for robots without."""
-    parts = robot.provenance.get("parts")
+def part_licences(card: Mapping[str, object]) -> tuple[str, ...]:
+    """Return the licences of a robot's parts in their order; none for robots without.
+
+    card: Provenance of the robot, or its whole card.
+    """
+    parts = card.get("parts")
     rows = parts if isinstance(parts, list) else []
     names = [
         one_line(str(part["licence"]))

@@ -1,6 +1,7 @@
 """Robot URIs resolve only to files inside the served folders."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -168,6 +169,14 @@ def test_folders_are_listed(files, tmp_path):
     assert robot_subfolders(tmp_path) == ["robots"]
     with pytest.raises(UriError, match="holds no robot"):
         folder_rows("uploads", files)
+
+
+def test_a_part_without_a_licence_leaves_the_facts_of_its_card(files, tmp_path):
+    parts = [{"label": "arm", "part": "a"}, {"label": "ee", "part": "b", "licence": "MIT"}]
+    robot = replace(arm(), provenance={"parts": parts})
+    write_bundle(robot, tmp_path / "robots" / "four", picture=False)
+    row = next(row for row in folder_rows("robots", files) if row.name == "four")
+    assert (row.dof, row.licence, row.findings) == (4, "MIT", ())
 
 
 def test_the_folder_of_all_uploads_has_no_address(files):
