@@ -84,11 +84,11 @@ def show(session: Session) -> None:
     drawn = drawn_in_set(subject, files) if derivation else None
     # A robot with choices is one of the grammar around it.
     is_around = is_robot(subject) and not state.keys().isdisjoint(_OF_GRAMMARS)
-    is_grammar = is_around or (not derivation and "=" not in subject.split()[0])
+    is_name = derivation is None and not is_robot(subject)  # the subject is a grammar's name
     grammar_name = drawn[0] if drawn else DEFAULT_GRAMMAR
-    if is_grammar:
+    if is_around or is_name:
         grammar_name = subject if is_around else subject.split()[0]
-    words = DEFAULT_WORDS if derivation or (is_grammar and not is_around) else subject
+    words = DEFAULT_WORDS if derivation or is_name else subject
     known = choice_of(derivation, library) if derivation else None
     choice = known or parse_choice(words.split(), library)
     session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
@@ -96,7 +96,7 @@ def show(session: Session) -> None:
     tabs = session.client.gui.add_tab_group()
     # The tab that the address asks for comes first.
     first: GrammarTab | PartsTab | ParametersTab
-    if is_grammar:
+    if is_around or is_name:
         first = grammar = GrammarTab(session, tabs, grammar_name, page.show)
         PartsTab(session, tabs, choice, page.show)
     else:
@@ -106,10 +106,7 @@ def show(session: Session) -> None:
             first = PartsTab(session, tabs, choice, page.show)
         grammar = GrammarTab(session, tabs, grammar_name, page.show)
     page.add_tabs(tabs, grammar)
-    if isinstance(first, GrammarTab):
-        first.show(first.mode)
-    else:
-        first.show()
+    first.show()
     if drawn is not None and page.shown is not None:
         grammar.choices, grammar.mode = drawn[1], "chosen"
         page.shown = replace(page.shown, choices=drawn[1])

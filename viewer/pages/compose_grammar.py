@@ -264,7 +264,7 @@ class GrammarTab:
             self._num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
             self._tree = gui.add_html("")
         session.on_change(self._start, lambda: self.load(self._start.value))
-        session.on_change(self._text, lambda: self.show(self.mode), "grammar")
+        session.on_change(self._text, self.show, "grammar")
         session.on_change(buttons, lambda: self._draw(buttons.value))
         session.on_change(save, self._send)
         for field in (self._seed, self._number):
@@ -285,9 +285,12 @@ class GrammarTab:
         set_value(self._text, self._original)
         self.show("typical")
 
-    def show(self, mode: Mode) -> None:
-        """Show a robot of the text, or what is wrong with the text; then the last robot stays."""
-        self.mode, self._too_long.content = mode, ""
+    def show(self, mode: Mode | None = None) -> None:
+        """Show a robot of the text, or what is wrong with the text; then the last robot stays.
+
+        mode: Which robot; by default the present mode.
+        """
+        self.mode, self._too_long.content = mode or self.mode, ""
         text: dict[str, str] = {}
         if self._text.value != self._original:
             try:

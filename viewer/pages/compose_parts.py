@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -167,7 +168,52 @@ def with_value(choice: PartChoice, key: str, value: float, default: float) -> Pa
     return replace(choice, values=values)
 
 
-class PartsTab:
+class _ComposingTab(ABC):
+    """A tab whose controls compose a robot."""
+
+    _fault: viser.GuiHtmlHandle  # reason why no robot can be composed, or empty
+
+    def __init__(self, session: Session, show_robot: ShowRobot) -> None:
+        """Prepare the tab; ``show_robot`` shows a composed robot."""
+        self._session, self._library, self._show_robot = session, session.files.library, show_robot
+
+    @abstractmethod
+    def _compose(self) -> Shown:
+        """Return the robot that the controls describe."""
+
+    def show(self) -> None:
+        """Show the robot, or why it cannot be composed; then the last robot stays."""
+        try:
+            shown = self._compose()
+        except MorphgenError as error:
+            self._fault.content = markup.error(self._session.files.redact(error))
+            return
+        self._fault.content = ""
+        self._show_robot(shown)
+
+    def _add_slider(
+        self,
+        name: str,
+        parameter: Parameter,
+        value: float,
+        key: str,
+        change: Callable[[float], None],
+    ) -> None:
+        """Add the slider of a part's parameter."""
+        low, high = parameter.minimum, parameter.maximum
+        slider = self._session.client.gui.add_slider(
+            name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
+            low,
+            high,
+            1.0 if parameter.integer else slider_step(low, high),
+            min(max(value, low), high),
+            marks=tuple((end, f"{end:.3g}") for end in (low, high)),
+            hint=parameter.summary or name,
+        )
+        self._session.on_change(slider, lambda: change(slider.value), key)
+
+
+class PartsTab(_ComposingTab):
     """The tab with a dropdown of parts for the base and its slots, and sliders of parameters."""
 
     def __init__(
@@ -178,29 +224,23 @@ class PartsTab:
         show_robot: ShowRobot,
     ) -> None:
         """Add the tab; ``show`` shows the chosen robot."""
-        gui, library = session.client.gui, session.files.library
-        self._session, self._library, self._choice = session, library, choice
-        self._show_robot = show_robot
+        super().__init__(session, show_robot)
+        gui, self._choice = session.client.gui, choice
         self._slots: list[viser.GuiFolderHandle] = []  # folders with the controls of each slot
         with tabs.add_tab("Parts", viser.Icon.PUZZLE):
             self._fault = gui.add_html("")
-            bases = tuple(library.names("base"))
+            bases = tuple(self._library.names("base"))
             base = gui.add_dropdown("base", bases, initial_value=choice.parts["base"])
             self._folder = gui.add_folder(None)
         session.on_change(base, lambda: self._choose("base", base.value))
         self._add_slots()
 
-    def show(self) -> None:
-        """Show the robot of the chosen parts, or why they do not fit."""
+    def _compose(self) -> Shown:
         words = self._choice.words
+        derivation, name = resolve_words(words, self._session.files)
+        robot = compose(derivation, self._library, name)
         command = shlex.join(["morphgen", "compose", *words.split()])
-
-        def resolve() -> Shown:
-            derivation, name = resolve_words(words, self._session.files)
-            robot = compose(derivation, self._library, name)
-            return Shown(robot, derivation, command, WORDS + words, words)
-
-        _show_composed(self._session, self._fault, resolve, self._show_robot)
+        return Shown(robot, derivation, command, WORDS + words, words)
 
     def _add_slots(self) -> None:
         """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
@@ -220,7 +260,7 @@ class PartsTab:
                         key = f"{slot}.{name}"
                         value = choice.values.get(key, parameter.default)
                         change = functools.partial(self._change, key, parameter.default)
-                        _add_slider(self._session, name, parameter, value, key, change)
+                        self._add_slider(name, parameter, value, key, change)
 
     def _add_part_dropdown(self, slot: str) -> None:
         names, chosen = part_options(slot, self._library), self._choice.parts.get(slot)
@@ -240,7 +280,7 @@ class PartsTab:
         self.show()
 
 
-class ParametersTab:
+class ParametersTab(_ComposingTab):
     """The tab with sliders for every part of a derivation that words cannot describe."""
 
     def __init__(
@@ -251,12 +291,12 @@ class ParametersTab:
         show_robot: ShowRobot,
     ) -> None:
         """Add the tab; ``show`` shows the robot."""
-        gui, library = session.client.gui, session.files.library
-        self._session, self._derivation, self._show_robot = session, derivation, show_robot
+        super().__init__(session, show_robot)
+        gui, self._derivation = session.client.gui, derivation
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
             self._fault = gui.add_html("")
             for node in derivation.walk():
-                manifest, values = library.manifest(node.part), dict(node.parameters)
+                manifest, values = self._library.manifest(node.part), dict(node.parameters)
                 is_root = node is derivation
                 parameters = manifest.parameters if is_root else manifest.attached_parameters
                 if names := [name for name in parameters if name in values]:
@@ -264,57 +304,17 @@ class ParametersTab:
                         for name in names:
                             change = functools.partial(self._change, node.label, name)
                             key = f"{node.label}.{name}"
-                            _add_slider(session, name, parameters[name], values[name], key, change)
+                            self._add_slider(name, parameters[name], values[name], key, change)
 
-    def show(self) -> None:
-        """Show the robot, or why its values do not fit."""
-        derivation, library = self._derivation, self._session.files.library
-
-        def resolve() -> Shown:
-            uri = f"{DERIVATION}{derivation}"
-            robot = compose(derivation, library, default_name(derivation, library))
-            return Shown(robot, derivation, f"# {derivation}", uri, uri)
-
-        _show_composed(self._session, self._fault, resolve, self._show_robot)
+    def _compose(self) -> Shown:
+        derivation = self._derivation
+        uri = f"{DERIVATION}{derivation}"
+        robot = compose(derivation, self._library, default_name(derivation, self._library))
+        return Shown(robot, derivation, f"# {derivation}", uri, uri)
 
     def _change(self, label: str, name: str, value: float) -> None:
         self._derivation = with_parameter(self._derivation, label, name, value)
         self.show()
-
-
-def _show_composed(
-    session: Session, fault: viser.GuiHtmlHandle, make: Callable[[], Shown], show: ShowRobot
-) -> None:
-    """Show a robot, or why it cannot be composed; then the last robot stays."""
-    try:
-        shown = make()
-    except MorphgenError as error:
-        fault.content = markup.error(session.files.redact(error))
-        return
-    fault.content = ""
-    show(shown)
-
-
-def _add_slider(
-    session: Session,
-    name: str,
-    parameter: Parameter,
-    value: float,
-    key: str,
-    change: Callable[[float], None],
-) -> None:
-    """Add the slider of a part's parameter."""
-    low, high = parameter.minimum, parameter.maximum
-    slider = session.client.gui.add_slider(
-        name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
-        low,
-        high,
-        1.0 if parameter.integer else slider_step(low, high),
-        min(max(value, low), high),
-        marks=tuple((end, f"{end:.3g}") for end in (low, high)),
-        hint=parameter.summary or name,
-    )
-    session.on_change(slider, lambda: change(slider.value), key)
 
 
 def with_parameter(derivation: Derivation, label: str, name: str, value: float) -> Derivation:
