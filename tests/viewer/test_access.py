@@ -101,11 +101,18 @@ def test_malformed_origin_is_rejected(origin):
         access_policy("127.0.0.1", [origin])
 
 
-def test_foreign_origin_gets_no_websocket(shared_viewer):
+@pytest.mark.parametrize(
+    ("host", "origin", "why"),
+    [
+        (None, "http://evil.example", b"may not use this viewer"),
+        ("evil.example", "http://evil.example", b"is not a name of this viewer"),
+    ],
+)
+def test_foreign_origin_or_host_name_gets_no_websocket(shared_viewer, host, origin, why):
     with pytest.raises(InvalidStatus) as refused:
-        PlainClient(shared_viewer.port, origin="http://evil.example")
+        PlainClient(shared_viewer.port, host=host, origin=origin)
     assert refused.value.response.status_code == 403
-    assert b"may not use this viewer" in refused.value.response.body
+    assert why in refused.value.response.body
 
 
 @pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])

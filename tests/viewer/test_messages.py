@@ -59,6 +59,19 @@ def test_valid_messages_are_accepted():
 
 
 @pytest.mark.parametrize(
+    ("event", "points", "fault"),
+    [
+        ("rect-select", [[0.1, 0.1], [0.5, 0.5]], ""),
+        ("click", [[0.5, 0.5]], "expected a rectangle with two points"),
+    ],
+)
+def test_the_scene_takes_rectangles_and_no_clicks(event, points, fault):
+    rays = {"ray_origin": [0.0, 0.0, 0.0], "ray_direction": [1.0, 0.0, 0.0], "modifier": None}
+    message = {"type": "ScenePointerMessage", "event_type": event, "screen_pos": points, **rays}
+    assert message_fault(msgspec.msgpack.encode(message)) == fault
+
+
+@pytest.mark.parametrize(
     ("kind", "label", "value", "why"),
     [
         ("Text", "Search", 3, "expected a text"),

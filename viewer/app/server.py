@@ -200,8 +200,9 @@ def message_fault(data: object) -> str:
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
         return f"malformed message: {error}"
     # No page listens to clicks beside the nodes of its scene.
-    rectangle = (content.get("event_type"), len(content.get("screen_pos", ())))
-    if message_type is ScenePointer and rectangle != ("rect-select", 2):
+    if message_type is ScenePointer and (
+        content["event_type"] != "rect-select" or len(content["screen_pos"]) != 2
+    ):
         return "expected a rectangle with two points"
     norm = math.hypot(*content.get("wxyz", (1.0,)))
     if not _all_finite(content.values()) or norm < MIN_QUATERNION_NORM:
