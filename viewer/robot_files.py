@@ -164,7 +164,7 @@ def change_tray(session: Session, action: str, uri: str) -> None:
         session.run_in_background(lambda: send_bundles(session, session.chosen))
     else:
         raise AddressError(
-            f"{action!r:.40}: no action of the tray; expected choose, drop, clear or download"
+            f"{action!r:.40}: unknown action; expected choose, drop, clear or download"
         )
 
 

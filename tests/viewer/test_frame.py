@@ -115,7 +115,7 @@ def test_a_script_chooses_robots(viewer):
         script.send("choose", "x" * MAX_CHOSEN)
         client.shows("choose fewer")
         script.send("explode", "")
-        client.shows("no action of the tray")
+        client.shows("unknown action; expected choose, drop")
 
 
 def test_a_narrow_window_has_its_cards_above_the_panel(shared_viewer):
