@@ -12,7 +12,6 @@ import viser
 
 from morphgen.grammar.robot_source import is_set_folder
 from morphgen.splits.split_file import split_names
-from morphgen.viewer.app.address import parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
 from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_folder, resolve_split
@@ -26,9 +25,9 @@ def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> 
     Args:
         session: Session of the page.
         key: Key of the value in the address.
-        control: A dropdown, check box, text, slider or number field.
+        control: A dropdown, check box, text or slider.
         keys: Texts in the address that stand for the options of a dropdown, by default the options,
-            or for a check box that is on, by default any.
+            or for a check box that is on.
     """
     default, keys = control.value, tuple(keys)
 
@@ -39,7 +38,7 @@ def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> 
         if isinstance(control, viser.GuiDropdownHandle):
             return keys[control.options.index(value)] if keys else str(value)
         if isinstance(control, viser.GuiCheckboxHandle):
-            return keys[0] if keys else "yes"
+            return keys[0]
         return f"{value:g}" if isinstance(value, float) else str(value)
 
     def apply(text: str) -> None:
@@ -56,9 +55,7 @@ def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # no
             keys = keys or control.options
             return control.options[keys.index(text)] if text in keys else None
         case viser.GuiCheckboxHandle():
-            return text in keys if keys else bool(text)
-        case viser.GuiNumberHandle():
-            return parse_count(text, control.value)
+            return text in keys
         case viser.GuiSliderHandle():
             try:
                 number = float(text)

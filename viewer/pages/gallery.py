@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import viser
@@ -160,27 +161,23 @@ def section_links(files: FileAccess, page: str = "library") -> str:
     """Return links to what a page can show: robots, splits with the user's first, and grammars."""
     root = files.roots[0]
     own = sorted(path.relative_to(root).as_posix() for path in (root / SPLITS).rglob("*.yaml"))
-    sections = (  # title, names, pages that show them, pages with the section, text without names
-        (
-            *("Robots in this folder", robot_folders(root)),
-            *(("gallery", "population"), ("library", "gallery", "population")),
-            "none yet: compose a robot and write it to robots/, or run "
-            "<code>morphgen sample arm3</code>",
-        ),
-        (
-            *("Splits", [*own, *split_names()]),
-            *(("split", "population"), ("library", *_TITLES)),
-            "none yet: choose robots in a gallery, then press split",
-        ),
-        (
-            *("Grammars", grammar_names()),
-            *(("compose", "population"), ("library", "population"), ""),
-        ),
-    )
+
+    def section(title: str, names: Sequence[str], targets: Sequence[str], empty: str = "") -> str:
+        """Return links to the page, or else to the first target, or a text without any names."""
+        target = page if page in targets else targets[0]
+        text = " · ".join(markup.link(Address(target, (name,)), name) for name in names)
+        return f"<h3>{title}</h3>{text or markup.dim(empty)}"
+
     html = ""
-    for title, names, targets, pages, empty in sections:
-        if page in pages:
-            target = page if page in targets else targets[0]
-            text = " · ".join(markup.link(Address(target, (name,)), name) for name in names)
-            html += f"<h3>{title}</h3>{text or markup.dim(empty)}"
+    if page != "split":
+        empty = (
+            "none yet: compose a robot and write it to robots/, or run "
+            "<code>morphgen sample arm3</code>"
+        )
+        robots = robot_folders(root)
+        html += section("Robots in this folder", robots, ("gallery", "population"), empty)
+    empty = "none yet: choose robots in a gallery, then press split"
+    html += section("Splits", [*own, *split_names()], ("split", "population"), empty)
+    if page in ("library", "population"):
+        html += section("Grammars", grammar_names(), ("compose", "population"))
     return html
