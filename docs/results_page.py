@@ -1,8 +1,8 @@
-"""Write the tables and figures of docs/results.md from the scores in results/.
+"""Write the tables of docs/results.md and results/tables.md, and their figures, from the scores.
 
     python docs/results_page.py
 
-Each table stands between two comments of the page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
+Each table stands between two comments of a page, ``<!-- NAME -->`` and ``<!-- /NAME -->``, and is
 replaced. The figures are in docs/images/results: reach.png, push.png, fine-tuning.png,
 robots.png and similarity.png.
 """
@@ -31,6 +31,7 @@ from morphgen.splits.split import SIDES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
+TABLES = ROOT / "results/tables.md"
 IMAGES = ROOT / "docs/images/results"
 STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
 TASKS = ("reach", "reach-obstacles", "push", "push-obstacles")
@@ -116,6 +117,20 @@ def split_table(task: str) -> str:
             split = ""
     score = ["MT", "success", "ZS", "success"] if with_scores else ["MT", "ZS"]
     headers = ["split", "agent", "transitions", "seeds", *score]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def summary_table() -> str:
+    """Return zero-shot success on each split of reach and push, by agent."""
+    columns = ("me-graph", *list(AGENTS)[1:5])
+    lines = []
+    for task, best in (("reach", "ik"), ("push", "scripted")):
+        for split in SPLITS:
+            rates: dict[str, str] = {}
+            for (agent, _), row in results_of(f"{task}-30m", f"{split}/{task}").items():
+                rates[agent] = row.sides["test"].success.as_percent() if "test" in row.sides else ""
+            lines.append([f"{split}/{task}", *(rates.get(agent, "") for agent in (*columns, best))])
+    headers = ["split", *(AGENTS[agent] for agent in columns), "`ik`; push: `scripted`"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -232,18 +247,19 @@ def curve_table(name: str) -> str:
     return str(CURVE["table"](name, CURVE_OPTIONS))
 
 
-def write_tables(tables: Mapping[str, str], page: str) -> str:
-    """Return a page with its tables replaced.
+def write_tables(tables: Mapping[str, str], page: Path) -> str:
+    """Return the text of a page with its tables replaced.
 
     Raises:
         ValueError: If the page has no place for a table.
     """
+    text = page.read_text("utf-8")
     for name, table in tables.items():
         pattern = rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)"
-        page, count = re.subn(pattern, rf"\1\n{table}\n\n\2", page, flags=re.DOTALL)
+        text, count = re.subn(pattern, rf"\1\n{table}\n\n\2", text, flags=re.DOTALL)
         if count != 1:
-            raise ValueError(f"{PAGE}: {count} places for the table {name}; expected one")
-    return page
+            raise ValueError(f"{page}: {count} places for the table {name}; expected one")
+    return text
 
 
 def bar_figure(task: str, baseline: str) -> Figure:
@@ -336,8 +352,12 @@ def save(figure: Figure, name: str) -> Path:
     return path
 
 
-def tables() -> dict[str, str]:
-    """Return the tables of the page by their names."""
+def tables() -> dict[Path, dict[str, str]]:
+    """Return the tables of each page by their names."""
+    return {PAGE: {"summary": summary_table()}, TABLES: _all_tables()}
+
+
+def _all_tables() -> dict[str, str]:
     return {
         **{task: split_table(task) for task in TASKS},
         "ee-task": ee_task_table(),
@@ -354,12 +374,13 @@ def similarity_rows() -> list[Any]:
 
 
 def main() -> int:
-    """Write the page and the figures."""
+    """Write the pages and the figures."""
     argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args()
-    PAGE.write_text(write_tables(tables(), PAGE.read_text("utf-8")), "utf-8")
-    print(PAGE)
+    for page, found in tables().items():
+        page.write_text(write_tables(found, page), "utf-8")
+        print(page)
     print(save(bar_figure("reach", "jacobian"), "reach.png"))
     print(save(bar_figure("push", "scripted"), "push.png"))
     print(save(fine_tuning_figure(), "fine-tuning.png"))

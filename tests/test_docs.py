@@ -21,7 +21,11 @@ from morphgen.grammar.library import default_library
 from morphgen.tasks.registry import register_gym_envs
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "benchmarks/README.md", "examples/README.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "results").glob("*.md")),
+]
 BLOCK = re.compile(
     r"(?:(?P<file>\S+)`:\n\n)?```(?P<language>\w*)\n(?P<code>.*?)```\n"
     r"|(?P<commands>(?:^    [^\n]*\n)+)",
@@ -81,7 +85,7 @@ def commands(block):
     return [shlex.split(text, comments=True) for text in texts]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_are_valid(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         if not target.startswith("https://"):
@@ -91,7 +95,7 @@ def test_links_between_pages_are_valid(page):
             assert path.exists() or packaged.exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_documented_commands_have_valid_options(page, parser):
     for block in blocks(page):
         for words in commands(block):
@@ -101,7 +105,7 @@ def test_documented_commands_have_valid_options(page, parser):
                 parse(parser, words)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_yaml_and_toml_can_be_read(page):
     assert all(yaml.safe_load(text) or text.startswith("#") for text in code(page, "yaml"))
     assert all(tomllib.loads(text) for text in code(page, "toml"))

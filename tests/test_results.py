@@ -1,4 +1,4 @@
-"""The tables of docs/training.md and docs/results.md are those that the stored studies print."""
+"""The tables of docs/results.md and results/ are those that the stored studies print."""
 
 import csv
 import json
@@ -22,8 +22,8 @@ COMMANDS = re.findall(
 )
 DOCS = [
     re.split(r"\s*\|\s*", line)
-    for page in ("training.md", "results.md")
-    for line in (ROOT / "docs" / page).read_text("utf-8").splitlines()
+    for page in ("results/tables.md", "results/studies.md")
+    for line in (ROOT / page).read_text("utf-8").splitlines()
 ]
 
 RUNS = (
@@ -89,14 +89,14 @@ def test_results_of_many_episodes_are_those_of_the_page(file):
 
 def test_the_page_of_results_has_the_tables_of_its_command():
     page = runpy.run_path(str(ROOT / "docs/results_page.py"))
-    text = page["PAGE"].read_text("utf-8")
-    assert page["write_tables"](page["tables"](), text) == text
+    for path, tables in page["tables"]().items():
+        assert page["write_tables"](tables, path) == path.read_text("utf-8")
 
 
 def test_the_docs_have_the_table_of_the_stored_conformance(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     assert run_here("python benchmarks/conformance.py --report", monkeypatch) == 0
-    text = (ROOT / "docs" / "measurements.md").read_text("utf-8")
+    text = (ROOT / "benchmarks" / "README.md").read_text("utf-8")
     assert capsys.readouterr().out.rstrip() in "\n".join(map(str.rstrip, text.splitlines()))
 
 
