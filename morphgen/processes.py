@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import os
+import pickle
 import signal
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from ctypes import c_byte
@@ -20,7 +21,7 @@ from typing import Any, TypeVar
 
 from morphgen.arguments import whole_number
 from morphgen.errors import MissingDependencyError, MorphgenError
-from morphgen.progress import report, show_progress
+from morphgen.progress import raise_if_interrupted, report, show_progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -28,16 +29,18 @@ R = TypeVar("R")
 CHUNK_SIZE = 8
 """Default number of items that a worker processes before it reports."""
 POLL_INTERVAL = 0.2
-"""Interval at which workers check whether the parent has stopped [s]."""
+"""Interval at which workers check whether the parent has stopped, and the parent whether a signal
+was received [s]."""
 STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
 """Signals that stop a command as Ctrl-C does: of a service manager, of a closed terminal."""
 RAY_TIMEOUT = 5.0
 """Longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes."""
 
-_work: Callable[[Any], object] | None = None
+_work: Callable[[Any], object]
 _stopped: c_byte | None = None
 """Flag that the parent has stopped, in memory that all its processes share."""
 _is_working = False
+_is_starting = False
 
 
 def parallel_map(
@@ -65,13 +68,13 @@ def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
 def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
     context = get_context("spawn")  # fork would copy the locks that threads of torch or tqdm hold
     stopped = context.RawValue("b", 0)
-    pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (work, stopped))
+    pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (pickle.dumps(work), stopped))
     waiting = iter(chunks)
     try:
         # A chunk waits for each worker.
         running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
         while running:
-            results: list[R] = running.popleft().result()
+            results: list[R] = _result(running.popleft())
             running.extend(_submit(pool, itertools.islice(waiting, 1)))
             yield from results
     except BrokenProcessPool as error:
@@ -89,31 +92,53 @@ def _submit(pool: ProcessPoolExecutor, chunks: Iterable[Sequence[Any]]) -> list[
         return [pool.submit(_process_chunk, chunk) for chunk in chunks]
 
 
+def _result(future: Future[R]) -> R:
+    """Wait for a result; a signal ends the wait, whichever thread received it."""
+    while True:
+        raise_if_interrupted()
+        with signals_deferred():
+            if wait((future,), POLL_INTERVAL).done:
+                return future.result()
+
+
+@contextmanager
+def signals_deferred() -> Iterator[None]:
+    """Handle the signals that stop a command at the end of this block instead of within it.
+
+    Their handlers raise ``KeyboardInterrupt``. Where that leaves a lock of a pool locked, as
+    between its acquisition and the ``try`` that follows, the pool's own thread waits for ever.
+    """
+    received: list[int] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():  # Python calls handlers in it only
+        handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, *STOP_SIGNALS)}
+    handlers = {each: handler for each, handler in handlers.items() if callable(handler)}
+    for each in handlers:
+        signal.signal(each, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+        for number in received:
+            signal.raise_signal(number)
+
+
 @contextmanager
 def sigint_blocked() -> Iterator[None]:
     """Block Ctrl-C (SIGINT) in this block, so that processes started in it never receive it.
 
-    They inherit the signal mask. This process handles a Ctrl-C at the end of the block. The mask
-    alone is not enough for that: another thread may receive the signal, and Python then runs the
+    They inherit the signal mask. This process handles a Ctrl-C at the end of the block, for which
+    the mask alone is not enough: another thread may receive the signal, and Python then runs the
     handler in this one.
     """
-    received: list[int] = []
-    is_main = threading.current_thread() is threading.main_thread()
-    handler = signal.getsignal(signal.SIGINT)
-    if is_main:
-        signal.signal(signal.SIGINT, lambda number, _: received.append(number))
-    try:
+    with signals_deferred():
         resource_tracker.ensure_running()  # starting it later would reset the mask
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             yield
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    finally:
-        if is_main:
-            signal.signal(signal.SIGINT, handler or signal.SIG_DFL)
-        if received:
-            signal.raise_signal(signal.SIGINT)
 
 
 def init_worker(stopped: c_byte) -> None:
@@ -143,11 +168,13 @@ def call_in_worker(work: Callable[..., R], *arguments: object) -> R:
     raise CancelledError
 
 
-def _init_map_worker(work: Callable[[Any], object], stopped: c_byte) -> None:
-    """Initialise a worker of ``parallel_map``."""
-    global _work
-    _work = work
+def _init_map_worker(work: bytes, stopped: c_byte) -> None:
+    """Initialise a worker of ``parallel_map``, which ends if it is stopped meanwhile."""
+    global _work, _is_starting
+    _is_starting = True
     init_worker(stopped)
+    _work = pickle.loads(work)  # imports what the work needs, which takes seconds
+    _is_starting = False
 
 
 def _interrupt(*_: object) -> None:
@@ -160,6 +187,8 @@ def _interrupt_when_stopped() -> None:
     """Interrupt the work once the parent has stopped; a fit may still take minutes by then."""
     while _stopped is not None and not _stopped.value:
         time.sleep(POLL_INTERVAL)
+    if _is_starting:  # an interrupted import would leave half of a package to what unpickles items
+        os._exit(1)
     main = threading.main_thread().ident
     if main is not None:
         signal.pthread_kill(main, signal.SIGTERM)  # which also interrupts a system call
@@ -174,8 +203,6 @@ def _end_with_parent() -> None:
 
 
 def _process_chunk(items: Sequence[Any]) -> list[Any]:
-    if _work is None:
-        raise RuntimeError("the worker was not initialised")
     with _working() as is_needed:
         return [_work(item) for item in items if is_needed()]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from threading import current_thread, main_thread
 from typing import Protocol, runtime_checkable
 
 
@@ -27,6 +28,18 @@ class StagedProgress(Progress, Protocol):
 
 
 _listener: ContextVar[Progress | None] = ContextVar("listener", default=None)
+
+interrupts: list[int] = []
+"""Signals that stopped the command which is running. Python loses the ``KeyboardInterrupt`` that
+Ctrl-C raises while it calls a ``__del__`` or the callback of a weak reference, as each import does,
+or imports an extension module; then the next progress raises it again."""
+
+
+def raise_if_interrupted() -> None:
+    """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed, once, in the thread that runs commands."""
+    if interrupts and current_thread() is main_thread():
+        interrupts.clear()
+        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -1,16 +1,17 @@
 """Results of parallel work equal those of serial work."""
 
 import os
+import signal
 import time
 from functools import partial
-from threading import Thread
+from threading import Condition, Thread, current_thread, main_thread
 
 import pytest
 
 from helpers.worker_functions import die, die_at_three, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.processes import CHUNK_SIZE, parallel_map
-from morphgen.progress import own_progress, part_of, report, show_progress
+from morphgen.progress import interrupts, own_progress, part_of, report, show_progress
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -45,6 +46,31 @@ def test_a_process_that_dies_while_results_are_used_is_reported():
 
     with pytest.raises(MorphgenError, match="a worker died"):
         list(map(slowly, parallel_map(die_at_three, range(40), 2, chunk=1)))
+
+
+def test_ctrl_c_between_a_lock_and_its_release_ends_the_pool(monkeypatch):
+    enter = Condition.__enter__
+
+    def interrupted(condition):
+        entered = enter(condition)
+        if current_thread() is main_thread():
+            signal.raise_signal(signal.SIGINT)
+        return entered
+
+    results = parallel_map(time.sleep, [0.0, 1.0, 1.0], 2, chunk=1)
+    next(results)
+    monkeypatch.setattr(Condition, "__enter__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        list(results)
+
+
+def test_ctrl_c_that_python_loses_ends_the_pool_before_the_next_result():
+    results = parallel_map(time.sleep, [0.0, 60.0, 60.0], 2, chunk=1)
+    next(results)
+    interrupts.append(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        next(results)
+    assert interrupts == []
 
 
 @pytest.mark.parametrize("jobs", [0, -1])

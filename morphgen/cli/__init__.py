@@ -101,8 +101,8 @@ def _stopping_cleanly(received: list[int]) -> Iterator[None]:
     The signals are appended to the list. Those that have another handler, or are ignored as by
     ``nohup``, stay as they are.
     """
-    from morphgen.cli.progress import interrupts
     from morphgen.processes import STOP_SIGNALS
+    from morphgen.progress import interrupts
 
     interrupts.clear()
     defaults = (signal.default_int_handler, signal.SIG_DFL)

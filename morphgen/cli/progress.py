@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 from tqdm import tqdm
 
-from morphgen.progress import Progress, show_progress
+from morphgen.progress import Progress, raise_if_interrupted, show_progress
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
@@ -31,18 +31,6 @@ GOAL_LINE_INTERVAL = 5.0
 """Time between two lines about goal sets that are made, where there is no terminal [s]."""
 TRAINING_LINES = 20
 """Number of lines about a training where there is no terminal."""
-
-
-interrupts: list[int] = []
-"""Signals of Ctrl-C since the command began. An extension module that is being imported may lose
-the error that Ctrl-C raises; then the next progress raises it again."""
-
-
-def raise_if_interrupted() -> None:
-    """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed, once."""
-    if interrupts:
-        interrupts.clear()
-        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import pytest
 from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import training_progress
-from morphgen.progress import report, stage
+from morphgen.progress import interrupts, report, stage
 from morphgen.rl.distributed import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
@@ -98,7 +98,7 @@ def test_a_ctrl_c_that_an_import_lost_ends_the_next_progress(capsys):
         yield lambda: progress.status(nothing, "reading").__enter__()
 
     for show in shown():
-        progress.interrupts.append(2)
+        interrupts.append(2)
         with pytest.raises(KeyboardInterrupt):
             show()
-        assert progress.interrupts == []
+        assert interrupts == []
