@@ -7,34 +7,31 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lxml import etree
 from msgspec import field
 
-from morphgen.errors import FormatError, shortened
+from morphgen.errors import FormatError
 from morphgen.formats.data_files import parse_yaml
 from morphgen.formats.records import Record, read_record
 from morphgen.model.findings import Finding
 
 _LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
 _ENCODING = re.compile(rb"""<\?xml[^>]{0,200}?encoding\s*=\s*["']([\w.:-]{1,40})["']""")
-_VERSION = re.compile(r"""\sversion\s*=\s*["']([^"'<>]{0,20})["']""")
-_NAME = r"""[^\W\d][^\s<>/="'&!?]*"""
-_START = re.compile(rf"<\s*({_NAME})")
-_END = re.compile(rf"</{_NAME}\s*>")
-_ATTRIBUTE = re.compile(rf"""(\s*)({_NAME})(\s*=\s*)("[^"]*"|'[^']*')""")
-_CLOSE = re.compile(r"\s*(/?)>")
-_MARKUP = re.compile(r"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<![^>]*>", re.DOTALL)
-_BARE = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[1-9][0-9]{0,5}|#x[1-9A-Fa-f][0-9A-Fa-f]{0,4});)")
-_SOUND_TAIL = re.compile(r"<!--(?:(?!--).)*-->|<\?.*?\?>", re.DOTALL)
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_INSTRUCTION = re.compile(r"<\?.*?\?>", re.DOTALL)
+_SOUND_DECLARATION = re.compile(r"""\A<\?xml\s[^>]*?version\s*=\s*["']1\.[0-9]+["']""")
+_ROOT = re.compile(r"<([^\W\d][^\s<>/]*)")
 _INVALID = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_PREFIX = re.compile(r"Namespace prefix (\S+) ")
 _UNDECLARED = "undeclared:"  # begin of the namespace of a prefix that the document does not declare
-_MAX_PREFIXES = 20  # largest number of prefixes in a document that is repaired
+_MAX_PREFIXES = 20  # largest number of such prefixes in a document that is repaired
+_MAX_ERRORS = 100  # number of errors after which libxml2 reports no more
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:
@@ -44,15 +41,8 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     without bound ("billion laughs") or include other files. Comments and processing instructions
     are dropped, so that the text around them is a single string.
     """
-    parser = etree.XMLParser(
-        resolve_entities=False,
-        no_network=True,
-        load_dtd=False,
-        remove_comments=True,
-        remove_pis=True,
-    )
     try:
-        root = etree.fromstring(data, parser)
+        root = etree.fromstring(data, _parser())
     except etree.XMLSyntaxError as error:
         line, column = error.position
         reason = " ".join(_LOCATION.sub("", error.msg or "not XML").split())
@@ -62,14 +52,24 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     return root
 
 
+def _parser(*, recover: bool = False) -> etree.XMLParser:
+    return etree.XMLParser(
+        recover=recover,
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        remove_comments=True,
+        remove_pis=True,
+    )
+
+
 def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[Finding, ...]]:
     """Parse a robot description as tolerantly as robot software does.
 
     A document that is not valid XML is repaired where tinyxml2, which Pinocchio, PyBullet and
     MuJoCo use, or libxml2's recovery, which yourdfpy uses, read it without a doubt: comments with
-    ``--``, a bare ``&``, ``<`` in an attribute, text before and after the root element, missing
-    spaces between attributes, an invalid declaration or encoding, unprintable characters, and
-    prefixes without a namespace. ``parse_xml`` then parses the repaired document. What has two
+    ``--``, a bare ``&``, ``<`` in an attribute, text before and after the root element, an invalid
+    declaration or encoding, unprintable characters, and prefixes without a namespace. What has two
     meanings is refused: elements that are not closed, attributes that are repeated or without a
     value, a ``<`` in a text. A DOCTYPE is always refused, and entities are never expanded.
 
@@ -78,219 +78,128 @@ def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[F
     """
     try:
         return parse_xml(data, origin), ()
-    except FormatError as error:
-        repair = _Repair(origin)
-        if not repair.run(repair.decode(data)):
+    except FormatError:
+        text, findings = _repaired(data, origin)
+        if "<!DOCTYPE" in text.upper():
+            raise _doctype_error(origin) from None
+        root, more = _recovered(text, origin)
+        if root is None:
             raise
-        return repair.result(str(error))
+        return root, (*findings, *more)
 
 
 def root_tag(data: bytes) -> str | None:
     """Return the tag of a document's root element, with its prefix; None if it has none."""
-    repair = _Repair("")
-    with suppress(FormatError):
-        repair.run(repair.decode(data), to_root=True)
-    return repair.root
+    match = _ROOT.search(_repaired(data, "")[0])
+    return match and match[1]
 
 
-class _Repair:
-    """Rewrites a document piece by piece; line numbers stay.
+def _decoded(data: bytes) -> tuple[str, str, str]:
+    """Return a document's text, its declared encoding, and the one that it was read in.
 
-    Attributes:
-        root: Tag of the root element, once it has begun.
+    That is the declared one, else UTF-8, else Latin-1.
     """
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return data.decode("utf-16", errors="replace"), "utf-16", "utf-16"
+    data = data.removeprefix(codecs.BOM_UTF8)
+    match = _ENCODING.match(data.lstrip())
+    declared = "utf-8" if match is None else match[1].decode()
+    for encoding in dict.fromkeys((declared, "utf-8", "latin1")):
+        with suppress(LookupError, UnicodeDecodeError):
+            etree.XMLParser(encoding=encoding)  # knows fewer, safe encodings
+            text = data.decode(encoding)
+            if match is None or text.lstrip().startswith("<?xml"):
+                break
+    return text, declared, encoding
 
-    def __init__(self, origin: str) -> None:
-        self.root: str | None = None
-        self._origin = origin
-        self._pieces: list[str] = []
-        self._line = 1
-        self._after_root_name = 0
-        self._declared: set[str] = set()
-        self._prefixes: dict[str, int] = {}
-        self._faults: dict[str, tuple[Finding, int]] = {}
 
-    def decode(self, data: bytes) -> str:
-        """Return the text of a document: in the declared encoding, else UTF-8, else Latin-1."""
-        if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-            return data.decode("utf-16", errors="replace")
-        data = data.removeprefix(codecs.BOM_UTF8)
-        match = _ENCODING.match(data.lstrip())
-        declared = "utf-8" if match is None else match[1].decode()
-        for encoding in dict.fromkeys((declared, "utf-8", "latin1")):
-            with suppress(LookupError, UnicodeDecodeError):
-                etree.XMLParser(encoding=encoding)  # knows fewer, safe encodings
-                text = data.decode(encoding)
-                if match is None or text.lstrip().startswith("<?xml"):
-                    break
-        if encoding != declared:
-            why, repair = f"its encoding is not {declared!r}", f"it was read as {encoding}"
-            self._note(why, "save it as UTF-8", repair)
-        return text
+def _blank(match: re.Match[str]) -> str:
+    """Return a text of as many lines."""
+    return "\n" * match[0].count("\n")
 
-    def run(self, text: str, *, to_root: bool = False) -> bool:
-        """Rewrite a text, or what comes up to its root; return whether it was understood."""
-        position = depth = 0
-        while position < len(text) and (depth or self.root is None):
-            if text[position] != "<":
-                end = text.find("<", position)
-                end = len(text) if end < 0 else end
-                self._text(text[position:end], is_inside=depth > 0)
-            elif markup := _MARKUP.match(text, position):
-                end = markup.end()
-                if not self._markup(markup[0]):
-                    return False
-            elif tag := _END.match(text, position):
-                end = tag.end()
-                self._put(tag[0], tag[0])
-                depth -= 1
-            else:
-                end = self._start(text, position)
-                if end == 0 or to_root:
-                    return end > 0
-                depth += text[end - 2] != "/"
-            position = end
-        return self.root is not None and self._end(text[position:])
 
-    def result(self, fault: str) -> tuple[etree._Element, tuple[Finding, ...]]:
-        """Parse what was rewritten; return its root, and a finding for each kind of repair."""
-        undeclared = [name for name in self._prefixes if name not in self._declared]
-        namespaces = "".join(f' xmlns:{name}="{_UNDECLARED}{name}"' for name in undeclared)
-        self._pieces.insert(self._after_root_name, namespaces)
-        root = parse_xml("".join(self._pieces).encode(), self._origin)
-        names = (name for element in root.iter("*") for name in (element.tag, *element.keys()))
-        used = {etree.QName(name).namespace for name in names}
-        for name in undeclared:
-            if f"{_UNDECLARED}{name}" in used:
-                self._line = self._prefixes[name]
-                self._note(
-                    f"the prefix {name!r} is used but not declared",
-                    f'declare it by xmlns:{name}="..."',
-                    f"elements and attributes with the undeclared prefix {name!r} were left out",
-                    "prefix-undeclared",
-                )
-        if not self._faults:
-            why = fault.removeprefix(f"{self._origin}:")
-            self._note(f"it is not valid XML: {why}", "correct it", "it was read as tinyxml2 does")
-        findings = (
-            replace(first, why=f"{first.why} ({count} times)" if count > 1 else first.why)
-            for first, count in self._faults.values()
-        )
-        return root, tuple(findings)
+def _is_invalid_comment(comment: re.Match[str]) -> bool:
+    return "--" in comment[0][4:-2] or _INVALID.search(comment[0]) is not None
 
-    def _note(self, why: str, fix: str, repair: str, code: str = "xml-repaired") -> None:
-        """Add a finding; those with the same repair are counted."""
-        where = f"{self._origin}:{self._line} document"
-        first, count = self._faults.get(repair, (None, 0))
-        self._faults[repair] = first or Finding(code, "warning", where, why, fix, repair), count + 1
 
-    def _put(self, original: str, repaired: str) -> None:
-        self._pieces.append(repaired)
-        self._line += original.count("\n")
+def _is_invalid_declaration(instruction: re.Match[str]) -> bool:
+    is_sound = instruction.start() == 0 and _SOUND_DECLARATION.match(instruction[0])
+    return instruction[0][:5].lower() == "<?xml" and not is_sound
 
-    def _blank(self, original: str) -> None:
-        self._put(original, "\n" * original.count("\n"))
 
-    def _text(self, text: str, *, is_inside: bool) -> None:
-        if is_inside:
-            self._put(text, self._escaped(text).replace("]]>", "]]&gt;"))
-            return
-        if text.strip():
-            why = f"{_excerpt(text)} stands before the root element"
-            self._note(why, "remove it", "text before the root element was left out")
-        self._blank(text)
+_BARE = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[1-9][0-9]{0,5}|#x[1-9A-Fa-f][0-9A-Fa-f]{0,4});)")
+_REPLACEMENTS: dict[re.Pattern[str], tuple[Any, Callable[[re.Match[str]], bool], str, str]] = {
+    _COMMENT: (_blank, _is_invalid_comment, "comments with '--' or bad characters", "left out"),
+    _INSTRUCTION: (_blank, _is_invalid_declaration, "a declaration not of XML 1", "left out"),
+    re.compile(r"\A\s*[^<\s][^<]*"): (_blank, bool, "text before the root element", "left out"),
+    _BARE: ("&amp;", bool, "a bare '&'", "kept"),
+    _INVALID: ("\ufffd", bool, "a character that XML does not allow", "read as U+FFFD"),
+}
+"""Patterns that are replaced, in this order: by what, which matches are faults, the fault and its
+repair."""
+_RECOVERED = {
+    "ERR_DOCUMENT_END": ("text after the root element", "left out"),
+    "ERR_LT_IN_ATTRIBUTE": ("'<' in an attribute", "kept"),
+    "ERR_MISPLACED_CDATA_END": ("']]>' in a text", "kept"),
+}
+"""Errors that libxml2 recovers from as other robot software does: the fault and its repair."""
 
-    def _escaped(self, text: str) -> str:
-        """Return a text or attribute with ``&`` as an entity and printable characters only."""
-        if _BARE.search(text):
-            self._note(f"a bare '&' in {_excerpt(text)}", "write &amp;", "a bare '&' was kept")
-        if _INVALID.search(text):
-            why = f"a character that XML does not allow in {_excerpt(text)}"
-            self._note(why, "remove it", "a character that XML does not allow was read as U+FFFD")
-        return _INVALID.sub("\ufffd", _BARE.sub("&amp;", text))
 
-    def _markup(self, markup: str) -> bool:
-        """Rewrite a comment, instruction, declaration or CDATA; return whether it is allowed."""
-        if markup.startswith("<![CDATA["):
-            self._put(markup, markup)
-            return markup.endswith("]]>")
-        if markup[:9].upper() == "<!DOCTYPE":
-            raise _doctype_error(self._origin)
-        if markup.startswith("<!--"):
-            if not markup.endswith("-->"):
-                return False
-            if "--" in markup[4:-3] or markup.endswith("--->") or _INVALID.search(markup):
-                why = f"the comment {_excerpt(markup)} holds '--' or a character that XML forbids"
-                self._note(why, "write single hyphens", "invalid comments were left out")
-        elif markup[:5].lower() == "<?xml":
-            self._declaration(markup)
-        elif markup.startswith("<!"):
-            why = f"{_excerpt(markup)} is not XML"
-            self._note(why, "remove it", f"{_excerpt(markup)} was left out")
-        self._blank(markup)
-        return True
+def _repaired(data: bytes, origin: str) -> tuple[str, list[Finding]]:
+    """Return a document without comments and instructions, and what was repaired by patterns."""
+    text, declared, encoding = _decoded(data)
+    findings = []
+    if encoding != declared:
+        what = f"an encoding other than {declared!r}"
+        findings.append(_finding(f"{origin}:1", 1, what, f"read as {encoding}"))
+    for pattern, (new, is_fault, what, repair) in _REPLACEMENTS.items():
+        faults = [match.start() for match in pattern.finditer(text) if is_fault(match)]
+        if faults:
+            line = text.count("\n", 0, faults[0]) + 1
+            code = "xml-declaration" if pattern is _INSTRUCTION else "xml-repaired"
+            findings.append(_finding(f"{origin}:{line}", len(faults), what, repair, code))
+        text = pattern.sub(new, text)
+    return text, findings
 
-    def _declaration(self, markup: str) -> None:
-        version = _VERSION.search(markup)
-        number = "" if version is None else version[1]
-        if not re.fullmatch(r"1\.[0-9]+", number):
-            why, repair = f"it declares XML version {number!r}", "its XML version was read as 1.0"
-            self._note(why, 'write version="1.0"', repair, "xml-declaration")
-        if self._pieces:
-            why = "there is white space or another text before the XML declaration"
-            repair = "white space before the XML declaration was left out"
-            self._note(why, "begin the file with <?xml", repair, "xml-declaration")
 
-    def _start(self, text: str, begin: int) -> int:
-        """Rewrite a start tag; return its end, or 0 if it is malformed."""
-        tag = _START.match(text, begin)
-        if tag is None:
-            return 0
-        names, words, end = [tag[1]], [], tag.end()
-        while attribute := _ATTRIBUTE.match(text, end):
-            blank, name, equals, value = attribute.groups()
-            end = attribute.end()
-            if name.startswith("xmlns:") and not value[1:-1].strip():
-                continue  # a namespace without a name declares nothing
-            names.append(name)
-            if not blank or "<" in value:
-                why = f"'<' or no space before {_excerpt(name + equals + value)}"
-                fix = "write &lt;, and a space before each attribute"
-                self._note(why, fix, "attributes with '<' or without a space were read")
-            words.append(f"{blank or ' '}{name}{equals}{self._escaped(value).replace('<', '&lt;')}")
-        close = _CLOSE.match(text, end)
-        if close is None:
-            return 0
-        self._pieces.append(f"<{tag[1]}")
-        for name in names:
-            prefix, colon, local = name.partition(":")
-            if prefix == "xmlns" and self.root is None:
-                self._declared.add(local)
-            elif colon and prefix not in ("xml", "xmlns"):
-                self._prefixes.setdefault(prefix, self._line)
-        if self.root is None:
-            self.root, self._after_root_name = tag[1], len(self._pieces)
-        self._put(text[begin : close.end()], "".join(words) + close[0])
-        return close.end()
+def _recovered(text: str, origin: str) -> tuple[etree._Element | None, list[Finding]]:
+    """Parse a document as libxml2 recovers it; None if that may not be what its author meant."""
+    prefixes: dict[str, int] = {}  # undeclared ones, with the line of their first use
+    missing = {"": 0}
+    while missing and len(prefixes) <= _MAX_PREFIXES:
+        spaces = "".join(f' xmlns:{name}="{_UNDECLARED}{name}"' for name in prefixes)
+        parser = _parser(recover=True)
+        declared = _ROOT.sub(lambda match: match[0] + spaces, text, count=1)  # noqa: B023
+        root: etree._Element | None = etree.fromstring(declared.encode() or b" ", parser)
+        errors = [*parser.error_log]
+        missing = {}
+        for error in errors:
+            if match := _PREFIX.match(error.message):
+                missing.setdefault(match[1], error.line)
+        prefixes |= missing
+    lines: dict[str, list[int]] = {}
+    for error in errors:
+        lines.setdefault(error.type_name, []).append(error.line)
+    if root is None or not _RECOVERED.keys() >= lines.keys() or len(errors) >= _MAX_ERRORS:
+        return None, []
+    findings = [
+        _finding(f"{origin}:{first}", len(others) + 1, *_RECOVERED[kind])
+        for kind, (first, *others) in lines.items()
+    ]
+    for name, line in prefixes.items():
+        what = f"elements and attributes with the undeclared prefix {name!r}"
+        findings.append(_finding(f"{origin}:{line}", 1, what, "left out", "prefix-undeclared"))
+    return root, findings
 
-    def _end(self, rest: str) -> bool:
-        """Leave out what follows the root element; return whether it may be left out."""
-        surplus = _SOUND_TAIL.sub("", rest).strip()
-        if surplus:
-            self._line += rest[: rest.find(surplus[0])].count("\n")
-            why = f"{_excerpt(surplus)} follows the root element"
-            self._note(why, "remove it", "text after the root element was left out")
-        if "<!DOCTYPE" in surplus.upper():
-            raise _doctype_error(self._origin)
-        return len(self._prefixes) <= _MAX_PREFIXES
+
+def _finding(where: str, count: int, what: str, repair: str, code: str = "xml-repaired") -> Finding:
+    times = f" ({count} times)" if count > 1 else ""
+    why = f"it is not valid XML: {what}{times}"
+    return Finding(code, "warning", f"{where} document", why, "correct it", f"{what}: {repair}")
 
 
 def _doctype_error(origin: str) -> FormatError:
     return FormatError(f"{origin}: has a DOCTYPE; a robot description needs none, remove it")
-
-
-def _excerpt(text: str) -> str:
-    return repr(shortened(" ".join(text.split())))
 
 
 class Attribute(NamedTuple):

@@ -63,7 +63,7 @@ def test_the_declared_encoding_is_respected():
     [
         (b'<?xml version="0.0"?>', ["xml-declaration"]),
         (b'\n\r\n <?xml version="1.0"?>', ["xml-declaration"]),
-        (b'\xef\xbb\xbf\n<?xml version="0.0" encoding="utf-8" ?>', ["xml-declaration"] * 2),
+        (b'\xef\xbb\xbf\n<?xml version="0.0" encoding="utf-8" ?>', ["xml-declaration"]),
         (b'\xef\xbb\xbf<?xml version="1.0"?>', []),
         (b'<?xml version="1.1"?>', []),
         (b"\n", []),
@@ -87,7 +87,7 @@ def test_undeclared_prefixes_are_repaired():
 
 
 def test_other_errors_are_found_despite_undeclared_prefixes():
-    with pytest.raises(FormatError, match="tag mismatch"):
+    with pytest.raises(FormatError, match=r"^r.urdf:1:\d+: "):
         parse_description(b"<robot><drake:a></robot>", "r.urdf")
     with pytest.raises(FormatError, match="DOCTYPE"):
         parse_description(
@@ -104,10 +104,10 @@ def described(body=b"", name=b"r", before=b"", after=b""):
 @pytest.mark.parametrize(
     ("data", "name", "repair"),
     [
-        (described(b"<!-- a -- b -->"), "r", "invalid comments"),
-        (described(b"<!-- a --->"), "r", "invalid comments"),
-        (described(before=b"<!-- a -- b -->"), "r", "invalid comments"),
-        (described(b"<!-- \x01 -->"), "r", "invalid comments"),
+        (described(b"<!-- a -- b -->"), "r", "comments with '--'"),
+        (described(b"<!-- a --->"), "r", "comments with '--'"),
+        (described(before=b"<!-- a -- b -->"), "r", "comments with '--'"),
+        (described(b"<!-- \x01 -->"), "r", "comments with '--'"),
         (described(name=b"Arm & Hand"), "Arm & Hand", "bare '&'"),
         (described(b" a & b "), "r", "bare '&'"),
         (described(name=b"a&nbsp;b"), "a&nbsp;b", "bare '&'"),
@@ -115,16 +115,12 @@ def described(body=b"", name=b"r", before=b"", after=b""):
         (described(after=b"\nthe end"), "r", "text after"),
         (described(after=b"</robot>"), "r", "text after"),
         (described(after=b'<robot name="second"><link name="m"/></robot>'), "r", "text after"),
-        (described(after=b"<!-- a -- b -->"), "r", "text after"),
-        (described(after=b"\x00\x00"), "r", "text after"),
-        (described(after=b"<!-- not closed"), "r", "text after"),
+        (described(after=b"<!-- a -- b -->"), "r", "comments with '--'"),
         (described(before=b"junk"), "r", "text before"),
         (described(before=b"\xef\xbb\xbf\xef\xbb\xbf"), "r", "text before"),
-        (described(name=b"a<b>"), "a<b>", "attributes with '<'"),
-        (described(b'<a b="1"c="2"/>'), "r", "attributes with '<'"),
+        (described(name=b"a<b>"), "a<b>", "'<' in an attribute"),
         (described(name=b"a\x01b"), "a\ufffdb", "U+FFFD"),
-        (described(b" ]]> "), "r", "as tinyxml2 does"),
-        (described(b"< a/>"), "r", "as tinyxml2 does"),
+        (described(b" ]]> "), "r", "']]>' in a text"),
         (described(name=b"t\xefp"), "t\xefp", "read as latin1"),
         (described(b"<!-- t\xefp -->"), "r", "read as latin1"),
         (described(before=b'<?xml version="1.0" encoding="foo-8"?>'), "r", "read as utf-8"),
@@ -134,9 +130,8 @@ def described(body=b"", name=b"r", before=b"", after=b""):
             "t\xefp",
             "read as utf-8",
         ),
-        (described(before=b'<?xml encoding="utf-8"?>'), "r", "version was read as 1.0"),
-        (described(b'<?xml version="1.0"?>'), "r", "XML declaration"),
-        (described(b"<!foo>"), "r", "'<!foo>' was left out"),
+        (described(before=b'<?xml encoding="utf-8"?>'), "r", "declaration"),
+        (described(b'<?xml version="1.0"?>'), "r", "declaration"),
     ],
 )
 def test_what_loaders_read_although_it_is_not_xml_is_read_with_a_warning(data, name, repair):
@@ -169,6 +164,10 @@ def test_repairs_of_a_kind_are_one_finding_with_a_count():
     "data",
     [
         described(b'<link name="a" name="b"/>'),
+        described(b'<a b="1"c="2"/>'),
+        described(b'<a b="<"/>' * 100),
+        described(b"< a/>"),
+        described(b"<!foo>"),
         described(b"<link name/>"),
         described(b"<link name=a/>"),
         described(b"a < b"),
@@ -190,5 +189,5 @@ def test_what_has_two_meanings_stays_an_error(data):
 def test_a_doctype_is_an_error_beside_other_faults(fault, doctype, place):
     pieces = {"before": b"", "body": b"", "after": b"", place: doctype}
     body = pieces.pop("body") + fault
-    with pytest.raises(FormatError):
+    with pytest.raises(FormatError, match="DOCTYPE"):
         parse_description(described(body, **pieces), "robot.urdf")
