@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,69 +40,31 @@ MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]
 
 
 def read_srdf(path: Path) -> etree._Element:
-    """Return the root of an SRDF file, whose elements are known and complete."""
+    """Return the root of an SRDF file, whose pairs of links are complete."""
     return parse_srdf(read_bytes(path, MAX_SRDF_BYTES), str(path))
 
 
 def parse_srdf(data: bytes, origin: str) -> etree._Element:
     """Return the root of SRDF text; see ``read_srdf``."""
-    root = parse_xml(data, origin)
+    root, schema = parse_xml(data, origin), read_schema("srdf")
     if root.tag != "robot":
         raise FormatError(f"{origin}: root element <{shortened(str(root.tag))}>; expected <robot>")
-    _require_valid(root, "", origin)
-    groups = Counter(group.get("name", "") for group in root.iterfind("group"))
-    for name, count in groups.items():
-        if count > 1:
-            raise FormatError(f"{origin}: two groups are named {shortened(name)!r}")
-    named = [(owner, sub.get("name", "")) for owner in root for sub in owner.iterfind("group")]
-    named += [(owner, owner.get(key, "")) for owner in root for key in ("group", "parent_group")]
-    for owner, group in named:
-        if group and group not in groups:
-            name = shortened(f"{owner.tag} {owner.get('name', '')!r}")
-            hint = nearest(group, groups)
+    for element in root:
+        tag, attributes = str(element.tag), element.attrib
+        where = f"{origin}:{element.sourceline}: <{shortened(tag)}>"
+        if tag not in schema.children["robot"]:
             raise FormatError(
-                f"{origin}: {name} names the unknown group {shortened(group)!r}{hint}"
+                f"{where} is unknown in <robot>{nearest(tag, schema.children['robot'])}"
             )
+        rules = {attribute.name: attribute.required for attribute in schema.attributes.get(tag, ())}
+        for name in (name for name, is_required in rules.items() if is_required):
+            if not attributes.get(name):
+                raise FormatError(f"{where}: missing attribute {name!r}")
+        for name in map(str, attributes) if rules else ():
+            if name not in rules:
+                hint = nearest(name, rules)
+                raise FormatError(f"{where}: unknown attribute {shortened(name)!r}{hint}")
     return root
-
-
-def _require_valid(element: etree._Element, path: str, origin: str) -> None:
-    """Require that an element and those in it are as the schema says."""
-    schema, where = read_schema("srdf"), _place(element, origin)
-    for child in element:
-        if child.tag not in schema.children[path]:
-            hint = nearest(str(child.tag), schema.children[path])
-            parent = shortened(str(element.tag))
-            raise FormatError(f"{_place(child, origin)} is unknown in <{parent}>{hint}")
-        _require_valid(child, f"{path}/{child.tag}".removeprefix("/"), origin)
-    attributes = schema.attributes[path]
-    for attribute in attributes:
-        if attribute.required and not element.get(attribute.name):
-            raise FormatError(f"{where}: missing attribute {attribute.name!r}")
-    valid = [attribute.name for attribute in attributes]
-    for name in map(str, element.attrib):
-        if name not in valid:
-            hint = nearest(name, valid)
-            raise FormatError(f"{where}: unknown attribute {shortened(name)!r}{hint}")
-    for name, counts, _, _ in attributes:
-        if counts:
-            _require_numbers(name, element.get(name, ""), counts[0], where)
-
-
-def _require_numbers(name: str, text: str, count: int, where: str) -> None:
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        values = [math.nan]
-    if not values or len(values) != (count or len(values)) or not all(map(math.isfinite, values)):
-        wanted = {0: "finite numbers", 1: "a finite number"}.get(count, f"{count} finite numbers")
-        raise FormatError(f"{where}: {name} {shortened(text)!r}; expected {wanted}")
-    if name == "radius" and values[0] < 0:
-        raise FormatError(f"{where}: radius {values[0]:g}; expected 0 or more")
-
-
-def _place(element: etree._Element, origin: str) -> str:
-    return f"{origin}:{element.sourceline}: <{shortened(str(element.tag))}>"
 
 
 def disabled_link_pairs(root: etree._Element, links: Iterable[str]) -> tuple[Pair, ...]:

@@ -206,7 +206,7 @@ class Attribute(NamedTuple):
     """An attribute of an element."""
 
     name: str
-    counts: tuple[int, ...]  # valid counts of numbers, 0 for any but none; empty for a text
+    counts: tuple[int, ...]  # valid counts of numbers; empty for a text
     required: bool
     positive: bool  # whether its numbers are lengths
 
