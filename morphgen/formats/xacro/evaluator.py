@@ -23,8 +23,6 @@ _MAX_REASON = 400  # longest reason in an error [characters]; expressions can be
 MAX_BITS = 1024  # largest whole number of an expression [bits]: what a float can hold
 MAX_SIZE = 200_000
 """Largest text, list or dictionary of an expression [characters and entries, nested ones too]."""
-MAX_FACTORIAL = 170  # largest argument of factorial; the factorial of 171 is beyond a float
-MAX_CHOOSE = 1000  # largest argument of comb and perm
 MAX_DIGITS = 1000  # largest width, precision or rounding place [digits]
 
 _CONVERSION = re.compile(r"%[-+ #0]*(\(|\*|\d*)(?:\.(\*|\d*))?")
@@ -43,9 +41,6 @@ class Function:
 
     name: str
     call: Callable[..., object]
-    applies: bool = False
-    """Whether its first argument is a function, as of ``map``; ``call`` then takes, before it, a
-    caller that calls that function within the limits."""
 
     def __str__(self) -> str:
         """Return its name, for messages."""
@@ -106,11 +101,6 @@ def _power(left: Value, right: Value) -> object:
     return result
 
 
-def _shift(left: Value, right: Value) -> object:
-    _require(right, MAX_BITS, "a shift")
-    return left << right
-
-
 def _modulo(left: Value, right: Value) -> object:
     if not isinstance(left, str):
         return left % right
@@ -136,11 +126,6 @@ OPERATORS: Mapping[type, Callable[[Value, Value], object]] = {
     ast.FloorDiv: operator.floordiv,
     ast.Mod: _modulo,
     ast.Pow: _power,
-    ast.LShift: _shift,
-    ast.RShift: operator.rshift,
-    ast.BitAnd: operator.and_,
-    ast.BitOr: operator.or_,
-    ast.BitXor: operator.xor,
 }
 """Binary operators by the type of their node."""
 
@@ -164,23 +149,6 @@ def _sum(numbers: Iterable[Value], start: Value = 0) -> object:
             raise TypeError("sum() adds numbers only")
         total = checked(total + number)
     return total
-
-
-def _prod(numbers: Iterable[Value], *, start: Value = 1) -> object:
-    product = start
-    for number in numbers:
-        product = checked(_multiply(product, number))
-    return product
-
-
-def _limited(function: Callable[..., int], limit: int) -> Function:
-    """Return a function of ``math`` whose first argument is bounded."""
-
-    def call(n: int, *rest: int) -> int:
-        _require(n, limit, f"an argument of {function.__name__}()")
-        return function(n, *rest)
-
-    return Function(function.__name__, call)
 
 
 def _replace(text: str, old: str, new: str, count: int = -1) -> str:
@@ -207,16 +175,6 @@ def _as_list(call: Callable[..., Iterable[object]]) -> Callable[..., list[object
     return lambda *operands, **named: list(call(*operands, **named))
 
 
-def _map(caller: Callable[..., object], function: object, *items: Iterable[object]) -> list[object]:
-    return [caller(function, *operands) for operands in zip(*items, strict=False)]
-
-
-def _filter(
-    caller: Callable[..., object], function: object, items: Iterable[object]
-) -> list[object]:
-    return [item for item in items if (item if function is None else caller(function, item))]
-
-
 _REAL = (  # noqa: SIM905
     "acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh degrees dist erf erfc exp "
     "exp2 expm1 fabs floor fmod frexp fsum gamma gcd hypot isclose isfinite isinf isnan isqrt lcm "
@@ -231,10 +189,6 @@ MATH: Mapping[str, object] = {
     "inf": math.inf,
     "nan": math.nan,
     **{name: Function(name, getattr(math, name)) for name in _REAL if hasattr(math, name)},
-    "factorial": _limited(math.factorial, MAX_FACTORIAL),
-    "comb": _limited(math.comb, MAX_CHOOSE),
-    "perm": _limited(math.perm, MAX_CHOOSE),
-    "prod": Function("prod", _prod),
 }
 """Names of ``math`` that expressions may use."""
 
@@ -262,11 +216,7 @@ _CALLS: Mapping[str, Callable[..., object]] = {
     "zip": _as_list(zip),
 }
 
-BUILTINS: Mapping[str, Function] = {
-    **{name: Function(name, call) for name, call in _CALLS.items()},
-    "map": Function("map", _map, applies=True),
-    "filter": Function("filter", _filter, applies=True),
-}
+BUILTINS: Mapping[str, Function] = {name: Function(name, call) for name, call in _CALLS.items()}
 """Python's own functions that expressions may call."""
 
 METHODS: Mapping[type, Mapping[str, Callable[..., object]]] = {
@@ -316,11 +266,10 @@ _SIGNS: Mapping[type, Callable[[Value], Value]] = {
     ast.Not: operator.not_,
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
-    ast.Invert: operator.invert,
 }
 _ALLOWED = (
     *(ast.Constant, ast.Name, ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.IfExp, ast.Compare, ast.Call),
-    *(ast.Subscript, ast.Slice, ast.Attribute, ast.keyword, ast.Starred, ast.List, ast.Tuple),
+    *(ast.Subscript, ast.Slice, ast.Attribute, ast.keyword, ast.List, ast.Tuple),
     *(ast.Dict, ast.ListComp, ast.GeneratorExp, ast.comprehension, ast.expr_context, ast.boolop),
     *(*OPERATORS, *_COMPARISONS, *_SIGNS),
 )
@@ -385,11 +334,14 @@ class _Evaluation:
             case ast.Slice(low, high, step):
                 return slice(*(end and self.value(end) for end in (low, high, step)))
             case ast.List(items):
-                return self._result(list(map(_data, self._items(items))))
+                return self._result([_data(self.value(item)) for item in items])
             case ast.Tuple(items):
-                return self._result(tuple(map(_data, self._items(items))))
-            case ast.Dict():
-                return self._dict(node)
+                return self._result(tuple(_data(self.value(item)) for item in items))
+            case ast.Dict(keys, values):
+                pairs = zip(keys, values, strict=True)
+                return self._result(
+                    {self.value(key): _data(self.value(v)) for key, v in pairs if key}
+                )
             case ast.ListComp() | ast.GeneratorExp():
                 return self._comprehension(node)
         raise _refused(node, self._text)
@@ -452,45 +404,12 @@ class _Evaluation:
             function = self.value(node.func)
         if not isinstance(function, Function):
             raise _refused(node, self._text)
-        operands += self._items(node.args)
-        named: dict[str, Value] = {}
-        for keyword in node.keywords:
-            value = self.value(keyword.value)
-            named |= self._charged(value) if keyword.arg is None else {keyword.arg: value}
-        return self._apply(function, operands, named)
-
-    def _apply(self, function: Function, operands: list[Value], named: dict[str, Value]) -> object:
-        """Call a function; its operands and its result count as work."""
+        operands += map(self.value, node.args)
+        named = {str(keyword.arg): self.value(keyword.value) for keyword in node.keywords}
         self._spend(1)
         for operand in (*operands, *named.values()):
-            if not (function.applies and isinstance(operand, Function)):
-                self._charged(operand)
-        if not function.applies:
-            return self._result(function.call(*operands, **named))
-
-        def apply(inner: object, *items: object) -> object:
-            if not isinstance(inner, Function) or inner.applies:
-                raise TypeError(f"{function} applies one of the listed functions")
-            return self._apply(inner, list(items), {})
-
-        return self._result(function.call(apply, *operands, **named))
-
-    def _dict(self, node: ast.Dict) -> object:
-        result: dict[object, object] = {}
-        for key, item in zip(node.keys, node.values, strict=True):
-            if key is None:
-                result.update(self._charged(self.value(item)))
-            else:
-                result[self.value(key)] = _data(self.value(item))
-        return self._result(result)
-
-    def _items(self, nodes: list[ast.expr]) -> Iterator[Value]:
-        """Yield the values of elements or arguments, some of them starred."""
-        for node in nodes:
-            if isinstance(node, ast.Starred):
-                yield from self._charged(self.value(node.value))
-            else:
-                yield self.value(node)
+            self._charged(operand)
+        return self._result(function.call(*operands, **named))
 
     def _comprehension(self, node: ast.ListComp | ast.GeneratorExp) -> object:
         outer, self._inner = self._inner, dict(self._inner)
@@ -591,6 +510,10 @@ def _require_allowed(node: ast.AST, text: str) -> None:
         is_allowed = type(node.value) in _SCALARS
     elif isinstance(node, ast.Attribute):
         is_allowed = not node.attr.startswith("__")
+    elif isinstance(node, ast.keyword):
+        is_allowed = node.arg is not None
+    elif isinstance(node, ast.Dict):
+        is_allowed = None not in node.keys
     elif isinstance(node, ast.comprehension):
         are_names = all(isinstance(name, ast.Name) for name in _targets(node.target))
         is_allowed = are_names and not node.is_async
