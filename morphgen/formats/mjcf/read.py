@@ -57,7 +57,13 @@ _REFUSED_JOINTS = {
     ),
 }
 _FLOOR_GEOMS = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)  # a floor where the world has them
-_WRAPPED_GEOMS = (_WRAP.mjWRAP_SPHERE, _WRAP.mjWRAP_CYLINDER)
+_WRAPPED = {
+    _WRAP.mjWRAP_JOINT: _OBJ.mjOBJ_JOINT,
+    _WRAP.mjWRAP_SITE: _OBJ.mjOBJ_SITE,
+    _WRAP.mjWRAP_SPHERE: _OBJ.mjOBJ_GEOM,
+    _WRAP.mjWRAP_CYLINDER: _OBJ.mjOBJ_GEOM,
+}
+_CONSTRAINED = {_EQ.mjEQ_JOINT: _OBJ.mjOBJ_JOINT, _EQ.mjEQ_TENDON: _OBJ.mjOBJ_TENDON}
 _JOINT_TRANSMISSIONS = (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT)
 _LAST_DRAWN_GROUP = 2  # last geom group that MuJoCo's viewers show
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # colour of a geom that names none
@@ -534,60 +540,55 @@ class _Couplings:
         self._joints, self._bodies = set(joints), set(bodies)
         resolved_tendons = set()
         for k in range(model.neq):
-            if model.eq_active0[k] and self._touches(k):
+            if model.eq_active0[k] and any(map(self._is_on_robot, self._ends(k))):
                 self._add(k)
                 if model.eq_type[k] == _EQ.mjEQ_TENDON:
                     resolved_tendons.add(int(model.eq_obj1id[k]))
         self._lock_followers()
         for tendon in range(model.ntendon):
-            if tendon not in resolved_tendons and self._tendon_touches(tendon):
+            if tendon not in resolved_tendons and self._is_on_robot((_OBJ.mjOBJ_TENDON, tendon)):
                 self._require_actuation_only(tendon)
 
-    def _touches(self, equality: int) -> bool:
-        """Return whether a constraint acts on a joint or body of the robot."""
-        ends = self._ends(equality)
-        match _EQ(self._model.eq_type[equality]):
-            case _EQ.mjEQ_JOINT:
-                return any(end in self._joints for end in ends)
-            case _EQ.mjEQ_TENDON:
-                return any(map(self._tendon_touches, ends))
-        return any(body in self._bodies for body in self._connected_bodies(equality))
-
-    def _ends(self, equality: int) -> list[int]:
-        """Return the indices of the one or two objects at the ends of a constraint."""
+    def _ends(self, equality: int) -> list[tuple[int, int]]:
+        """Return the type and the index of the one or two objects at the ends of a constraint."""
         model = self._model
-        return [int(k) for k in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if k >= 0]
+        kind = _CONSTRAINED.get(_EQ(model.eq_type[equality]), model.eq_objtype[equality])
+        ends = (model.eq_obj1id[equality], model.eq_obj2id[equality])
+        return [(kind, int(k)) for k in ends if k >= 0]
 
-    def _connected_bodies(self, equality: int) -> list[int]:
-        """Return the bodies at the ends of a constraint other than of joints and tendons."""
-        model, ends = self._model, self._ends(equality)
-        if model.eq_objtype[equality] == _OBJ.mjOBJ_SITE:
-            return [int(model.site_bodyid[end]) for end in ends]
-        if model.eq_objtype[equality] == _OBJ.mjOBJ_GEOM:
-            return [int(model.geom_bodyid[end]) for end in ends]
-        return ends
-
-    def _name(self, equality: int) -> str:
-        """Return the name of a constraint, or else what it connects."""
+    def _bodies_of(self, kind: int, k: int) -> set[int]:
+        """Return the bodies that an object of MuJoCo is of; none for joints of other robots."""
         model = self._model
-        object_type = {_EQ.mjEQ_JOINT: _OBJ.mjOBJ_JOINT, _EQ.mjEQ_TENDON: _OBJ.mjOBJ_TENDON}.get(
-            _EQ(model.eq_type[equality]), model.eq_objtype[equality]
-        )
-        ends = (
-            mujoco.mj_id2name(model, int(object_type), end) or "" for end in self._ends(equality)
-        )
-        return model.equality(equality).name or " - ".join(ends)
+        match _OBJ(kind):
+            case _OBJ.mjOBJ_JOINT:
+                return {int(model.jnt_bodyid[k])} if k in self._joints else set()
+            case _OBJ.mjOBJ_SITE:
+                return {int(model.site_bodyid[k])}
+            case _OBJ.mjOBJ_GEOM:
+                return {int(model.geom_bodyid[k])}
+            case _OBJ.mjOBJ_TENDON:
+                wraps = [(_WRAPPED.get(_WRAP(model.wrap_type[w])), w) for w in self._wraps(k)]
+                items = [(kind, int(model.wrap_objid[w])) for kind, w in wraps if kind is not None]
+                return {body for item in items for body in self._bodies_of(*item)}
+        return {k}
+
+    def _is_on_robot(self, item: tuple[int, int]) -> bool:
+        return not self._bodies.isdisjoint(self._bodies_of(*item))
 
     def _add(self, k: int) -> None:
         """Add a constraint to the mimics or locks, or a finding about it."""
-        kind, name = _EQ(self._model.eq_type[k]), self._name(k)
+        model, ends = self._model, self._ends(k)
+        kind = _EQ(model.eq_type[k])
+        names = (mujoco.mj_id2name(model, int(object_type), end) or "" for object_type, end in ends)
+        name = model.equality(k).name or " - ".join(names)
         if kind == _EQ.mjEQ_JOINT:
             self._add_joint_equality(k, name)
         elif kind == _EQ.mjEQ_TENDON and self._add_tendon_equality(k, name):
             return
         elif kind in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD) and any(
-            body not in self._bodies and self._model.body_mocapid[body] >= 0
-            for body in self._connected_bodies(k)
+            body not in self._bodies and model.body_mocapid[body] >= 0
+            for end in ends
+            for body in self._bodies_of(*end)
         ):
             where = f"{self._document.path.name}: equality {name!r}"
             why = "it connects the robot to a mocap body, which is not of the robot"
@@ -692,18 +693,6 @@ class _Couplings:
         if any(model.wrap_type[w] != _WRAP.mjWRAP_JOINT for w in wraps):
             return None
         return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
-
-    def _tendon_touches(self, tendon: int) -> bool:
-        model = self._model
-        for w in self._wraps(tendon):
-            item, kind = int(model.wrap_objid[w]), _WRAP(model.wrap_type[w])
-            if kind == _WRAP.mjWRAP_JOINT and item in self._joints:
-                return True
-            if kind == _WRAP.mjWRAP_SITE and int(model.site_bodyid[item]) in self._bodies:
-                return True
-            if kind in _WRAPPED_GEOMS and int(model.geom_bodyid[item]) in self._bodies:
-                return True
-        return False
 
 
 def _ref(model: mujoco.MjModel, joint: int) -> float:
