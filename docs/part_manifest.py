@@ -1,20 +1,36 @@
-"""Write the tables of ``part-manifest.md`` from the JSON schema and the shipped manifests.
+"""Write the JSON schema of part manifests, and the tables of ``part-manifest.md``.
+
+The schema follows from the records that read a manifest: their types, defaults and docstrings.
 
 python docs/part_manifest.py
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
+import json
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import yaml
+from msgspec.structs import fields
 
 from morphgen.grammar.library import default_library
-from morphgen.grammar.manifest import REAL_ONLY, TEMPLATE_ONLY
-from morphgen.grammar.manifest_schema import manifest_schema
+from morphgen.grammar.manifest import (
+    REAL_ONLY,
+    SCHEMA_FILE,
+    TEMPLATE_ONLY,
+    FrameSpec,
+    Manifest,
+    PackageSource,
+    Parameter,
+    Scaling,
+)
 
 PAGE = Path(__file__).with_name("part-manifest.md")
 MARK = "<!-- The rest of this page is written by docs/part_manifest.py. -->\n"
@@ -27,6 +43,45 @@ RECORDS = {
 """Heading of the section about each record of the schema."""
 LONGEST_EXAMPLE = 80
 """Longest example that is not cut [characters]."""
+
+
+def manifest_schema() -> dict[str, Any]:
+    """Return the JSON schema of a part's YAML file; ``$defs`` has one entry per record."""
+    # The only type that JSON lacks is the path of the YAML file, which is no key of it.
+    schema = msgspec.json.schema(Manifest, schema_hook=lambda kind: {"type": "string"})
+    records: dict[str, Any] = schema["$defs"]
+    for record in (Manifest, FrameSpec, PackageSource, Scaling, Parameter):
+        properties = records[record.__name__]["properties"]
+        texts = field_docstrings(record)
+        for entry in fields(record):
+            properties[entry.encode_name]["description"] = texts[entry.name]
+    manifest = records["Manifest"]
+    properties = manifest["properties"]
+    del properties["path"]
+    properties["reference"] = dict(properties["citation"])
+    manifest["oneOf"] = [
+        {"required": [source], "properties": dict.fromkeys(sorted(unused), False)}
+        for source, unused in (("source", TEMPLATE_ONLY), ("file", REAL_ONLY))
+    ]
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Part of morphgen",
+        **schema,
+    }
+
+
+def field_docstrings(record: type[msgspec.Struct]) -> dict[str, str]:
+    """Return the docstring of every field of a record, by the field's name."""
+    (definition,) = ast.parse(inspect.getsource(record)).body
+    assert isinstance(definition, ast.ClassDef)
+    return {
+        field.target.id: " ".join(str(text.value.value).replace("``", "`").split())
+        for field, text in pairwise(definition.body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+    }
 
 
 def page() -> str:
@@ -127,4 +182,5 @@ def _yaml(value: object) -> str:
 
 
 if __name__ == "__main__":
+    SCHEMA_FILE.write_text(json.dumps(manifest_schema(), indent=2) + "\n", encoding="utf-8")
     PAGE.write_text(page(), encoding="utf-8")

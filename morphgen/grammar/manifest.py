@@ -17,6 +17,9 @@ from morphgen.formats.data_files import parse_yaml, read_bytes
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.rounding import format_number
 
+SCHEMA_FILE = Path(__file__).with_name("manifest.schema.json")
+"""The JSON schema of a manifest, for editors; ``docs/part_manifest.py`` writes it."""
+
 Unit = Literal["m", "rad", "kg", ""]
 _SCALES: dict[Unit, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},

@@ -13,7 +13,6 @@ from morphgen.errors import FormatError
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.formats.urdf.schema import structure_findings
 from morphgen.formats.xml import parse_xml
-from morphgen.model.geometry import Capsule
 from morphgen.model.robot import Robot
 
 INERTIAL = (
@@ -326,20 +325,10 @@ def test_a_root_with_a_namespace_is_refused_with_a_true_message(tmp_path, start,
         reading(text, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("ends", "centre"),
-    [("0 0 0 0 0 1", (0, 0, 0.5)), ("1 0 0 0 0 0", (0.5, 0, 0)), ("0 0 2 0 2 0", (0, 1, 1))],
-)
-def test_a_capsule_by_its_end_points_is_read(tmp_path, ends, centre):
-    shape = f'<geometry><capsule radius="0.1" fromto="{ends}"/></geometry>'
-    (capsule,) = reading(urdf(tip=f"<collision>{shape}</collision>"), tmp_path).links[1].collisions
-    a, b = np.reshape([float(word) for word in ends.split()], (2, 3))
-    assert capsule.geometry == Capsule(0.1, pytest.approx(np.linalg.norm(b - a)))
-    assert capsule.T_link_shape.position == pytest.approx(centre)
-    axis = capsule.T_link_shape.matrix[:3, 2]
-    np.testing.assert_allclose(axis, (b - a) / np.linalg.norm(b - a), atol=1e-12)
+def test_a_capsule_without_a_length_is_an_error(tmp_path):
+    shape = '<geometry><capsule radius="0.1" diameter="1"/></geometry>'
     with pytest.raises(FormatError, match="has no length, but diameter"):
-        reading(urdf(tip=f"<collision>{shape}</collision>".replace("fromto", "diameter")), tmp_path)
+        reading(urdf(tip=f"<collision>{shape}</collision>"), tmp_path)
 
 
 def test_the_findings_of_a_bundle_do_not_name_what_morphgen_wrote(tmp_path):

@@ -45,7 +45,6 @@ from morphgen.model.geometry import (
 from morphgen.model.mesh import require_bounded_files
 from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic, Robot
 from morphgen.model.rotation import Vec3
-from morphgen.typing import Array
 
 MAX_URDF_BYTES = 8 * 2**20  # largest URDF that is read [bytes]
 _MESH = "geometry[1]/mesh"
@@ -423,11 +422,7 @@ def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | 
         case "sphere":
             geometry = Sphere(float(element.get("radius", "")))
         case "capsule":
-            length = _number(element, "length")
-            if length is None:
-                a, b = _end_points(element)
-                length = math.dist(a, b)
-            geometry = Capsule(float(element.get("radius", "")), length)
+            geometry = Capsule(float(element.get("radius", "")), float(element.get("length", "")))
         case "cylinder":
             geometry = Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
         case _:
@@ -454,19 +449,7 @@ def _shape(holder: etree._Element, meshes: Mapping[str, Path], rgba: Rgba | None
     geometry = _geometry(holder, meshes)
     if geometry is None:
         return None
-    T_link_shape = _origin(holder)
-    capsule = holder.find("geometry[1]/capsule")
-    if isinstance(geometry, Capsule) and capsule is not None and not capsule.get("length"):
-        a, b = _end_points(capsule)
-        x, y, z = ((b - a) / geometry.length).tolist()
-        T_link_shape @= Pose(tuple(((a + b) / 2).tolist()), rotation.from_z((x, y, z)))
-    return Shape(geometry, T_link_shape, rgba)
-
-
-def _end_points(capsule: etree._Element) -> tuple[Array, Array]:
-    """Return the centres of a capsule's spheres, which MJCF's ``fromto`` holds."""
-    points = np.reshape(_numbers(capsule.get("fromto", "")), (2, 3))
-    return points[0], points[1]
+    return Shape(geometry, _origin(holder), rgba)
 
 
 def _rgba(holder: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:

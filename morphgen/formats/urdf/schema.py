@@ -108,7 +108,7 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
         _number_faults(element, attribute) if attribute.counts else _text_faults(element, attribute)
         for attribute in _SCHEMA.attributes.get(tag, ())
     ]
-    for fault in chain(*checks, _missing_faults(element), _alternative_faults(element)):
+    for fault in chain(*checks, _missing_faults(element), _rotation_faults(element)):
         yield _finding(element, *fault)
     if tag == "geometry":
         yield from _geometry_findings(element)
@@ -211,8 +211,7 @@ def _number_faults(element: etree._Element, attribute: Attribute) -> Iterator[_F
         yield "mesh-scale-invalid", f"{shown} flattens the mesh", "write factors other than 0"
 
 
-def _alternative_faults(element: etree._Element) -> Iterator[_Fault]:
-    """Check attributes of which an element has either one or the other."""
+def _rotation_faults(element: etree._Element) -> Iterator[_Fault]:
     quaternion = element.get("quat_xyzw", "1").split()
     if element.tag == "origin" and (
         (element.get("rpy") and element.get("quat_xyzw"))
@@ -220,11 +219,6 @@ def _alternative_faults(element: etree._Element) -> Iterator[_Fault]:
     ):
         fix = "write one rotation, as a quaternion of length 1 or as rpy"
         yield "rotation-invalid", "its quat_xyzw is zero, or beside rpy", fix
-    ends = element.get("fromto", "").split()
-    has_ends = bool(ends) and ends[:3] != ends[3:]
-    if element.tag == "capsule" and not element.get("length") and not has_ends:
-        why = f"<capsule> has no length{_others(element)}, and no two end points as fromto"
-        yield "attribute-missing", why, 'write <capsule length="...">'
 
 
 def _others(element: etree._Element) -> str:
