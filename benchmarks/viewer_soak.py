@@ -3,8 +3,9 @@
     python benchmarks/viewer_soak.py [--minutes 60] [--robots 100]
 
 Serves a sampled set of arm3 with `morphgen view`. Round after round a new headless browser opens
-the library, a gallery, a robot from a card, Back, the population, a comparison, a robot that
-evolves, a split and a rollout of reach, and closes; every second one while it loads another page.
+the library, a gallery, a robot from a card, Back, the population, a comparison, a robot of
+a grammar in Compose, a split and a rollout of reach, and closes; every second one while it loads
+another page.
 Prints after every tenth of the time the resident memory of the server and of its worker processes,
 and the server's threads and open files (Linux). The exit code is 1 if the server's memory grows by
 more than a tenth between half of the time and the end.
@@ -98,8 +99,8 @@ def _round(page: Any, address: str) -> None:  # noqa: ANN401
     page.get_by_text("no robot is selected").wait_for()
     page.goto(f"{address}/?compare=robots/arm3/arm3-000001&compare=robots/arm3/arm3-000002")
     page.get_by_text("Similarity").first.wait_for()
-    page.goto(f"{address}/?compose=arm3&seed=0&number=1&evolve=1&tab=Evolve")
-    page.locator("[data-do=adopt]").nth(8).wait_for()
+    page.goto(f"{address}/?compose=arm3&seed=0&number=1")
+    page.get_by_text("open its page").wait_for()
     page.goto(f"{address}/?split=interpolation/arm3/reach")
     page.get_by_role("tab").first.wait_for()
     page.goto(f"{address}/?play=reach&robot=words:arm=arm3 ee=stick&policy=jacobian")

@@ -1,8 +1,8 @@
 """Film the way from a gallery to a split in the viewer: python docs/viewer_film.py [--out FILE].
 
 Opens the gallery of a set of 24 arm3 in headless chromium, chooses three, compares them, edits one
-in Compose, evolves it twice, writes the result to a folder, and makes a split of it and the
-chosen three. Each state of the page is shown for a second or two.
+in Compose, writes the result to a folder, and makes a split of it and the chosen three. Each state
+of the page is shown for a second or two.
 Needs `pip install morphgen[test]` and chromium.
 """
 
@@ -52,7 +52,7 @@ def main() -> int:
 
 def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     """Work with the page; yield a word for each state that the film shows."""
-    adopt, tray = page.locator("[data-do=adopt]"), page.locator("#morphgen-tray")
+    tray = page.locator("#morphgen-tray")
     page.goto(f"{address}?gallery=robots/arm3&sort=-reach")
     page.locator("#morphgen-cover").wait_for(state="detached")
     page.wait_for_function("!document.querySelector('.card:not(:has(img))')")
@@ -77,18 +77,6 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
         slider.press("ArrowRight")
     page.get_by_text(re.compile("changed: ")).first.wait_for()
     yield "edited"
-    page.get_by_role("tab", name="Evolve").click()
-    page.get_by_role("button", name="mutants").click()
-    adopt.nth(8).wait_for()
-    yield "nine mutants"
-    adopt.nth(4).click()
-    page.wait_for_url(re.compile("evolve=2"))
-    adopt.nth(8).wait_for()
-    yield "mutants of a mutant"
-    adopt.nth(2).click()
-    page.wait_for_url(re.compile("evolve=3"))
-    adopt.nth(8).wait_for()
-    yield "evolved twice"
     page.get_by_role("tab", name="Get").click()
     page.get_by_role("button", name="Write to robots/").click()
     page.get_by_text("Written", exact=True).wait_for()
@@ -102,10 +90,10 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     tray.get_by_text("split").click()
     page.get_by_text("test (1)").wait_for()
     name = page.get_by_text("split name", exact=True)
-    name.locator("xpath=ancestor::*[.//input][1]//input").last.fill("mine/evolved")
+    name.locator("xpath=ancestor::*[.//input][1]//input").last.fill("mine/longer")
     yield "three to train on, one to test on"
     page.get_by_role("button", name="Save").click()
-    page.get_by_text("morphgen split audit splits/mine/evolved.yaml").wait_for()
+    page.get_by_text("morphgen split audit splits/mine/longer.yaml").wait_for()
     yield "a split"
 
 

@@ -36,7 +36,6 @@ PAGES = {
         "right.ee=panda_hand",
         "text=open its page",
     ),
-    "evolve": ("?compose=arm3&seed=0&number=4&evolve=2&tab=Evolve", ".offspring"),
     "compare": (
         "?compare=words:arm=panda ee=panda_hand&compare=words:arm=ur5 ee=robotiq_2f85"
         "&compare=words:arm=xarm7 ee=stick",

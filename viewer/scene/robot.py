@@ -12,7 +12,6 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike
 
-from morphgen.formats.bundle import split_colours
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics
@@ -24,10 +23,8 @@ from morphgen.viewer.scene.stage import (
     MIN_EXTENT,
     Rgb,
     Triangles,
-    add_ground,
     grown_triangles,
     inertia_box,
-    look_at,
     shape_colour,
     triangles,
 )
@@ -224,37 +221,6 @@ def _add_mesh(
         cast_shadow=opacity is None,
     )
     return DrawnShape(handle, colour)
-
-
-COLUMNS = 3
-CAMERA_DIRECTION = (0.08, -0.8, 0.62)  # to the camera: the first row is the farthest
-_GAP = 1.25  # distance of two columns in widths of the widest robot
-_ROW = 0.8  # smallest distance of rows in longest sides: they are seen from above at an angle
-
-
-def add_offspring(
-    client: viser.ClientHandle, parent: Robot, robots: Sequence[Robot]
-) -> list[RobotView]:
-    """Draw the offspring beside the parent, which stands at the origin, and look at all."""
-    bounds = np.array([robot_bounds(robot) for robot in (parent, *robots)])
-    sizes = (bounds[:, 1] - bounds[:, 0]).max(axis=0)
-    step_x = _GAP * float(sizes[0])
-    step_y = max(_GAP * float(sizes[1]), _ROW * float(sizes.max()))
-    views = []
-    with client.atomic():
-        for i, robot in enumerate(robots):
-            row, column = divmod(i, COLUMNS)
-            position = ((column + 1.3) * step_x, (1 - row) * step_y, 0.0)
-            bounds[i + 1] += position
-            views.append(add_robot(client.scene, split_colours(robot), f"/offspring{i}", position))
-            above = (0.0, 0.0, float(bounds[i + 1, 1, 2]) + 0.04 * step_x)
-            client.scene.add_label(
-                f"/offspring{i}/label", str(i + 1), position=above, anchor="bottom-center"
-            )
-        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-        add_ground(client.scene, float(np.linalg.norm(high - low)))
-        look_at(client, low, high, CAMERA_DIRECTION)
-    return views
 
 
 SIZE = (640, 480)  # width and height of a frame [pixels]

@@ -1,35 +1,49 @@
-"""Conversion between the controls of the compose panel and compose arguments."""
+"""The tabs of the compose page: words by parts and parameters, derivations, and grammars."""
 
 from urllib.parse import unquote
 
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.pages.compose_grammar import first_parts
-from morphgen.viewer.pages.compose_parts import (
-    NO_PART,
-    choice_of,
+from morphgen.viewer.pages.compose_tabs import (
+    first_parts,
     parameters_of,
-    parse_choice,
     slots_of,
+    split_words,
     with_parameter,
-    with_part,
-    with_value,
+    with_word,
+    words_of,
 )
 
 LIBRARY = default_library()
 WORDS = "base=pedestal left.arm=ur5 left.ee=plane right.ee=stick left.ee.size=0.1 base.height=0.7"
 
 
-@pytest.mark.parametrize("bad", ["arm", "arm=ur5 ee.size=1", "arm=ur5 arm.size=1", "arm=ur6"])
-def test_invalid_compose_arguments_are_rejected(bad):
-    with pytest.raises(MorphgenError):
-        parse_choice(bad.split(), LIBRARY)
+def changed(text, key, value):
+    return joined(with_word(split_words(text), key, value, LIBRARY))
+
+
+def joined(words):
+    return " ".join(f"{key}={value}" for key, value in words.items())
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("=", "is not of the form key=value"),
+        ("arm=ur5 ee.size=1", "ee.size=1: no part is chosen"),
+        ("arm=ur5 arm.size=1", "arm.size: "),
+        ("arm=ur6", "did you mean"),
+        ("base=fixd", "did you mean"),
+    ],
+)
+def test_invalid_words_are_rejected(words, why, shared_viewer):
+    with PlainClient(shared_viewer.port, f"?compose={words}") as client:
+        client.shows(why)
 
 
 @pytest.mark.parametrize(
@@ -43,13 +57,12 @@ def test_invalid_compose_arguments_are_rejected(bad):
     ],
 )
 def test_parts_offer_slots_and_each_can_be_filled(words, slots):
-    choice = parse_choice(words.split(), LIBRARY)
-    assert slots_of(choice, LIBRARY) == slots.split()
+    assert slots_of(split_words(words), LIBRARY) == slots.split()
     for slot in slots.split():
         part = "ur5" if slot.endswith("arm") else "stick"
-        filled = with_part(choice, slot, part, LIBRARY)
-        assert filled.parts[slot] == part
-        parse_words(filled.words.split(), LIBRARY)
+        filled = changed(words, slot, part)
+        assert f"{slot}={part}" in filled.split()
+        parse_words(filled.split(), LIBRARY)
 
 
 def sliders(client, last):
@@ -65,6 +78,13 @@ def test_a_typed_number_draws_that_robot_and_a_grammar_is_saved(shared_viewer):
         client.until(lambda: client.addresses[-1][1] == "?compose=planar_arm&seed=0&number=2")
         client.change(client.control("Button", "Save the grammar"))
         client.shows("planar_arm.grammar")
+
+
+def test_a_robot_of_a_set_offers_the_grammar_of_the_set(shared_viewer):
+    with PlainClient(shared_viewer.port, "?compose=robots/prims/prims-000001&evolve=2") as client:
+        client.control("Number", "robot number")
+        client.shows("robots/prims/grammar.grammar")
+        client.until(lambda: client.addresses and "evolve" not in client.addresses[-1][1])
 
 
 def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
@@ -93,36 +113,30 @@ TEMPLATES = [
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
 def test_every_part_accepts_both_ends_of_every_control(manifest):
-    name = manifest.name
-    slot = manifest.kind
+    name, slot = manifest.name, manifest.kind
     words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
-    choice = parse_choice(words.split(), LIBRARY)
-    for key, parameter in parameters_of(slot, manifest).items():
+    for key, parameter in parameters_of(slot, name, LIBRARY).items():
         for value in (parameter.minimum, parameter.maximum):
-            text = with_value(choice, f"{slot}.{key}", value, parameter.default).words
-            parse_words(text.split(), LIBRARY)
+            parse_words(changed(words, f"{slot}.{key}", str(value)).split(), LIBRARY)
 
 
 def test_changing_a_part_resets_its_parameters():
-    choice = parse_choice(WORDS.split(), LIBRARY)
-    other = with_part(choice, "left.ee", "stick", LIBRARY)
-    assert "left.ee.size" not in other.values
-    assert other.values == {"base.height": 0.7}
-    assert "left.arm" not in with_part(choice, "left.arm", NO_PART, LIBRARY).parts
+    other = changed(WORDS, "left.ee", "stick").split()
+    assert "base.height=0.7" in other
+    assert "left.ee.size=0.1" not in other
+    assert "left.arm" not in changed(WORDS, "left.arm", "")
 
 
 def test_changing_the_base_keeps_limbs_with_matching_ports():
-    choice = parse_choice(["base=pedestal", "arm=ur5", "left.arm=ur5", "left.ee=stick"], LIBRARY)
-    gantry = with_part(choice, "base", "gantry", LIBRARY)
-    assert gantry.words == "base=gantry arm=ur5"
-    planar = with_part(choice, "base", "planar", LIBRARY)
-    assert planar.parts == {**choice.parts, "base": "planar"}
+    words = "base=pedestal arm=ur5 left.arm=ur5 left.ee=stick"
+    assert changed(words, "base", "gantry") == "base=gantry arm=ur5"
+    assert changed(words, "base", "planar") == words.replace("pedestal", "planar")
 
 
-def test_default_values_are_omitted():
-    choice = parse_choice(["arm=arm3", "arm.length=0.2"], LIBRARY)
-    assert with_value(choice, "arm.length", 0.3, 0.3).words == "base=fixed arm=arm3"
-    assert with_value(choice, "arm.length", 0.4, 0.3).words == "base=fixed arm=arm3 arm.length=0.4"
+def test_a_value_is_replaced_and_the_default_is_left_out():
+    words = "base=fixed arm=arm3 arm.length=0.2"
+    assert changed(words, "arm.length", "") == "base=fixed arm=arm3"
+    assert changed(words, "arm.length", "0.4") == "base=fixed arm=arm3 arm.length=0.4"
 
 
 def test_derivation_is_built_part_by_part():
@@ -138,16 +152,14 @@ def test_derivation_is_built_part_by_part():
 @pytest.mark.parametrize("words", [WORDS, "base=planar ee=cube", "arm=arm3 ee=claw ee.mount_yaw=1"])
 def test_a_derivation_of_words_is_edited_by_its_parts(words):
     derivation, _ = parse_words(words.split(), LIBRARY)
-    choice = choice_of(derivation, LIBRARY)
-    assert choice is not None
-    assert parse_words(choice.words.split(), LIBRARY)[0] == derivation
+    assert parse_words(joined(words_of(derivation, LIBRARY)).split(), LIBRARY)[0] == derivation
 
 
 @pytest.mark.parametrize(
     "text", ["arm3=arm3(length=0.3)[flange: claw=claw]", "body=cubes(size=0.1, travel=1)"]
 )
 def test_a_derivation_of_another_shape_has_no_words(text):
-    assert choice_of(parse_derivation(text), LIBRARY) is None
+    assert words_of(parse_derivation(text), LIBRARY) is None
 
 
 def test_parameters_of_any_derivation_can_be_changed():
