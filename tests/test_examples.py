@@ -13,12 +13,12 @@ import pytest
 
 from morphgen.cli import main
 from morphgen.grammar.library import default_library
+from morphgen.rl.baselines import baselines_for
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer.app.address import Address
 from morphgen.viewer.episode import episode_bytes, read_episode
-from morphgen.viewer.pages.play import parse_rollout
+from morphgen.viewer.pages.play import default_policy
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
 from morphgen.viewer.scene.rollout import episode_page
@@ -118,7 +118,7 @@ def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys
     assert main(["goals", robot, "--task", "follow", "--certify"]) == 0
 
     places = FileAccess(default_library().folders, (tmp_path,), tmp_path / "none")
-    assert parse_rollout(Address("play", ("follow",)), []).task == "follow"
+    assert default_policy("follow", obstacles=False) in baselines_for("follow")
     rollout = Rollout(RolloutConfig("follow", ("words:base=planar ee=cube",), RUN), places)
     while rollout.advance():
         pass

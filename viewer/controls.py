@@ -12,6 +12,7 @@ import viser
 
 from morphgen.grammar.robot_source import is_set_folder
 from morphgen.splits.split_file import split_names
+from morphgen.viewer.app.address import AddressError, parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
 from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_folder, resolve_split
@@ -20,12 +21,12 @@ from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_fo
 def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Keep the value of a control in the page's address; its present value is the default.
 
-    A value of the address that the control cannot have changes nothing.
+    A value of the address that the control cannot have is left out with a note.
 
     Args:
         session: Session of the page.
         key: Key of the value in the address.
-        control: A dropdown, check box, text or slider.
+        control: A dropdown, check box, text, number or slider.
         keys: Texts in the address that stand for the options of a dropdown, by default the options,
             or for a check box that is on.
     """
@@ -42,8 +43,12 @@ def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> 
         return f"{value:g}" if isinstance(value, float) else str(value)
 
     def apply(text: str) -> None:
-        if (value := parse_value(control, text, keys)) is not None:
-            set_value(control, value)
+        if (value := parse_value(control, text, keys)) is None:
+            valid = "a number"
+            if isinstance(control, viser.GuiDropdownHandle):
+                valid = ", ".join(keys or control.options)
+            raise AddressError(f"{key}={text[:40]} was left out; expected {valid[:200]}")
+        set_value(control, value)
 
     session.keep(key, write, apply)
 
@@ -56,6 +61,9 @@ def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # no
             return control.options[keys.index(text)] if text in keys else None
         case viser.GuiCheckboxHandle():
             return text in keys
+        case viser.GuiNumberHandle():
+            count = parse_count(text, -1)
+            return None if count < 0 else count
         case viser.GuiSliderHandle():
             try:
                 number = float(text)

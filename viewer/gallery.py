@@ -214,6 +214,7 @@ def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str])
     if value and value not in keys:
         valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
         gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
+        session.address = session.address.with_state(**{key: ""})
     labels = [_sort_label(gallery, k) for k in keys] if key == "sort" else keys
     if len(keys) > 1:
         gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))

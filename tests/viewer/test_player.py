@@ -183,7 +183,6 @@ def test_a_player_stops_while_it_loads(display):
 
 
 def test_times_of_addresses():
-    assert parse_time("") is None
     assert parse_time("1.5") == 1.5
     for text in ("-1", "soon", "nan", "inf"):
         with pytest.raises(AddressError, match=f"t={text} is no time; expected seconds, 0 or more"):

@@ -8,6 +8,7 @@ import pytest
 
 from helpers.robots import arm
 from helpers.runs import QUIET, small_config
+from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
@@ -18,7 +19,7 @@ from morphgen.rl.runs.training import train
 from morphgen.viewer.app.address import Address, parse_address
 from morphgen.viewer.app.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.pages.play import parse_rollout, rollout_address
+from morphgen.viewer.pages.play import default_policy
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import EpisodeSource, Rollout, RolloutConfig, simulators
 from morphgen.viewer.scene.rollout import (
@@ -210,41 +211,47 @@ def test_an_invalid_rollout_is_rejected(files, module_cache, config, why):
         Rollout(config, files)
 
 
-def test_rollout_is_restored_from_its_url():
-    for simulator in simulators():
-        config = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
-        assert parse_rollout(rollout_address(config), []) == config
-    default = parse_rollout(
-        rollout_address(RolloutConfig("push", (), "zero")), [("it", "robots/one")]
-    )
-    assert default.robots == ("robots/one",)
+@pytest.mark.parametrize("simulator", simulators())
+def test_a_rollout_is_restored_from_its_address(shared_viewer, simulator):
+    query = f"?play=push&robot={CUBE}&robot=robots/some-arm&policy=random&seed=7&obstacles=yes"
+    query += "" if simulator == "mujoco" else f"&sim={simulator}"
+    shown = parse_address(query).query
+    with PlainClient(shared_viewer.port, query) as client:
+        client.until(lambda: client.addresses and client.addresses[-1][1] == shown)
 
 
 @pytest.mark.parametrize(
-    ("query", "policy"),
+    ("task", "obstacles", "policy"),
     [
-        ("?play=reach", "zero-shot"),
-        ("?play=reach&obstacles=yes", "zero-shot-obstacles"),
-        ("?play=push", "zero-shot-push"),
-        ("?play=push&obstacles=yes", baselines_for("push")[0]),
+        ("reach", False, "zero-shot"),
+        ("reach", True, "zero-shot-obstacles"),
+        ("push", False, "zero-shot-push"),
+        ("push", True, baselines_for("push")[0]),
     ],
 )
-def test_a_rollout_opens_with_the_shipped_policy_of_its_task(query, policy):
-    assert parse_rollout(parse_address(query), []).policy == policy
+def test_a_rollout_opens_with_the_shipped_policy_of_its_task(task, obstacles, policy):
+    assert default_policy(task, obstacles=obstacles) == policy
 
 
 @pytest.mark.parametrize(
-    ("query", "why"),
+    ("query", "reasons"),
     [
-        ("?play=rech", "did you mean 'reach'"),
-        ("?play=reach&seed=x", "seed 'x': expected a whole number"),
-        ("?play=reach&sim=bullet", "did you mean 'pybullet'"),
-        ("?play=robots/prims/index.jsonl", "no task"),
+        ("?play=rech", ["did you mean"]),
+        ("?play=robots/prims/index.jsonl", ["no task"]),
+        (
+            f"?play=reach&robot={CUBE}&policy=random&seed=x&sim=bullet&t=soon",
+            [
+                "seed=x was left out; expected a number",
+                "sim=bullet was left out; expected mujoco",
+                "t=soon is no time; expected seconds, 0 or more",
+            ],
+        ),
     ],
 )
-def test_an_invalid_address_of_a_rollout_is_rejected(query, why):
-    with pytest.raises(MorphgenError, match=why):
-        parse_rollout(parse_address(query), [])
+def test_an_invalid_address_of_a_rollout_is_explained(shared_viewer, query, reasons):
+    with PlainClient(shared_viewer.port, query) as client:
+        for reason in reasons:
+            client.shows(reason)
 
 
 def test_snapshot_is_independent_of_the_episode(episode):

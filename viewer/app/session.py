@@ -17,7 +17,7 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.progress import show_progress
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address, require_few_chosen
+from morphgen.viewer.app.address import Address, AddressError, require_few_chosen
 from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
 from morphgen.viewer.app.viser_internals import run_javascript
 from morphgen.viewer.app.workers import SharedResults, Workers
@@ -259,11 +259,17 @@ class Session:
         return {key: write() for key, (write, _) in self.values.items()}
 
     def apply_state(self) -> None:
-        """Take over the state that the page's address has, in the order of ``keep``."""
+        """Take over the state that the page's address has, in the order of ``keep``.
+
+        A note says which values the page cannot have.
+        """
         asked = self.address.state  # a new value may show the state, which changes the address
         for key, (_, apply) in list(self.values.items()):
             if key in asked and apply is not None:
-                apply(asked[key])
+                try:
+                    apply(asked[key])
+                except AddressError as error:
+                    self.notify("Not all of the address", self.files.redact(error), error=True)
 
     def show_state(self) -> None:
         """Show the page's state in the address, without keys that the page does not have."""

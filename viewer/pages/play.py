@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from html import escape
-from typing import Any
 
 import numpy as np
 import viser
@@ -19,9 +18,9 @@ from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_polic
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError, parse_count
+from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.controls import Robots, add_picker, picked_uri, robot_lists
+from morphgen.viewer.controls import Robots, add_picker, bind, picked_uri, robot_lists
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
 from morphgen.viewer.rollout import (
@@ -54,21 +53,21 @@ def show(session: Session) -> None:
     if not subject and "policy" not in session.address.state:
         show_tasks(session)
         return
-    start = parse_time(session.address.state.get("t", ""))
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
     if subject.endswith(EPISODE_SUFFIX):
         episode = read_episode(session.files.path(subject), session.files)
         page = PlayPage(session)
         session.client.gui.add_html(markup.framed(_description(episode)))
-        page.player.load(lambda: EpisodeSource(episode, episode.num_steps), start=start)
-        session.show_address(f"play {uri_name(subject)}")
+        session.title = f"play {uri_name(subject)}"
+        session.apply_state()
+        page.load(lambda: EpisodeSource(episode, episode.num_steps))
     else:
         trained_on = complete_address(session)
-        config = parse_rollout(session.address, trained_on)
+        if (task := session.address.subject) not in TASKS:
+            raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
         page = PlayPage(session)
-        page.add_rollout_controls(config, trained_on)
-        page.start(config, start)
+        page.add_rollout_controls(trained_on)
     page.add_downloads()
 
 
@@ -97,6 +96,7 @@ class PlayPage:
         self._is_planning = False  # whether the policy is still planning its first step
         self._position: int | None = None  # step of a pause; None while the episode plays
         self._step = 0  # step that is shown
+        self._start: float | None = None  # time at which the address asks to pause [s]
         self._charts: list[viser.GuiUplotHandle] = []  # of distance and score
         self._fault = gui.add_html("")
         buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
@@ -116,55 +116,63 @@ class PlayPage:
             speed, lambda: self.player.set_speed(float(speed.value.removesuffix("x")))
         )
         session.on_change(self._time, self._go_to_time, "time")
-        for key in ("policy", "seed", "obstacles", "sim"):
-            session.keep(key)
-        session.keep("t", self._write_time)
+        session.keep("t", self._write_time, self._apply_time)
 
-    def start(self, config: RolloutConfig, start: float | None = None) -> None:
-        """Show a rollout's address, and let the player simulate it."""
-        session = self.session
-        session.address = rollout_address(config)
-        session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+    def load(self, make_source: Callable[[], EpisodeSource]) -> None:
+        """Show the state in the address, and let the player show an episode."""
+        self._position = None
+        self.session.show_state()
         if self._scene is not None:  # not the pose of another seed until the new start is there
             self._scene.root.visible = False
-        self.player.load(lambda: Rollout(config, session.files, session.set_status), start=start)
+        start, self._start = self._start, None
+        self.player.load(make_source, start=start)
 
-    def add_rollout_controls(self, config: RolloutConfig, trained_on: Robots) -> None:
-        """Add the controls that start another episode, in the state of a config."""
-        gui, session = self.session.client.gui, self.session
-        robots, handles = config.robots, dict[str, Any]()
+    def add_rollout_controls(self, trained_on: Robots) -> None:
+        """Add the controls of a rollout in the state that the address gives, and start it."""
+        gui, session, state = self.session.client.gui, self.session, self.session.address.state
+        first = trained_on[0][1] if trained_on else WORDS + DEFAULT_WORDS
+        robots = (session.address.robots or (first,))[:MAX_PLAYED]
+        asked = state.get("policy") or default_policy(
+            session.address.subject, obstacles="obstacles" in state
+        )
         next_one = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
         with gui.add_folder("Task"):
-            handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
-            policies = _policies(session.files, config.task, config.policy)
-            handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
-            handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
-            handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
-            handles["simulator"] = gui.add_dropdown(
-                "simulator", tuple(simulators()), initial_value=config.simulator
-            )
+            task = gui.add_dropdown("task", tuple(TASKS), initial_value=session.address.subject)
+            policies = _policies(session.files, task.value, asked)
+            policy = gui.add_dropdown("policy", policies, initial_value=asked)
+            obstacles = gui.add_checkbox("obstacles", initial_value=False)
+            seed = gui.add_number("seed", 0, min=0, step=1)
+            simulator = gui.add_dropdown("simulator", tuple(simulators()))
         with gui.add_folder("Robots"):
-            first = {"trained on": lambda: trained_on} if trained_on else {}
-            lists = robot_lists(robots[0], session.files, first)
-            picker = add_picker(session, lists, lambda: robots[0])
+            lists = {"trained on": lambda: trained_on} if trained_on else {}
+            picker = add_picker(
+                session, robot_lists(robots[0], session.files, lists), lambda: robots[0]
+            )
             action = gui.add_button_group("this robot", ACTIONS)
+        session.keep("policy", lambda: policy.value)  # its default depends on the task
+        bind(session, "seed", seed)
+        bind(session, "obstacles", obstacles, ("yes",))
+        bind(session, "sim", simulator)
 
         def restart() -> None:
-            values = {name: handle.value for name, handle in handles.items()}
-            self.start(RolloutConfig(robots=robots, **values))
+            config = RolloutConfig(
+                task.value, robots, policy.value, seed.value, obstacles.value, simulator.value
+            )
+            session.address = replace(session.address, subjects=(task.value,), robots=robots)
+            session.title = f"{task.value} {uri_name(robots[0])}"
+            self.load(lambda: Rollout(config, session.files, session.set_status))
 
         def start_next() -> None:
-            set_value(handles["seed"], handles["seed"].value + 1)
+            set_value(seed, seed.value + 1)
             restart()
 
         def change_task() -> None:
-            """Start another task, with its own baseline if the current one is for the other."""
-            task, dropdown = handles["task"].value, handles["policy"]
-            policy = dropdown.value
-            if is_named(policy) and policy not in policies_for(task):
-                policy = default_policy(task, obstacles=handles["obstacles"].value)
-            dropdown.options = _policies(session.files, task, policy)
-            dropdown.value = policy
+            """Start another task, with its own policy if the current one is for the other."""
+            chosen = policy.value
+            if is_named(chosen) and chosen not in policies_for(task.value):
+                chosen = default_policy(task.value, obstacles=obstacles.value)
+            policy.options = _policies(session.files, task.value, chosen)
+            set_value(policy, chosen)
             restart()
 
         def use_robot(action: str) -> None:
@@ -178,11 +186,13 @@ class PlayPage:
             restart()
 
         session.on_change(next_one, start_next)
-        session.on_change(handles["task"], change_task)
-        for name in ("policy", "obstacles", "seed", "simulator"):
-            session.on_change(handles[name], restart, name)
+        session.on_change(task, change_task)
+        for control in (policy, obstacles, seed, simulator):
+            session.on_change(control, restart, "restart")
         session.on_change(picker.robot, lambda: use_robot("replace"))
         session.on_change(action, lambda: use_robot(action.value))
+        session.apply_state()
+        restart()
 
     def add_downloads(self) -> None:
         """Add buttons that send the episode, as far as it is simulated, as a file or a film."""
@@ -275,6 +285,9 @@ class PlayPage:
             return ""
         return f"{self._position * self._source.episode.period:.4g}"
 
+    def _apply_time(self, text: str) -> None:
+        self._start = parse_time(text)
+
     def _go_to_time(self) -> None:
         if self._source is not None:
             self.player.go_to(round(self._time.value / self._source.episode.period))
@@ -297,47 +310,12 @@ class PlayPage:
         self._fault.content = "".join(markup.error(redact(text)) for text in texts)
 
 
-def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
-    """Return the rollout that an address describes."""
-    state, installed = address.state, simulators()
-    task = address.subject
-    if task not in TASKS:
-        raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
-    simulator = state.get("sim", installed[0])
-    if simulator not in installed:
-        raise MorphgenError(
-            f"simulator {simulator!r} is not installed{nearest(simulator, installed)}"
-        )
-    seed_text = state.get("seed", "0")
-    if (seed := parse_count(seed_text, -1)) < 0:
-        raise MorphgenError(f"seed {seed_text!r:.80}: expected a whole number, 0 or more")
-    robot = trained_on[0][1] if trained_on else WORDS + DEFAULT_WORDS
-    return RolloutConfig(
-        task,
-        (address.robots or (robot,))[:MAX_PLAYED],
-        state.get("policy") or default_policy(task, obstacles=bool(state.get("obstacles"))),
-        seed,
-        bool(state.get("obstacles")),
-        simulator,
-    )
-
-
 def default_policy(task: str, *, obstacles: bool) -> str:
     """Return the shipped policy that does a task with any robot, or else the first baseline."""
     try:
         return zero_shot_policy(task, "position", obstacles=obstacles).name
     except TaskError:
         return baselines_for(task)[0]
-
-
-def rollout_address(config: RolloutConfig) -> Address:
-    """Return the address of a rollout; default values are left out."""
-    return Address("play", (config.task,), robots=config.robots).with_state(
-        policy=config.policy,
-        seed=str(config.seed),
-        obstacles="yes" if config.obstacles else "",
-        sim="" if config.simulator == simulators()[0] else config.simulator,
-    )
 
 
 def complete_address(session: Session) -> Robots:
@@ -357,10 +335,8 @@ def _policies(files: FileAccess, task: str, policy: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*policies_for(task), *list_checkpoints(files), policy)))
 
 
-def parse_time(text: str) -> float | None:
-    """Return the time at which an address shows an episode [s]; None if the text is empty."""
-    if not text:
-        return None
+def parse_time(text: str) -> float:
+    """Return the time at which an address shows an episode [s]."""
     try:
         time = float(text)
     except ValueError:
