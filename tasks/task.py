@@ -487,6 +487,15 @@ class Task(ABC, Generic[C, G]):
         return goals.goal_poses[:, :3]
 
 
+def require_returned(
+    task: str, method: str, result: object, is_expected: bool, expected: str
+) -> None:
+    """Require that a task's method returned what is expected of it."""
+    if not is_expected:
+        returned = type(result).__name__
+        raise TaskError(f"task {task!r}: {method} returned {returned}; expected {expected}")
+
+
 def require_task_config(config: TaskConfig) -> None:
     """Require valid values of the constants of every task, and only finite numbers or text."""
     name = type(config).__name__

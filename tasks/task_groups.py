@@ -23,22 +23,11 @@ from morphgen.tasks.task import (
     Task,
     TaskEnvs,
     TaskState,
+    require_returned,
 )
 from morphgen.typing import Array
 
-
-def _wrong_type(task: str, method: str, result: object, expected: str) -> TaskError:
-    returned = type(result).__name__
-    return TaskError(f"task {task!r}: {method} returned {returned}; expected {expected}")
-
-
-def _require_start(task: str, start: object, k: int, num_joints: int) -> None:
-    """Require what ``TaskEnvs.begin`` returns."""
-    if not isinstance(start, tuple) or len(start) != 2:
-        expected = "two tensors: joint positions and poses of the block"
-        raise _wrong_type(task, "begin", start, expected)
-    _require_shape(task, "begin: the joint positions", start[0], (k, num_joints))
-    _require_shape(task, "begin: the poses of the block", start[1], (k, 7))
+_FLAGS, _NUMBERS = ("success", "terminated"), ("distance", "score")
 
 
 def _require_methods(task: str, envs: TaskEnvs) -> None:
@@ -55,45 +44,6 @@ def _require_methods(task: str, envs: TaskEnvs) -> None:
         )
 
 
-def _require_result(task: str, result: object, k: int) -> None:
-    """Require what ``TaskEnvs.evaluate`` returns."""
-    if not isinstance(result, StepResult):
-        raise _wrong_type(task, "evaluate", result, "a StepResult")
-    if not result.terms:
-        raise TaskError(f"task {task!r}: evaluate: no reward terms; expected one or more")
-    for name in ("success", "terminated", "distance", "score"):
-        value = getattr(result, name)
-        _require_shape(task, f"evaluate: {name}", value, (k,))
-        is_flag = name in ("success", "terminated")
-        if is_flag != (value.dtype == torch.bool):
-            expected = "bool" if is_flag else "numbers"
-            raise TaskError(
-                f"task {task!r}: evaluate: {name} is {value.dtype}; expected {expected}"
-            )
-    for name, value in result.terms.items():
-        _require_shape(task, f"evaluate: the reward term {name!r}", value, (k,))
-
-
-def _require_fields(task: Task[Any, Any], values: Mapping[str, torch.Tensor], k: int) -> None:
-    """Require what ``TaskEnvs.observe`` returns: every field that the task declares."""
-    declared = {field.name: field for field in task.fields}
-    for name in declared.keys() ^ values.keys():
-        if name in declared:
-            raise TaskError(f"task {task.name!r}: observe: the field {name!r} is missing")
-        raise TaskError(
-            f"task {task.name!r}: observe: {name!r} is no ObservationField in the task's `fields`"
-        )
-    for name, value in values.items():
-        _require_shape(task.name, f"observe: the field {name!r}", value, (k, declared[name].size))
-
-
-def _require_shape(task: str, what: str, value: object, shape: tuple[int, ...]) -> None:
-    if not isinstance(value, torch.Tensor):
-        raise TaskError(f"task {task!r}: {what}: {type(value).__name__}; expected a tensor")
-    if tuple(value.shape) != shape:
-        raise TaskError(f"task {task!r}: {what} has shape {tuple(value.shape)}; expected {shape}")
-
-
 @dataclass(frozen=True, eq=False)
 class _Group:
     """The environments of one task."""
@@ -101,6 +51,54 @@ class _Group:
     task: Task[Any, Any]
     envs: TaskEnvs
     rows: torch.Tensor  # indices of its environments in the batch, shape (k,), int64
+
+    def start(self, start: Any, num_joints: int) -> dict[str, torch.Tensor]:  # noqa: ANN401
+        """Return what ``TaskEnvs.begin`` returned by name, if that is sound."""
+        expected = "two tensors: joint positions and poses of the block"
+        is_pair = isinstance(start, tuple) and len(start) == 2
+        require_returned(self.task.name, "begin", start, is_pair, expected)
+        q, block_pose = start
+        self._require("begin: the joint positions", q, num_joints)
+        self._require("begin: the poses of the block", block_pose, 7)
+        return {"q": q, "block_pose": block_pose}
+
+    def result(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
+        """Return the result of ``TaskEnvs.evaluate``."""
+        result = self.envs.evaluate(state)
+        is_result = isinstance(result, StepResult)
+        require_returned(self.task.name, "evaluate", result, is_result, "a StepResult")
+        if not result.terms:
+            raise TaskError(
+                f"task {self.task.name!r}: evaluate: no reward terms; expected one or more"
+            )
+        for name in (*_FLAGS, *_NUMBERS):
+            self._require(f"evaluate: {name}", getattr(result, name), is_flag=name in _FLAGS)
+        for name, value in result.terms.items():
+            self._require(f"evaluate: the reward term {name!r}", value)
+        return result
+
+    def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the values of ``TaskEnvs.observe``: one for each field that the task declares."""
+        values = self.envs.observe(block_pose)
+        sizes = {field.name: field.size for field in self.task.fields}
+        for name in sizes.keys() ^ values.keys():
+            fault = f"the field {name!r} is missing"
+            if name in values:
+                fault = f"{name!r} is no ObservationField in the task's `fields`"
+            raise TaskError(f"task {self.task.name!r}: observe: {fault}")
+        for name, value in values.items():
+            self._require(f"observe: the field {name!r}", value, sizes[name])
+        return values
+
+    def _require(self, part: str, value: object, *size: int, is_flag: bool | None = None) -> None:
+        """Require a tensor with a row per environment, and of flags or numbers if that matters."""
+        part, shape = f"task {self.task.name!r}: {part}", (len(self.rows), *size)
+        if not isinstance(value, torch.Tensor):
+            raise TaskError(f"{part}: {type(value).__name__}; expected a tensor")
+        if tuple(value.shape) != shape:
+            raise TaskError(f"{part} has shape {tuple(value.shape)}; expected {shape}")
+        if is_flag is not None and is_flag != (value.dtype == torch.bool):
+            raise TaskError(f"{part} is {value.dtype}; expected {'bool' if is_flag else 'numbers'}")
 
 
 class TaskGroups:
@@ -118,42 +116,38 @@ class TaskGroups:
         self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, num_joints: int
     ) -> None:
         """Group environments by the tasks of their specifications."""
-        n, device = len(env_robot_index), env_robot_index.device
-        env_specs = [specs[i] for i in env_robot_index.tolist()]
-        self._num_joints = num_joints
+        device, self._num_joints = env_robot_index.device, num_joints
+        index = env_robot_index.tolist()
         self._groups: dict[str, _Group] = {}
-        self._row = torch.zeros(n, dtype=torch.int64, device=device)
-        """Row of each environment in its group."""
-        self.max_episode_steps = torch.zeros(n, dtype=torch.int64, device=device)
-        self.moves_fingers = torch.zeros(n, dtype=torch.bool, device=device)
-        for name in dict.fromkeys(spec.task for spec in env_specs):
+        self._row = torch.zeros_like(env_robot_index)  # row of each environment in its group
+        self.max_episode_steps = torch.zeros_like(env_robot_index)
+        self.moves_fingers = torch.zeros_like(env_robot_index, dtype=torch.bool)
+        for name in dict.fromkeys(specs[i].task for i in index):
             members = [i for i, spec in enumerate(specs) if spec.task == name]
             task, config = TASKS[name], specs[members[0]].config
             if any(specs[i].config != config for i in members):
                 raise TaskError(f"environments at {name} have different constants; expected one")
-            row_of_spec = torch.zeros(len(specs), dtype=torch.int64)
-            row_of_spec[members] = torch.arange(len(members))
-            is_at_task = torch.tensor([spec.task == name for spec in env_specs], device=device)
-            rows = torch.nonzero(is_at_task)[:, 0]
-            member_index = row_of_spec.to(device)[env_robot_index[rows]]
+            member_of = {i: k for k, i in enumerate(members)}
+            rows, member_index = (
+                torch.tensor([(env, member_of[i]) for env, i in enumerate(index) if i in member_of])
+                .T.contiguous()
+                .to(device)
+            )
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
-            if not isinstance(envs, TaskEnvs):
-                raise _wrong_type(name, "make_envs", envs, "TaskEnvs")
+            require_returned(name, "make_envs", envs, isinstance(envs, TaskEnvs), "TaskEnvs")
             _require_methods(name, envs)
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps
             self.moves_fingers[rows] = task.moves_fingers
-        task_fields = (field for group in self._groups.values() for field in group.task.fields)
+        groups = self._groups.values()
+        task_fields = (field for group in groups for field in group.task.fields)
         self.observation_fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *task_fields)))
-        self.needs_tool_rotation = any(
-            group.envs.needs_tool_rotation for group in self._groups.values()
-        )
+        self.needs_tool_rotation = any(group.envs.needs_tool_rotation for group in groups)
         self.masks = {
-            mask: torch.zeros(n, dtype=torch.bool, device=device)
-            for mask in dict.fromkeys(field.mask for field in self.observation_fields)
+            field.mask: torch.zeros_like(self.moves_fingers) for field in self.observation_fields
         }
-        for group in self._groups.values():
+        for group in groups:
             for field in group.task.fields:
                 self.masks[field.mask][group.rows] = True
 
@@ -179,10 +173,9 @@ class TaskGroups:
                 random if self._is_one else random.select(group.rows),
                 None if layout is None else self._rows_of(group, layout),
             )
-            _require_start(group.task.name, start, len(group.rows), self._num_joints)
-            starts.append(start)
-        q, block_pose = map(self._merged, zip(*starts, strict=True))
-        return q, block_pose
+            starts.append(group.start(start, self._num_joints))
+        merged = self._merged(starts)
+        return merged["q"], merged["block_pose"]
 
     @property
     def reset_options(self) -> dict[str, tuple[int, ...]]:
@@ -198,90 +191,70 @@ class TaskGroups:
         self, env: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
     ) -> tuple[Array, Array]:
         """Begin an episode as options ask for; see ``TaskEnvs.place``."""
-        return self._group_of(env).envs.place(int(self._row[env]), options, space, q, block_pose)
+        return self._envs_of(env).place(int(self._row[env]), options, space, q, block_pose)
 
     def evaluate(
         self, state: TaskState[torch.Tensor]
     ) -> tuple[StepResult[torch.Tensor], torch.Tensor]:
         """Evaluate a step of all environments; return also the rewards, shape (n,)."""
-        results: list[StepResult[torch.Tensor]] = []
+        results = []
         for group in self._groups.values():
             values: dict[str, Any] = {
                 name: None if value is None else self._rows_of(group, value)
                 for name, value in vars(state).items()
             }
-            result = group.envs.evaluate(TaskState(**values))
-            _require_result(group.task.name, result, len(group.rows))
-            results.append(result)
-        rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for result in results]
-        merged: dict[str, Any] = {
-            name: self._merged([getattr(result, name) for result in results])
-            for name in ("success", "terminated", "distance", "score")
-        }
-        merged["terms"] = {
-            name: self._merged(
-                [
-                    result.terms[name] if name in result.terms else torch.zeros_like(reward)
-                    for result, reward in zip(results, rewards, strict=True)
-                ]
-            )
-            for name in dict.fromkeys(name for result in results for name in result.terms)
-        }
-        if any(result.angle is not None for result in results):
-            merged["angle"] = self._merged(
-                [
-                    torch.full_like(result.distance, torch.nan)
-                    if result.angle is None
-                    else result.angle
-                    for result in results
-                ]
-            )
-        return StepResult(**merged), self._merged(rewards)
+            results.append(group.result(TaskState(**values)))
+        terms = self._merged([result.terms for result in results])
+        angles = [{} if each.angle is None else {"angle": each.angle} for each in results]
+        merged = self._merged(
+            [
+                {name: getattr(result, name) for name in (*_FLAGS, *_NUMBERS)}
+                | {"reward": torch.stack([*result.terms.values()]).sum(dim=0)}
+                for result in results
+            ]
+        )
+        reward = merged.pop("reward")
+        return StepResult(**merged, terms=terms, **self._merged(angles, torch.nan)), reward
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the observation fields of all tasks, shape (n, size) each, as copies."""
-        n = len(self._row)
-        values = {
-            field.name: torch.zeros(n, field.size, device=self._row.device)
+        n, device = len(self._row), self._row.device
+        values = self._merged(
+            [group.fields(self._rows_of(group, block_pose)) for group in self._groups.values()]
+        )
+        return {
+            field.name: values[field.name].clone()
+            if field.name in values
+            else torch.zeros(n, field.size, device=device)
             for field in self.observation_fields
         }
-        for group in self._groups.values():
-            task_values = group.envs.observe(self._rows_of(group, block_pose))
-            _require_fields(group.task, task_values, len(group.rows))
-            for name, value in task_values.items():
-                if self._is_one:
-                    values[name] = value.clone()
-                else:
-                    values[name][group.rows] = value
-        return values
 
     def tool_targets(self, block_pose: torch.Tensor) -> ToolTargets:
         """Return the points and orientations that the tasks want the tool at."""
-        n, device = len(self._row), self._row.device
-        groups = list(self._groups.values())
-        task_points = [group.envs.target_points(block_pose[group.rows]) for group in groups]
-        num_points = max(points.shape[1] for points in task_points)
-        points = torch.zeros(n, num_points, 3, device=device)
-        exists = torch.zeros(n, num_points, dtype=torch.bool, device=device)
-        rotations, has_rotation = None, None
-        for group, values in zip(groups, task_points, strict=True):
-            points[group.rows, : values.shape[1]] = values
-            exists[:, : values.shape[1]].index_fill_(0, group.rows, True)
-            task_rotations = group.envs.target_rotations()
-            if task_rotations is not None:
-                if rotations is None or has_rotation is None:
-                    rotations = torch.eye(3, device=device).repeat(n, 1, 1)
-                    has_rotation = torch.zeros(n, dtype=torch.bool, device=device)
-                rotations[group.rows] = task_rotations
-                has_rotation.index_fill_(0, group.rows, True)
-        return ToolTargets(points, exists, rotations, has_rotation)
+        groups = self._groups.values()
+        points = [group.envs.target_points(self._rows_of(group, block_pose)) for group in groups]
+        order = torch.arange(max(each.shape[1] for each in points), device=block_pose.device)
+        targets = []
+        for group, values in zip(groups, points, strict=True):
+            padding = (0, 0, 0, len(order) - values.shape[1])
+            exists = (order < values.shape[1]).expand(len(group.rows), -1)
+            target = {"points": torch.nn.functional.pad(values, padding), "exists": exists}
+            if (rotations := group.envs.target_rotations()) is not None:
+                wanted = torch.ones_like(group.rows, dtype=torch.bool)
+                target |= {"rotations": rotations, "has_rotation": wanted}
+            targets.append(target)
+        merged = self._merged(targets)
+        if "rotations" in merged:  # any rotation where no task wants one, rather than zeros
+            wanted, identity = merged["has_rotation"], torch.eye(3, device=block_pose.device)
+            merged["rotations"] = merged["rotations"].where(wanted[:, None, None], identity)
+        return ToolTargets(**merged)
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of each marker of an environment's task, shape (7,) each."""
-        return self._group_of(env).envs.marker_poses(int(self._row[env]))
+        return self._envs_of(env).marker_poses(int(self._row[env]))
 
-    def _group_of(self, env: int) -> _Group:
-        return next(group for group in self._groups.values() if bool((group.rows == env).any()))
+    def _envs_of(self, env: int) -> TaskEnvs:
+        return next(each.envs for each in self._groups.values() if bool((each.rows == env).any()))
 
     def advance(self, progress: float) -> None:
         """Advance the curricula; the progress of the training is from 0 to 1."""
@@ -290,12 +263,7 @@ class TaskGroups:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the states of the tasks, n rows each, zero where another task is."""
-        state: dict[str, torch.Tensor] = {}
-        for group in self._groups.values():
-            for name, values in group.envs.state_dict().items():
-                state.setdefault(name, values.new_zeros(len(self._row), *values.shape[1:]))
-                state[name][group.rows] = values
-        return state
+        return self._merged([group.envs.state_dict() for group in self._groups.values()])
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
@@ -315,11 +283,16 @@ class TaskGroups:
         """Return the rows of a tensor of the batch that belong to a group."""
         return values if self._is_one else values[group.rows]
 
-    def _merged(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Return a tensor of the batch from those of all groups."""
+    def _merged(
+        self, tensors: Sequence[Mapping[str, torch.Tensor]], fill: float = 0
+    ) -> dict[str, torch.Tensor]:
+        """Return tensors of the batch from those of all groups; some groups may lack some."""
         if self._is_one:
-            return values[0]
-        merged = values[0].new_empty(len(self._row), *values[0].shape[1:])
-        for group, rows in zip(self._groups.values(), values, strict=True):
-            merged[group.rows] = rows
+            return dict(tensors[0])
+        merged: dict[str, torch.Tensor] = {}
+        for group, values in zip(self._groups.values(), tensors, strict=True):
+            for name, rows in values.items():
+                if name not in merged:
+                    merged[name] = rows.new_full((len(self._row), *rows.shape[1:]), fill)
+                merged[name][group.rows] = rows
         return merged

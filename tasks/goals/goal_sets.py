@@ -29,7 +29,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
-from morphgen.tasks.task import GoalSet, Task, TaskConfig
+from morphgen.tasks.task import GoalSet, Task, TaskConfig, require_returned
 
 FOLDER = Path(__file__).parents[1] / "goal_set_files"
 """Folder of the compressed sets and of their index."""
@@ -103,11 +103,8 @@ def goal_set(
         goals = task.sample(
             robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
         )
-        if not isinstance(goals, task.goal_set_type):
-            raise TaskError(
-                f"task {task.name!r}: sample returned {type(goals).__name__}; expected "
-                f"{task.goal_set_type.__name__}"
-            )
+        kind = task.goal_set_type
+        require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
         sampled: GoalSet = goals
         return sampled
 
