@@ -17,11 +17,10 @@ from morphgen.tasks.observation import (
     Observation,
     ObservationConfig,
     PhysicsState,
-    StraightPaths,
     copied,
 )
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
-from morphgen.tasks.reset_options import EpisodePlacer
+from morphgen.tasks.reset_options import place_episodes
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Simulation, is_host
@@ -149,17 +148,13 @@ class TaskBatch:
         self._num_sim_joints = simulation.q.shape[1]
         self.observation_config = observe or ObservationConfig()
         self.layouts = EpisodeLayouts(self.specs, index, layouts, self.observation_config)
-        paths = StraightPaths(self.layouts, index)
-        self._place = EpisodePlacer(self.specs, index, paths)
         self.observation = BatchObservation(
             robot_tables,
-            self.specs,
             index,
             self.groups,
             self.layouts,
             self.action_mask,
             self.observation_config,
-            paths,
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -395,7 +390,7 @@ class TaskBatch:
         layout = self.layouts.current if self.layouts.any else None
         q, block_pose = self.groups.begin(mask, random, layout)
         if options:
-            q, block_pose = self._place(options, self.groups, q, block_pose)
+            q, block_pose = place_episodes(options, self.groups, self.layouts, q, block_pose)
         self.observation.begin(mask, random)
         obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()

@@ -127,6 +127,9 @@ def _components(free: NDArray[np.bool_], continuous: Sequence[bool]) -> NDArray[
 TRIES = 1000  # configurations to test per required free one before giving up
 RESOLUTION = 0.05  # largest change of a joint between tested configurations of a path [rad or m]
 
+SAME = 0.02  # largest difference of joints between configurations that count as the same [rad or m]
+COMPARED = 12  # number of different configurations whose paths are tested
+
 _GROUND_SIZE = (200.0, 200.0, 20.0)  # size of the box whose top is the ground [m]
 _POINT = 1e-3  # radius of the ball that represents the tool point [m]
 _CHUNK = 256
@@ -182,6 +185,23 @@ class FreeSpace:
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
         free = self.free(line, None if block is None else np.tile(block, (count, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
+
+    def first_reachable(self, start: Array, ends: Array) -> int | None:
+        """Return the first of some configurations (k, J) with a free path from (J,), or None.
+
+        Numbers beyond the robot's joints are padding. Ends are tested until ``COMPARED`` different
+        ones are not reached: many starts of inverse kinematics end in one configuration.
+        """
+        dof = self.scene.robot.dof
+        tested: list[Array] = []
+        for i, end in enumerate(ends[:, :dof]):
+            if len(tested) == COMPARED:
+                break
+            if all(np.abs(end - other).max() >= SAME for other in tested):
+                if self.free_fraction(start[:dof], end) == 1:
+                    return i
+                tested.append(end)
+        return None
 
     def place_obstacles(self, poses: Sequence[Pose]) -> None:
         """Move the obstacles of the scene to other poses in the world."""

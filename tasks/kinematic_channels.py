@@ -31,8 +31,8 @@ from morphgen.model.kinematics_torch import (
     rotvec_from_matrix,
     solve_ik,
 )
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.scenes.robot_tables import RobotTables
-from morphgen.typing import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,6 @@ class ToolTargets:
     """Environments whose task wants an orientation, shape (n,), bool; None if none does."""
 
 
-FirstFree = Callable[[int, Array, Array], "int | None"]
-"""Function that returns the first of the configurations (k, J) that an environment's robot reaches
-from another one, (J,), on a straight path without a collision; None if there is none."""
 STARTS = 32  # number of start configurations of a solution
 ITERATIONS = 25  # iterations of damped least squares
 SOLVED = 0.005  # distance of tool and target that counts as a solution [m]
@@ -71,10 +68,13 @@ class IkSolutions:
     """
 
     def __init__(
-        self, tables: RobotTables, env_robot_index: torch.Tensor, first_free: FirstFree
+        self,
+        tables: RobotTables,
+        env_robot_index: torch.Tensor,
+        space_of: Callable[[int], FreeSpace],
     ) -> None:
-        """Gather the tables of every environment."""
-        index, self._first_free = env_robot_index, first_free
+        """Gather the tables of every environment; ``space_of`` returns its scene."""
+        index, self._space_of = env_robot_index, space_of
         self._tables, self._index = tables, index
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
@@ -144,7 +144,8 @@ class IkSolutions:
         chosen = []  # the first free one; if all paths collide, the nearest
         for i, env in enumerate(rows.tolist()):
             preferred = order[: solved[i], i]
-            chosen.append(order[self._first_free(env, here[i], ends[preferred, i]) or 0, i])
+            first = self._space_of(env).first_reachable(here[i], ends[preferred, i])
+            chosen.append(order[first or 0, i])
         best = torch.tensor(np.array(chosen), device=rows.device)
         column = torch.arange(len(rows), device=rows.device)
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
@@ -237,9 +238,9 @@ class KinematicChannels:
         names: Sequence[str],
         *,
         has_block: torch.Tensor,
-        first_free: FirstFree,
+        space_of: Callable[[int], FreeSpace],
     ) -> None:
-        """Gather the tables of every environment."""
+        """Gather the tables of every environment; ``space_of`` returns its scene."""
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
         self._has_block = has_block if bool(has_block.any()) else None
@@ -251,7 +252,7 @@ class KinematicChannels:
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5  # 150 N m become one
         self._is_prismatic = tables.is_prismatic[index].float()
-        self._solutions = IkSolutions(tables, index, first_free) if "ik" in names else None
+        self._solutions = IkSolutions(tables, index, space_of) if "ik" in names else None
         needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
         self._tree = (
             compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)

@@ -24,7 +24,6 @@ from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import OBJECT, A, EnvSpec
 from morphgen.tasks.task_groups import TaskGroups
-from morphgen.typing import Array
 
 Observation = dict[str, torch.Tensor]
 """``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``obstacles`` (n, O, 13) and
@@ -238,6 +237,7 @@ class EpisodeLayouts:
     """Draws the layout of every episode, and holds the current poses of all obstacles.
 
     Attributes:
+        specs: Specification of each environment.
         poses: Current poses of the obstacles in the world, shape (n, O, 7); zeros where an
             environment has fewer than O. Updated in place.
         entries: Observation of the obstacles, ``obstacles`` and ``obstacle_mask``; all padding if
@@ -255,9 +255,11 @@ class EpisodeLayouts:
     ) -> None:
         """Begin with the first layout of every environment."""
         device = env_robot_index.device
-        self._specs = [specs[i] for i in env_robot_index.tolist()]
+        self._robots = env_robot_index.tolist()
+        self.specs = [specs[i] for i in self._robots]
         self._index = env_robot_index
-        scenes = [spec.scene for spec in self._specs]
+        self._spaces: dict[int, FreeSpace] = {}
+        scenes = [spec.scene for spec in self.specs]
         choices = [layouts_of(spec.config, side) for spec in specs]
         first, count = torch.tensor([(each.start, len(each)) for each in choices]).T.to(device)
         self._first, self._count = first[env_robot_index], count[env_robot_index]
@@ -287,15 +289,28 @@ class EpisodeLayouts:
 
     def obstacles(self, env: int) -> tuple[Block, ...]:
         """Return the obstacles of an environment at their current poses."""
-        spec, layout = self._specs[env], int(self.current[env])
+        spec, layout = self.specs[env], int(self.current[env])
         if layout < 0:
             return ()
         return place_boxes(spec.scene.obstacles, spec.goals.layouts[layout])
 
     def scene(self, env: int) -> Scene:
         """Return the scene of an environment with its obstacles at their current poses."""
-        scene: Scene = self._specs[env].scene
+        scene: Scene = self.specs[env].scene
         return replace(scene, obstacles=self.obstacles(env))
+
+    def space(self, env: int) -> FreeSpace:
+        """Return the scene of an environment for tests of collisions; the next call may move it."""
+        robot = self._robots[env]
+        if robot not in self._spaces:
+            self._spaces[robot] = FreeSpace(self.scene(env))
+        elif obstacles := self.obstacles(env):
+            self._spaces[robot].place_obstacles([obstacle.pose for obstacle in obstacles])
+        return self._spaces[robot]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which compiles the scenes again."""
+        return vars(self) | {"_spaces": {}}
 
     def _place(self) -> None:
         """Put the obstacles where the current layouts have them."""
@@ -393,50 +408,6 @@ def _normal(uniform: torch.Tensor) -> torch.Tensor:
     return torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
 
 
-SAME = 0.02  # largest difference of joints between configurations that count as the same [rad or m]
-COMPARED = 12  # number of different configurations whose paths are tested
-
-
-class StraightPaths:
-    """Finds the first configuration that a robot reaches on a straight path without a collision.
-
-    Links, the ground and the obstacles of the running episode count; see ``FreeSpace``.
-    """
-
-    def __init__(self, layouts: EpisodeLayouts, env_robot_index: torch.Tensor) -> None:
-        """Prepare tests in all environments; a robot's scene is compiled when it is first used."""
-        self._layouts, self._robots = layouts, env_robot_index.tolist()
-        self._spaces: dict[int, FreeSpace] = {}
-
-    def __call__(self, env: int, start: Array, ends: Array) -> int | None:
-        """Return the index of the first of some ends (k, J) with a free path from (J,), or None."""
-        space = self.space(env)
-        dof = space.scene.robot.dof
-        tested: list[Array] = []
-        for i, end in enumerate(ends[:, :dof]):
-            if any(np.abs(end - other).max() < SAME for other in tested):
-                continue  # many starts of inverse kinematics end in one configuration
-            if space.free_fraction(start[:dof], end) == 1:
-                return i
-            tested.append(end)
-            if len(tested) == COMPARED:
-                break
-        return None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which compiles the scenes again."""
-        return vars(self) | {"_spaces": {}}
-
-    def space(self, env: int) -> FreeSpace:
-        """Return the scene of an environment, with its obstacles at their current poses."""
-        robot = self._robots[env]
-        if robot not in self._spaces:
-            self._spaces[robot] = FreeSpace(self._layouts.scene(env))
-        elif obstacles := self._layouts.obstacles(env):
-            self._spaces[robot].place_obstacles([obstacle.pose for obstacle in obstacles])
-        return self._spaces[robot]
-
-
 @dataclass(frozen=True, eq=False)
 class PhysicsState:
     """State of the robots and blocks of n environments; see ``Simulation``."""
@@ -459,13 +430,11 @@ class BatchObservation:
     def __init__(
         self,
         robot_tables: RobotTables,
-        specs: Sequence[EnvSpec],
         env_robot_index: torch.Tensor,
         groups: TaskGroups,
         layouts: EpisodeLayouts,
         action_mask: torch.Tensor,
         config: ObservationConfig,
-        paths: StraightPaths,
     ) -> None:
         """Gather the tables of all environments."""
         self._config, self._groups, self._layouts = config, groups, layouts
@@ -473,7 +442,7 @@ class BatchObservation:
         self.tokens: LinkTokens[torch.Tensor] = LinkTokens(robot_tables, index)
         self.link_joints: LinkJoints[torch.Tensor] = LinkJoints(robot_tables, index)
         self.tool_positions = FramePositions(robot_tables.tool_chain, index)
-        scenes = [specs[i].scene for i in index.tolist()]
+        scenes = [spec.scene for spec in layouts.specs]
         self._constant_entries = {
             "links": robot_tables.link_mask[index],
             "actions": action_mask,
@@ -488,7 +457,7 @@ class BatchObservation:
         if names := config.kinematic_channels:
             has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
             self._kinematics = KinematicChannels(
-                robot_tables, index, names, has_block=has_block, first_free=paths
+                robot_tables, index, names, has_block=has_block, space_of=layouts.space
             )
         self._points: PointClouds | None = None
         if config.points:

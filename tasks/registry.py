@@ -152,7 +152,8 @@ class Registry(Generic[T]):
 
 def _require_task(task: Task[Any, Any]) -> None:
     """Require a task's name, constants and fields, and methods that take their arguments."""
-    from morphgen.tasks.task import STANDARD_FIELDS  # imports numpy, which names alone do not need
+    # They import numpy, which names alone do not need.
+    from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
 
     where = f"task {task.name!r}"
     if not re.fullmatch("[a-z][a-z0-9]*", task.name):
@@ -160,6 +161,8 @@ def _require_task(task: Task[Any, Any]) -> None:
     for name in ("config_type", "goal_set_type", "goal_format", "cache_folder", "fields"):
         if not hasattr(task, name):
             raise TaskError(f"{where}: the class attribute {name!r} is missing")
+    if not issubclass(task.config_type, TaskConfig):
+        raise TaskError(f"{where}: config_type is {task.config_type}; expected a TaskConfig")
     named = getattr(task.config_type, "task", None)
     if named != task.name:
         raise TaskError(f"{where}: config_type.task is {named!r}; expected {task.name!r}")

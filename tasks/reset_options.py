@@ -11,7 +11,7 @@ import torch
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.free_space import outside_limits
-from morphgen.tasks.observation import StraightPaths
+from morphgen.tasks.observation import EpisodeLayouts
 from morphgen.tasks.task import EnvSpec
 from morphgen.tasks.task_groups import TaskGroups
 from morphgen.typing import Array
@@ -20,96 +20,90 @@ Q = "q"  # option of every task: joint positions at the start
 ROUNDING = 1e-6  # distance beyond a joint limit that single precision explains [rad or m]
 
 
-class EpisodePlacer:
-    """Begins episodes at the joint positions, goals or blocks that options of ``reset`` name."""
+def place_episodes(
+    options: Mapping[str, Any],
+    groups: TaskGroups,
+    layouts: EpisodeLayouts,
+    q: torch.Tensor,
+    block_pose: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return q (n, J) and block poses (n, 7) of episodes that were drawn, after the options.
 
-    def __init__(
-        self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, spaces: StraightPaths
-    ) -> None:
-        """Keep what describes the environments."""
-        self._specs = [specs[i] for i in env_robot_index.tolist()]
-        self._spaces = spaces
-
-    def __call__(
-        self,
-        options: Mapping[str, Any],
-        groups: TaskGroups,
-        q: torch.Tensor,
-        block_pose: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return q (n, J) and block poses (n, 7) of episodes that were drawn, after the options."""
-        rows = self._rows(options, groups)
-        q, block_pose = q.clone(), block_pose.clone()
-        for env, (spec, wanted) in enumerate(zip(self._specs, rows, strict=True)):
-            robot = spec.robot
-            space = self._spaces.space(env)
-            drawn_q, drawn_block = (
-                rows[env].double().cpu().numpy() for rows in (q[:, : robot.dof], block_pose)
-            )
-            start = drawn_q
-            if Q in wanted:
-                low, high = joint_limits(robot).T
-                start = np.clip(wanted[Q], low - ROUNDING, high + ROUNDING)
-                for _, fault in outside_limits(robot, wanted[Q][None]):
-                    if not np.array_equal(start, wanted[Q]):
-                        raise TaskError(f"reset: option 'q' of {robot.name!r}: {fault}")
-                start = np.clip(start, low, high)
-            try:
-                start, block = groups.place(env, wanted, space, start, drawn_block)
-            except TaskError as error:
-                raise TaskError(f"reset: {robot.name!r} at {spec.task}: {error}") from error
-            if np.array_equal(start, drawn_q) and np.array_equal(block, drawn_block):
-                continue  # which is free as it was drawn
-            blocks = None if spec.scene.block is None else block[None]
-            if not space.free(start[None], blocks)[0]:
-                raise TaskError(
-                    f"reset: {robot.name!r} at {spec.task}: the start q {_text(start)} collides "
-                    f"with itself or the scene{_among(spec)}"
-                )
-            q[env, : robot.dof] = torch.from_numpy(start)
-            block_pose[env] = torch.from_numpy(block)
-        return q, block_pose
-
-    def _rows(self, options: Mapping[str, Any], groups: TaskGroups) -> list[dict[str, Array]]:
-        """Return the options of each environment as vectors of finite numbers."""
-        if not isinstance(options, Mapping):
-            raise TaskError(f"reset: options {options!r}: expected a dictionary")
-        known = groups.reset_options
-        rows: list[dict[str, Array]] = [{} for _ in self._specs]
-        for name, value in options.items():
-            if name != Q and name not in known:
-                tasks = " and ".join(dict.fromkeys(spec.task for spec in self._specs))
-                hint = nearest(str(name), [Q, *known])
-                raise TaskError(f"reset: unknown option {name!r} of {tasks}{hint}")
-            for row, vector, spec in zip(rows, self._each(name, value), self._specs, strict=True):
-                dof = spec.robot.dof
-                if name == Q and vector.ndim == 1 and len(vector) > dof and len(rows) > 1:
-                    vector = vector[:dof]  # rows of a batch are padded
-                sizes = (dof,) if name == Q else known[name]
-                if vector.ndim != 1 or len(vector) not in sizes:
-                    wanted = " or ".join(f"({size},)" for size in sizes)
-                    raise TaskError(
-                        f"reset: option {name!r} of {spec.robot.name!r} has shape {vector.shape}; "
-                        f"expected {wanted}"
-                    )
-                if not np.isfinite(vector).all():
-                    raise TaskError(
-                        f"reset: option {name!r} {_text(vector)}: expected finite numbers"
-                    )
-                row[name] = vector
-        return rows
-
-    def _each(self, name: str, value: Any) -> list[Array]:  # noqa: ANN401 - as the caller gave it
-        """Return the vector of an option for each environment."""
+    Options name joint positions, and goals or blocks where the tasks allow it.
+    """
+    wanted_rows = _rows(options, groups, layouts.specs)
+    q, block_pose = q.clone(), block_pose.clone()
+    for env, (spec, wanted) in enumerate(zip(layouts.specs, wanted_rows, strict=True)):
+        robot, space = spec.robot, layouts.space(env)
+        drawn_q, drawn_block = (
+            rows[env].double().cpu().numpy() for rows in (q[:, : robot.dof], block_pose)
+        )
+        start = drawn_q
+        if Q in wanted:
+            low, high = joint_limits(robot).T
+            start = np.clip(wanted[Q], low - ROUNDING, high + ROUNDING)
+            for _, fault in outside_limits(robot, wanted[Q][None]):
+                if not np.array_equal(start, wanted[Q]):
+                    raise TaskError(f"reset: option 'q' of {robot.name!r}: {fault}")
+            start = np.clip(start, low, high)
         try:
-            if isinstance(value, torch.Tensor):
-                value = value.detach().cpu()
-            is_list = isinstance(value, Sequence | np.ndarray) and len(value) == len(self._specs)
-            if is_list and all(np.ndim(each) == 1 for each in value):
-                return [np.array(each, np.float64) for each in value]
-            return [np.array(value, np.float64)] * len(self._specs)
-        except (TypeError, ValueError) as error:
-            raise TaskError(f"reset: option {name!r} {value!r}: expected numbers") from error
+            start, block = groups.place(env, wanted, space, start, drawn_block)
+        except TaskError as error:
+            raise TaskError(f"reset: {robot.name!r} at {spec.task}: {error}") from error
+        if np.array_equal(start, drawn_q) and np.array_equal(block, drawn_block):
+            continue  # which is free as it was drawn
+        blocks = None if spec.scene.block is None else block[None]
+        if not space.free(start[None], blocks)[0]:
+            raise TaskError(
+                f"reset: {robot.name!r} at {spec.task}: the start q {_text(start)} collides "
+                f"with itself or the scene{_among(spec)}"
+            )
+        q[env, : robot.dof] = torch.from_numpy(start)
+        block_pose[env] = torch.from_numpy(block)
+    return q, block_pose
+
+
+def _rows(
+    options: Mapping[str, Any], groups: TaskGroups, specs: Sequence[EnvSpec]
+) -> list[dict[str, Array]]:
+    """Return the options of each environment as vectors of finite numbers."""
+    if not isinstance(options, Mapping):
+        raise TaskError(f"reset: options {options!r}: expected a dictionary")
+    known = groups.reset_options
+    rows: list[dict[str, Array]] = [{} for _ in specs]
+    for name, value in options.items():
+        if name != Q and name not in known:
+            tasks = " and ".join(dict.fromkeys(spec.task for spec in specs))
+            hint = nearest(str(name), [Q, *known])
+            raise TaskError(f"reset: unknown option {name!r} of {tasks}{hint}")
+        for row, vector, spec in zip(rows, _each(name, value, len(specs)), specs, strict=True):
+            dof = spec.robot.dof
+            if name == Q and vector.ndim == 1 and len(vector) > dof and len(rows) > 1:
+                vector = vector[:dof]  # rows of a batch are padded
+            sizes = (dof,) if name == Q else known[name]
+            if vector.ndim != 1 or len(vector) not in sizes:
+                wanted = " or ".join(f"({size},)" for size in sizes)
+                raise TaskError(
+                    f"reset: option {name!r} of {spec.robot.name!r} has shape {vector.shape}; "
+                    f"expected {wanted}"
+                )
+            if not np.isfinite(vector).all():
+                raise TaskError(f"reset: option {name!r} {_text(vector)}: expected finite numbers")
+            row[name] = vector
+    return rows
+
+
+def _each(name: str, value: Any, count: int) -> list[Array]:  # noqa: ANN401 - as the caller gave it
+    """Return the vector of an option for each environment."""
+    try:
+        if isinstance(value, torch.Tensor):
+            value = value.detach().cpu()
+        is_list = isinstance(value, Sequence | np.ndarray) and len(value) == count
+        if is_list and all(np.ndim(each) == 1 for each in value):
+            return [np.array(each, np.float64) for each in value]
+        return [np.array(value, np.float64)] * count
+    except (TypeError, ValueError) as error:
+        raise TaskError(f"reset: option {name!r} {value!r}: expected numbers") from error
 
 
 def unit_quaternion(values: Array, name: str) -> Array:

@@ -12,7 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,86 +87,92 @@ class StepFormulas(ABC, Generic[A]):
         """Return the task's observation fields by name from poses of the block, shape (k, 7)."""
 
 
-class TaskConfig(Protocol):
-    """Constants of a task: a frozen dataclass whose fields all have defaults."""
+class TaskConfig:
+    """Constants of a task: base of a frozen dataclass whose fields all have defaults."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     task: ClassVar[str]
     """Name of the task."""
+    file_keys: ClassVar[Mapping[str, str]] = {}
+    """Keys in files of the fields that have another name there."""
+    max_episode_steps: int
+    """Time limit of an episode [control steps]."""
+    num_goals: int
+    """Number of goals in a robot's goal set."""
+    obstacles: int
+    """Number of boxes in the scene if obstacles are requested."""
+    obstacle_size: tuple[float, float]
+    """Range of the edge lengths of these boxes, relative to the robot's reach."""
+    train_layouts: int
+    """Number of layouts of these boxes that training draws its episodes from."""
+    eval_layouts: int
+    """Number of further layouts that evaluation draws its episodes from."""
 
-    @property
-    def max_episode_steps(self) -> int:
-        """Time limit of an episode [control steps]."""
+    def __post_init__(self) -> None:
+        """Require valid values of the constants of every task, and only finite numbers or text."""
+        name = type(self).__name__
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, str) and isinstance(field.default, str):
+                continue
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(isinstance(each, int | float) and math.isfinite(each) for each in numbers):
+                raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
+        # The largest are far above all uses: a file from elsewhere shall not fill the memory.
+        for field_name, minimum, maximum in (
+            ("max_episode_steps", 1, 1_000_000),
+            ("num_goals", 1, 1_000_000),
+            ("obstacles", 0, 1_000),
+            ("train_layouts", 1, 1_000_000),
+            ("eval_layouts", 1, 1_000_000),
+        ):
+            value = getattr(self, field_name)
+            if not isinstance(value, int) or not minimum <= value <= maximum:
+                raise TaskError(
+                    f"{name}: {field_name} {value!r}: expected an integer >= {minimum} and "
+                    f"<= {maximum:,}"
+                )
+        low, high = self.obstacle_size
+        if not 0 < low <= high:
+            raise TaskError(
+                f"{name}: obstacle_size {self.obstacle_size}: expected 0 < lowest <= highest"
+            )
 
-    @property
-    def num_goals(self) -> int:
-        """Number of goals in a robot's goal set."""
 
-    @property
-    def obstacles(self) -> int:
-        """Number of boxes in the scene if obstacles are requested."""
+class GoalSet:
+    """Starts and goals of a robot's episodes: base of a frozen dataclass.
 
-    @property
-    def obstacle_size(self) -> tuple[float, float]:
-        """Range of the edge lengths of these boxes, relative to the robot's reach."""
-
-    @property
-    def train_layouts(self) -> int:
-        """Number of layouts of these boxes that training draws its episodes from."""
-
-    @property
-    def eval_layouts(self) -> int:
-        """Number of further layouts that evaluation draws its episodes from."""
-
-
-class GoalSet(Protocol):
-    """Starts and goals of a robot's episodes: a frozen dataclass of arrays, boxes and numbers."""
+    Its fields are arrays, boxes and numbers.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     start_belongs_to_goal: ClassVar[bool]
     """Whether two goals are the same only if their start configurations are the same, too."""
     not_compared: ClassVar[frozenset[str]]
     """Fields that an audit certifies, but does not compare with those of a set sampled anew."""
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot."""
-
-    @property
-    def key(self) -> str:
-        """Hash of everything that the set depends on: 64 hexadecimal digits."""
-
-    @property
-    def q(self) -> Array:
-        """Start configurations of episodes, shape (G, dof) [rad or m]."""
+    robot: str
+    """Name of the robot."""
+    key: str
+    """Hash of everything that the set depends on: 64 hexadecimal digits."""
+    q: Array
+    """Start configurations of episodes, shape (G, dof) [rad or m]."""
+    obstacles: tuple[Block, ...]
+    """Boxes in the robot's workspace, at the poses of the first layout."""
+    layouts: Array
+    """Poses of the boxes in the world in each layout, those for training first, (L, O, 7)."""
+    usable: NDArray[np.bool_]
+    """Whether each layout leaves each goal possible, shape (L, G)."""
+    tried: int
+    """Number of tested candidates."""
+    accepted: int
+    """Number of candidates that became goals: G."""
+    seed: int
+    """Seed of the random numbers."""
 
     @property
     def goal_poses(self) -> Array:
         """Pose that identifies each goal, position and quaternion wxyz, shape (G, 7)."""
-
-    @property
-    def obstacles(self) -> tuple[Block, ...]:
-        """Boxes in the robot's workspace, at the poses of the first layout."""
-
-    @property
-    def layouts(self) -> Array:
-        """Poses of the boxes in the world in each layout, those for training first, (L, O, 7)."""
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Whether each layout leaves each goal possible, shape (L, G)."""
-
-    @property
-    def tried(self) -> int:
-        """Number of tested candidates."""
-
-    @property
-    def accepted(self) -> int:
-        """Number of candidates that became goals: G."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the random numbers."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,34 +500,3 @@ def require_returned(
     if not is_expected:
         returned = type(result).__name__
         raise TaskError(f"task {task!r}: {method} returned {returned}; expected {expected}")
-
-
-def require_task_config(config: TaskConfig) -> None:
-    """Require valid values of the constants of every task, and only finite numbers or text."""
-    name = type(config).__name__
-    for field in fields(config):
-        value = getattr(config, field.name)
-        if isinstance(value, str) and isinstance(field.default, str):
-            continue
-        numbers = value if isinstance(value, tuple) else (value,)
-        if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
-            raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
-    # The largest are far above all uses: a file from elsewhere shall not fill the memory.
-    for field_name, minimum, maximum in (
-        ("max_episode_steps", 1, 1_000_000),
-        ("num_goals", 1, 1_000_000),
-        ("obstacles", 0, 1_000),
-        ("train_layouts", 1, 1_000_000),
-        ("eval_layouts", 1, 1_000_000),
-    ):
-        value = getattr(config, field_name)
-        if not isinstance(value, int) or not minimum <= value <= maximum:
-            raise TaskError(
-                f"{name}: {field_name} {value!r}: expected an integer >= {minimum} and "
-                f"<= {maximum:,}"
-            )
-    low, high = config.obstacle_size
-    if not 0 < low <= high:
-        raise TaskError(
-            f"{name}: obstacle_size {config.obstacle_size}: expected 0 < lowest <= highest"
-        )

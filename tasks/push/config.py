@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError
-from morphgen.tasks.task import require_task_config
+from morphgen.tasks.task import TaskConfig
 
 
 @dataclass(frozen=True)
-class PushConfig:
+class PushConfig(TaskConfig):
     """Push a block across a line; the episode ends when it is across (paper, B.3)."""
 
     task: ClassVar[str] = "push"
     file_keys: ClassVar[dict[str, str]] = {"max_episode_steps": "steps", "num_goals": "starts"}
-    """Keys in files of the fields that have another name there."""
 
     max_episode_steps: int = 300
     """Time limit of an episode, 6 s [control steps]."""
@@ -40,13 +39,9 @@ class PushConfig:
     friction: float = 1.0
     """Friction coefficient of the block."""
     obstacles: int = 3
-    """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
-    """Range of the edge lengths of these boxes, relative to the robot's reach."""
     train_layouts: int = 20
-    """Number of layouts of these boxes for training."""
     eval_layouts: int = 10
-    """Number of further layouts for evaluation."""
     curriculum_steps: int = 50
     """Number of equal steps in which the line moves during the first half of the training."""
     curriculum_start: float = 0.1
@@ -60,7 +55,7 @@ class PushConfig:
 
     def __post_init__(self) -> None:
         """Require constants that describe a push."""
-        require_task_config(self)
+        super().__post_init__()
         low, high = self.block_size
         if self.curriculum_steps < 1:
             raise TaskError(f"a curriculum of {self.curriculum_steps} steps: expected 1 or more")

@@ -25,6 +25,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
 
 FULL_REACH = 0.4  # reach below which everything is scaled down in proportion [m]
@@ -161,7 +162,6 @@ NEAREST = (1, 2, 3, 6)
 _SPACING = 0.125  # distance of the tested poses on a path, in block edges
 _BANK = 2048  # number of free configurations to collect
 _DRAWN, _ROUNDS = 65_536, 8  # configurations drawn per round, and number of rounds
-_FEW = 8192  # number of configurations whose tools are computed at a time
 _ARRIVED = 1e-6  # distance from its goal at which inverse kinematics leaves a tool [m]
 _LOW, _HIGH = 0.15, 0.85  # range of heights of the tool, in block edges
 
@@ -287,7 +287,8 @@ def sample_tools_in_box(
     kept, kept_tools = np.zeros((0, robot.dof)), np.zeros((0, 3))
     for _ in range(_ROUNDS):
         q = random_configurations(robot, _DRAWN, rng)
-        tools, inside = _tools_in_box(robot, q, low, high)
+        tools = frame_positions(robot, np.ascontiguousarray(q.T)).T
+        inside = np.flatnonzero(((tools > low) & (tools < high)).all(axis=1))[:_BANK]
         free = inside[space.free(q[inside])]
         kept = np.concatenate([kept, q[free]])
         kept_tools = np.concatenate([kept_tools, tools[free]])
@@ -296,32 +297,10 @@ def sample_tools_in_box(
     return kept[:_BANK], kept_tools[:_BANK]
 
 
-def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Array, Indices]:
-    """Return tools (m, 3) of the first m configurations, and indices of those in a box.
-
-    There are ``_BANK`` indices at most, increasing; the other tools are not computed.
-    """
-    tools, inside = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-    for begin in range(0, len(q), _FEW):
-        few = frame_positions(robot, np.ascontiguousarray(q[begin : begin + _FEW].T)).T
-        tools = np.concatenate([tools, few])
-        inside = np.append(inside, begin + np.flatnonzero(((few > low) & (few < high)).all(axis=1)))
-        if len(inside) >= _BANK:
-            break
-    return tools, inside[:_BANK]
-
-
 def _nearest(goals: Array, points: Array, count: int) -> Indices:
     """Return indices of the points (m, 2) nearest to goals (n, 2), in order, (n, up to count)."""
-    count = min(count, len(points))
     x, y = (goals[:, i, None] - points[:, i] for i in range(2))
-    distance = np.sqrt(x * x + y * y)
-    farthest = np.partition(distance, count - 1, axis=1)[:, count - 1 : count]
-    nearest = np.empty((len(goals), count), dtype=np.int64)
-    for i, row in enumerate(distance):  # points at equal distance in the order of their indices
-        candidates = np.flatnonzero(row <= farthest[i])
-        nearest[i] = candidates[np.argsort(row[candidates], kind="stable")][:count]
-    return nearest
+    return np.argsort(np.sqrt(x * x + y * y), axis=1, kind="stable")[:, :count]
 
 
 def _yaws(blocks: Array) -> Array:
@@ -337,7 +316,7 @@ _CONFIGURATIONS = 1000  # free configurations to test for a start before giving 
 
 
 @dataclass(frozen=True, eq=False)
-class PushStartSet:
+class PushStartSet(GoalSet):
     """Starts of a robot's push episodes, and the block and obstacles that they share.
 
     See ``GoalSet`` for the fields that all tasks have.
@@ -357,8 +336,7 @@ class PushStartSet:
     ground: float  # height of the ground [m]
     obstacles: tuple[Block, ...]
     layouts: Array
-    usable: NDArray[np.bool_]
-    """Which starts are feasible in each layout, by their certificates, shape (L, S)."""
+    usable: NDArray[np.bool_]  # which starts are feasible in each layout, by their certificates
     tried: int
     accepted: int
     seed: int

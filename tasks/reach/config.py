@@ -8,16 +8,15 @@ from typing import ClassVar
 
 from morphgen.errors import TaskError, nearest
 from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.task import require_task_config
+from morphgen.tasks.task import TaskConfig
 
 
 @dataclass(frozen=True)
-class ReachConfig:
+class ReachConfig(TaskConfig):
     """Bring the tool to a goal and keep it there; the episode does not end early (paper, B.3)."""
 
     task: ClassVar[str] = "reach"
     file_keys: ClassVar[dict[str, str]] = {"max_episode_steps": "steps", "num_goals": "goals"}
-    """Keys in files of the fields that have another name there."""
 
     max_episode_steps: int = 300
     """Duration of an episode, 6 s [control steps]."""
@@ -26,13 +25,9 @@ class ReachConfig:
     near: float = 0.03
     """Distance between tool and goal that counts as success (paper, table of rewards) [m]."""
     obstacles: int = 3
-    """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
-    """Range of the edge lengths of these boxes, relative to the robot's reach."""
     train_layouts: int = 20
-    """Number of layouts of these boxes for training."""
     eval_layouts: int = 10
-    """Number of further layouts for evaluation."""
     joint_limit_weight: float = 1.0
     joint_acceleration_weight: float = 1e-5
     distance_weight: float = 1.0
@@ -59,7 +54,7 @@ class ReachConfig:
 
     def __post_init__(self) -> None:
         """Require constants that describe a reach."""
-        require_task_config(self)
+        super().__post_init__()
         if not self.near > 0:
             raise TaskError(f"near {self.near:g}: expected a positive distance [m]")
         if self.goal not in GOAL_KINDS:

@@ -27,7 +27,7 @@ from morphgen.tasks.free_space import (
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.task import GOAL, EnvSpec, Marker, Task
+from morphgen.tasks.task import GOAL, EnvSpec, GoalSet, Marker, Task
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ EXACT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class ReachGoalSet:
+class ReachGoalSet(GoalSet):
     """Goals of a robot, which are also its starts, and its obstacles; see ``GoalSet``."""
 
     start_belongs_to_goal: ClassVar[bool] = False

@@ -58,21 +58,15 @@ class GoalConfig:
         data = {}
         for name in dict.fromkeys((*TASKS.builtin, *(c.task for c in self.tasks), *used)):
             config = self.task_config(name)
-            keys, constants = _file_keys(config), asdict(config)
+            keys, constants = config.file_keys, asdict(config)
             data[name] = {keys.get(field, field): value for field, value in constants.items()}
         return data
 
 
 def config_fields(task: str, constants: Mapping[str, Any]) -> dict[str, Any]:
     """Return a task's constants from a file by the names of the fields of its config."""
-    fields = {key: field for field, key in _file_keys(TASKS[task].config_type).items()}
+    fields = {key: field for field, key in TASKS[task].config_type.file_keys.items()}
     return {fields.get(key, key): value for key, value in constants.items()}
-
-
-def _file_keys(config: TaskConfig | type[TaskConfig]) -> dict[str, str]:
-    """Return ``file_keys`` of a config, which tasks of other packages need not have."""
-    keys: dict[str, str] = getattr(config, "file_keys", {})
-    return keys
 
 
 def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...]:

@@ -324,6 +324,7 @@ def test_starts_and_goals_are_free_in_their_layout(build_layouts):
     for _ in range(10):
         batch.reset()
         reach, push = (FreeSpace(batch.layouts.scene(env)) for env in (0, 1))
+        assert batch.layouts.space(0).scene == batch.layouts.scene(0)
         goal = batch.groups["reach"].goal_configuration[0, : batch.specs[0].robot.dof]
         start = batch.q[0, : batch.specs[0].robot.dof]
         assert reach.free(torch.stack([goal, start]).double().numpy()).all()

@@ -7,7 +7,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from helpers.goal_sets import draw_goals
 from helpers.scenes import ball, push_scene, reach_scene, real_arm_scene
@@ -18,8 +17,7 @@ from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space as module
-from morphgen.tasks.free_space import FreeSpace, cspace_components, in_other_component
-from morphgen.tasks.observation import SAME, StraightPaths
+from morphgen.tasks.free_space import SAME, FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.sim.base import Block, Scene
@@ -391,29 +389,15 @@ def test_joints_that_do_not_move_the_tool_are_not_split():
 START, BEHIND, BESIDE = np.array([-0.5, 0.0]), np.array([0.5, 0.0]), np.array([-0.5, 0.5])
 
 
-class Layouts:
-    """Two environments of a ball on slides along x and y; in the first there is a wall."""
-
-    wall = Block((0.2, 0.4, 0.4), Pose((0.0, 0.0, 0.2)))
-
-    def obstacles(self, env):
-        return (self.wall,) if env == 0 else ()
-
-    def scene(self, env):
-        return Scene(ball(0.2), obstacles=self.obstacles(env))
-
-
 def test_the_first_end_with_a_free_path_is_found():
-    layouts = Layouts()
-    first_free = StraightPaths(layouts, torch.tensor([0, 1]))
-    assert first_free(0, START, np.array([BEHIND, BESIDE])) == 1
-    assert first_free(0, START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
-    assert first_free(0, START, BEHIND[None]) is None
-    assert first_free(0, START, np.zeros((0, 2))) is None
-    assert first_free(1, START, np.array([BEHIND, BESIDE])) == 0
+    wall = Block((0.2, 0.4, 0.4), Pose((0.0, 0.0, 0.2)))
+    space, empty = FreeSpace(Scene(ball(0.2), obstacles=(wall,))), FreeSpace(Scene(ball(0.2)))
+    assert space.first_reachable(START, np.array([BEHIND, BESIDE])) == 1
+    assert space.first_reachable(START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
+    assert space.first_reachable(START, BEHIND[None]) is None
+    assert space.first_reachable(START, np.zeros((0, 2))) is None
+    assert empty.first_reachable(START, np.array([BEHIND, BESIDE])) == 0
     padded = np.array([[*BEHIND, 0.0], [*BESIDE, 0.0]])
-    assert first_free(0, np.array([*START, 9.0]), padded) == 1
-    layouts.wall = replace(
-        layouts.wall, pose=Pose((0.0, 2.0, 0.2))
-    )  # obstacles count where they are
-    assert first_free(0, START, BEHIND[None]) == 0
+    assert space.first_reachable(np.array([*START, 9.0]), padded) == 1
+    space.place_obstacles([Pose((0.0, 2.0, 0.2))])  # obstacles count where they are
+    assert space.first_reachable(START, BEHIND[None]) == 0

@@ -115,6 +115,7 @@ def test_faults_are_named(make, parts, message):
         ({"name": "Hover-Task"}, "'Hover-Task': expected a name of lower-case letters and digits"),
         ({"name": "float"}, "'float': config_type.task is 'hover'; expected 'float'"),
         ({"config_type": None}, "'hover': the class attribute 'config_type' is missing"),
+        ({"config_type": int}, "'hover': config_type is .*int.*; expected a TaskConfig"),
         (
             {"sample": lambda self, robot, config: None},
             r"'hover': sample\(robot, config\): got an unexpected keyword argument 'obstacles'",
