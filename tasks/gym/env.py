@@ -49,7 +49,6 @@ from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
-from morphgen.tasks.sim.motor_law import TensorView
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -80,7 +79,6 @@ class NumpyStepper:
         self._normalized = np.zeros(batch.action_mask.shape[1], np.float32)
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
-        self._diverged = TensorView()
         self._view_state()
         self._constant: NumpyObservation = {}
         self._requested: Callable[[], NumpyObservation] = dict
@@ -131,7 +129,7 @@ class NumpyStepper:
         q, block_pose = self._q.copy(), self._block_pose.copy()
         simulation = self._batch.simulation
         mask = simulation.step(self._batch.targets)
-        diverged = bool(self._diverged(mask)[0])
+        diverged = bool(mask)  # of one environment
         if diverged:
             simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(block_pose[None]))
             self._motion.previous_qd[:] = 0

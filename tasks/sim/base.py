@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.errors import SimulationError
 from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own weight
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
+from morphgen.typing import Array
 
 if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
     import torch
@@ -43,7 +47,7 @@ class Block:
     pose: Pose = IDENTITY
     """Pose of its centre in the world."""
     mass: float = 0.0
-    """Mass [kg]; a block without mass does not move."""
+    """Mass [kg]; only the movable block of a scene has one."""
     friction: float = 1.0
     """Friction coefficient."""
 
@@ -55,10 +59,17 @@ class Scene:
     robot: Robot
     T_world_root: Pose = IDENTITY
     block: Block | None = None
-    """Box that the robot can push; None without one."""
+    """Box with a mass that the robot can push; None without one."""
     obstacles: tuple[Block, ...] = ()
     ground: float | None = 0.0
     """Height of a ground plane, or None without one [m]; the root link does not collide with it."""
+
+
+def all_finite(values: NDArray[Any]) -> bool:
+    """Return whether all values are finite."""
+    flat = values.ravel()
+    # They are if the sum of their squares is; it may also overflow.
+    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 @dataclass(frozen=True)
@@ -71,7 +82,7 @@ class Contacts:
     """Whether links collide with each other, except neighbours and ``Robot.ignore_pairs``."""
 
 
-class Simulation(Protocol):
+class Simulation(ABC):
     """Environments with a scene each, stepped together.
 
     Tensors are on ``device``; numbers are float32, padded with zeros to the largest number of
@@ -79,29 +90,30 @@ class Simulation(Protocol):
     influence each other: each gives the same numbers whatever else is in the batch.
 
     On a GPU, ``reset`` and ``step`` read no tensor, so that the caller never waits for them.
+
+    A new simulation is at rest at the home positions and at the poses of its scenes. Subclasses
+    implement ``_reset``, ``_step`` and ``faults``, which get valid arguments.
     """
 
-    device: torch.device
+    q: torch.Tensor
+    """Positions of the independent joints, shape (n, J) [rad or m]."""
+    qd: torch.Tensor
+    """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
+    block_pose: torch.Tensor
+    """Poses of the blocks in the world: x, y, z, qw, qx, qy, qz, (n, 7); zeros without one."""
+
+    def __init__(self, scenes: Sequence[Scene], device: torch.device) -> None:
+        """Keep the scene of each environment."""
+        if not scenes:
+            raise ValueError("there are no scenes; expected one or more")
+        self.scenes, self.device = tuple(scenes), device
+        self._num_obstacles = max(len(scene.obstacles) for scene in scenes)
+        self._is_closed = False
 
     @property
-    def scenes(self) -> Sequence[Scene]:
-        """Scene of each environment."""
-
-    @property
-    def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J) [rad or m]."""
-
-    @property
-    def qd(self) -> torch.Tensor:
-        """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
-
-    @property
-    def block_pose(self) -> torch.Tensor:
-        """Poses of the blocks in the world: x, y, z, qw, qx, qy, qz, (n, 7); zeros without one."""
-
-    @property
+    @abstractmethod
     def block_velocity(self) -> torch.Tensor:
-        """Linear and angular velocities of the blocks in the world, (n, 6); zeros without one."""
+        """Linear velocities of the blocks in the world, (n, 3); zeros without one [m/s]."""
 
     def reset(
         self,
@@ -125,6 +137,21 @@ class Simulation(Protocol):
         Raises:
             ValueError: If a shape is wrong or, on the CPU, a number is not finite.
         """
+        self._require_open()
+        n = len(self.scenes)
+        for name, values, shape in (
+            ("a mask", mask, (n,)),
+            ("q", q, tuple(self.q.shape)),
+            ("blocks", block_pose, (n, 7)),
+            ("obstacles", obstacle_poses, (n, self._num_obstacles, 7)),
+        ):
+            if values is not None and tuple(values.shape) != shape:
+                raise ValueError(
+                    f"reset with {name} of shape {tuple(values.shape)}; expected {shape}"
+                )
+        if str(mask.dtype) != "torch.bool":
+            raise ValueError(f"reset with a mask of type {mask.dtype}; expected torch.bool")
+        self._reset(mask, q, block_pose, obstacle_poses)
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step.
@@ -140,12 +167,144 @@ class Simulation(Protocol):
             ValueError: If the shape is wrong or, on the CPU, a target is not finite.
             SimulationError: If a worker died.
         """
+        self._require_open()
+        if targets.shape != self.q.shape:
+            raise ValueError(
+                f"targets have shape {tuple(targets.shape)}; expected {tuple(self.q.shape)}"
+            )
+        return self._step(targets)
 
+    @abstractmethod
     def faults(self) -> dict[int, str]:
         """Return why each environment diverged in the last step; waits for the device."""
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
+        self._is_closed = True
+
+    @abstractmethod
+    def _reset(
+        self,
+        mask: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None,
+    ) -> None: ...
+
+    @abstractmethod
+    def _step(self, targets: torch.Tensor) -> torch.Tensor: ...
+
+    def _go_home(self) -> None:
+        """Reset all environments to the home positions and to the poses of their scenes."""
+        import torch
+
+        n = len(self.scenes)
+        q, block = torch.zeros(self.q.shape), torch.zeros(n, 7)
+        obstacles = torch.zeros(n, self._num_obstacles, 7)
+        for env, scene in enumerate(self.scenes):
+            q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
+            boxes = [] if scene.block is None else [(block[env], scene.block)]
+            for row, box in (*boxes, *zip(obstacles[env], scene.obstacles, strict=False)):
+                row[:] = torch.tensor((*box.pose.position, *box.pose.quaternion))
+        tensors = (torch.ones(n, dtype=torch.bool), q, block, obstacles)
+        self.reset(*(tensor.to(self.device) for tensor in tensors))
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise SimulationError("the simulation is closed")
+
+    def _label(self, env: int) -> str:
+        return f"environment {env} (robot {self.scenes[env].robot.name!r})"
+
+    def _require_finite(self, what: str, rows: NDArray[Any]) -> None:
+        """Require finite numbers in the row of each environment."""
+        if not all_finite(rows):
+            env = int(np.isfinite(rows.reshape(len(rows), -1)).all(axis=1).argmin())
+            raise ValueError(
+                f"{self._label(env)}: {what} {rows[env].tolist()}; expected finite numbers"
+            )
+
+
+class HostSimulation(Simulation):
+    """A simulation on the CPU by a library that takes arrays of NumPy."""
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Allocate targets."""
+        import torch
+
+        super().__init__(scenes, torch.device("cpu"))
+        dofs = np.array([scene.robot.dof for scene in scenes])
+        self._is_joint: NDArray[np.bool_] = np.arange(dofs.max()) < dofs[:, None]
+        self._has_block = np.array([[scene.block is not None] for scene in scenes])
+        self._targets: Array = np.zeros(self._is_joint.shape)
+        self._seen: torch.Tensor | None = None
+        self._num_steps, self._reset_at = 0, np.zeros(len(scenes), np.int64)
+        self._faults: dict[int, str] = {}
+        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
+
+    @abstractmethod
+    def _put(
+        self,
+        envs: NDArray[np.int64],
+        q: NDArray[Any],
+        block_pose: NDArray[Any],
+        obstacle_poses: NDArray[Any] | None,
+    ) -> None:
+        """Put k environments at rest; all other arguments have k rows."""
+
+    @abstractmethod
+    def _advance(self) -> dict[int, str]:
+        """Step towards ``self._targets``; return the reason for each environment that diverged."""
+
+    def _reset(
+        self,
+        mask: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None,
+    ) -> None:
+        """See ``reset``."""
+        rows = mask.numpy()[:, None]
+        # Padding, poses without a block, and rows that are not reset may hold anything.
+        positions = np.where(rows & self._is_joint, q.numpy(), 0)
+        blocks = np.where(rows & self._has_block, block_pose.numpy(), 0)
+        self._require_finite("reset to q", positions)
+        self._require_finite("reset to block", blocks)
+        obstacles = None
+        envs = np.flatnonzero(rows)
+        if obstacle_poses is not None:
+            moved = np.where(rows[:, None], obstacle_poses.numpy(), 0)
+            self._require_finite("reset to obstacles", moved)
+            obstacles = moved[envs]
+        self._put(envs, positions[envs], blocks[envs], obstacles)
+        self._reset_at[envs] = self._num_steps
+
+    def _step(self, targets: torch.Tensor) -> torch.Tensor:
+        """See ``step``."""
+        if targets is not self._seen:  # to make a view takes 1 to 3 us
+            self._seen, self._given = targets, targets.numpy()
+        np.copyto(self._targets, self._given, where=self._is_joint)  # padding may be anything
+        self._require_finite("targets", self._targets)
+        self._num_steps += 1
+        faults = self._advance()
+        if faults or self._faults:
+            self._report(faults)
+        return self._diverged
+
+    def _report(self, faults: Mapping[int, str]) -> None:
+        """Keep the reasons for environments that diverged."""
+        import torch
+
+        self._faults = {}
+        self._diverged = torch.zeros(len(self.scenes), dtype=torch.bool)
+        for env, reason in sorted(faults.items()):
+            steps = self._num_steps - self._reset_at[env]
+            self._faults[env] = f"{self._label(env)}: diverged in step {steps}: {reason}"
+            self._diverged[env] = True
+
+    def faults(self) -> dict[int, str]:
+        """Return why environments diverged in the last step; see ``Simulation.faults``."""
+        return self._faults
 
 
 @dataclass(frozen=True)
@@ -171,43 +330,3 @@ class Simulator:
     """Distance within which convex meshes push each other away, although they do not touch [m]."""
     takes_workers: bool = True
     """Whether processes or threads share its work; one without steps all environments at once."""
-
-
-def require_finite(scenes: Sequence[Scene], what: str, rows: NDArray[Any]) -> None:
-    """Require finite numbers in the row of each environment."""
-    finite = np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
-    if not finite.all():
-        env = int(finite.argmin())
-        raise ValueError(
-            f"environment {env} (robot {scenes[env].robot.name!r}): {what} {rows[env].tolist()}; "
-            "expected finite numbers"
-        )
-
-
-def require_reset_shapes(
-    scenes: Sequence[Scene],
-    num_joints: int,
-    mask: torch.Tensor,
-    q: torch.Tensor,
-    block_pose: torch.Tensor,
-    obstacle_poses: torch.Tensor | None,
-) -> None:
-    """Require that arguments of ``Simulation.reset`` have the right shapes."""
-    n = len(scenes)
-    if tuple(mask.shape) != (n,) or str(mask.dtype) != "torch.bool":
-        raise ValueError(
-            f"reset with a mask of shape {tuple(mask.shape)} and type {mask.dtype}; expected "
-            f"({n},) and torch.bool"
-        )
-    if tuple(q.shape) != (n, num_joints) or tuple(block_pose.shape) != (n, 7):
-        raise ValueError(
-            f"reset to q of shape {tuple(q.shape)} and blocks of shape {tuple(block_pose.shape)}; "
-            f"expected ({n}, {num_joints}) and ({n}, 7)"
-        )
-    if obstacle_poses is None:
-        return
-    most = max(len(scene.obstacles) for scene in scenes)
-    if tuple(obstacle_poses.shape) != (n, most, 7):
-        raise ValueError(
-            f"reset to obstacles of shape {tuple(obstacle_poses.shape)}; expected ({n}, {most}, 7)"
-        )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import weakref
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,178 +15,132 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator, require_finite, require_reset_shapes
+from morphgen.tasks.sim.base import Contacts, HostSimulation, Scene, Simulator
 from morphgen.tasks.sim.bullet_batch import (
     BulletBatch,
     ExportedRobot,
     Float32,
     Share,
     Worker,
-    allocate,
-    attempt,
-    buffers_in,
+    consecutive,
 )
-from morphgen.tasks.sim.motor_law import TensorView, all_finite, mask_of
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 from morphgen.typing import Array
-
-BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
-"""Arguments of ``BulletBatch.reset``."""
 
 _BASE_LOAD = 5  # cost of stepping an environment without joints, in joints
 
 
-class BulletSimulation:
+class BulletSimulation(HostSimulation):
     """Environments in PyBullet, divided among processes of which this is one; a ``Simulation``.
 
     Every environment has its own client, so that none can influence another, and the bits are the
     same for any number of processes. A client takes 36 MB and some 25 ms to start, whatever is in
     it; a process can have 1024.
 
-    A step sends a few bytes through a pipe to every worker and back, while this process steps its
-    own share; targets and states are in shared memory. That memory has no name, so that nothing is
-    left of it whatever happens to the processes, and a worker ends when its pipe does. Workers are
-    started afresh ("spawn"): a script that makes them needs ``if __name__ == "__main__":``.
+    A step sends targets through a pipe to every worker, which returns its states, while this
+    process steps its own share. A worker ends when its pipe does. Workers are started afresh
+    ("spawn"): a script that makes them needs ``if __name__ == "__main__":``.
     """
 
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, processes: int = 1
     ) -> None:
-        """Load every scene; its robot is at zero until the first reset."""
-        if processes < 1 or not scenes:
-            raise ValueError(
-                f"{processes} processes for {len(scenes)} scenes; both must be at least 1"
-            )
-        self.scenes = tuple(scenes)
-        self.device = torch.device("cpu")
-        dofs = np.array([scene.robot.dof for scene in scenes], np.int64)
-        num_joints = int(dofs.max())
-        memory = allocate(len(scenes), num_joints)
-        buffers = buffers_in(memory, len(scenes))
-        self._targets = buffers.targets
-        self.q, self.qd = torch.from_numpy(buffers.q), torch.from_numpy(buffers.qd)
-        self.block_pose = torch.from_numpy(buffers.block_pose)
-        self.block_velocity = torch.from_numpy(buffers.block_velocity)
-        self._is_joint = np.arange(num_joints) < dofs[:, None]
-        self._has_block = np.array([scene.block is not None for scene in scenes], bool)
-        folder = tempfile.TemporaryDirectory(prefix="morphgen-")
-        self._view = TensorView()
-        self._faults: dict[int, str] = {}
-        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
-        self._workers: list[Worker] = []
-        self._local_batches: list[BulletBatch] = []
-        self._free = weakref.finalize(self, _free, self._workers, self._local_batches, folder)
+        """Load every scene."""
+        super().__init__(scenes)
+        n, joints = self._targets.shape
+        self._state = tuple(np.zeros((n, width), np.float32) for width in (joints, joints, 7, 3))
+        self.q, self.qd, self.block_pose, self._block_velocity = map(torch.from_numpy, self._state)
+        self.workers: list[Worker] = []
+        self._unreset: set[int] = set()
+        resources = ExitStack()
+        self._free = weakref.finalize(self, resources.close)
         try:
-            exported = export_robots(scenes, Path(folder.name))
+            folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="morphgen-"))
+            exported = export_robots(scenes, Path(folder))
+            shares = divide(scenes, processes)
+            self._shares = [np.array(envs) for envs in shares]
+            self._rows = [consecutive(envs) for envs in self._shares]
             first, *others = (
                 Share(
                     [scenes[env] for env in envs],
                     contacts or Contacts(),
                     [exported[env] for env in envs],
-                    envs,
-                    len(scenes),
+                    joints,
                 )
-                for envs in divide(scenes, processes)
+                for envs in shares
             )
             for number, share in enumerate(others, start=1):
-                self._workers.append(Worker(number, share, memory))
-            self._local_batches.append(BulletBatch(first, buffers))
-            self._envs = np.array(first.envs)
-            for worker in self._workers:
-                if isinstance(failure := worker.receive(), Exception):
-                    raise failure
+                self.workers.append(Worker(number, share))
+                resources.callback(self.workers[-1].end)
+            self.batch = BulletBatch(first)
+            resources.callback(self.batch.close)
+            for worker in self.workers:
+                worker.receive()
+            self._go_home()
         except BaseException:
             self.close()
             raise
 
-    def reset(
-        self,
-        mask: torch.Tensor,
-        q: torch.Tensor,
-        block_pose: torch.Tensor,
-        obstacle_poses: torch.Tensor | None = None,
-    ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
-        self._require_open()
-        joints = self._is_joint.shape[1]
-        require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
-        rows, indices = mask.numpy(), np.flatnonzero(mask.numpy())
-        # Padding, poses without a block, and rows that are not reset may hold anything.
-        is_joint, is_block = rows[:, None] & self._is_joint, (rows & self._has_block)[:, None]
-        require_finite(self.scenes, "reset to q", np.where(is_joint, q.numpy(), 0))
-        require_finite(self.scenes, "reset to block", np.where(is_block, block_pose.numpy(), 0))
-        positions, poses = q.numpy()[indices], block_pose.numpy()[indices]
-        obstacles: Float32 | None = None
-        if obstacle_poses is not None:
-            moved = np.where(rows[:, None, None], obstacle_poses.numpy(), 0)
-            require_finite(self.scenes, "reset to obstacles", moved)
-            obstacles = moved[indices]
-
-        def state(envs: NDArray[np.int64]) -> BulletState:
-            mine = np.isin(indices, envs)
-            others = None if obstacles is None else obstacles[mine]
-            return indices[mine], positions[mine], poses[mine], others
-
-        workers = [worker for worker in self._workers if np.isin(indices, worker.envs).any()]
-        self._call("reset", workers, state)
-
-    def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``."""
-        self._require_open()
-        given = self._view(targets)
-        if given.shape != self._is_joint.shape:
-            raise ValueError(f"targets have shape {given.shape}, not {self._is_joint.shape}")
-        np.copyto(self._targets, given, where=self._is_joint)  # padding may be anything
-        if not all_finite(self._targets):
-            require_finite(self.scenes, "targets", self._targets)
-        faults = self._call("step", self._workers)
-        if faults or self._faults:
-            self._faults = faults
-            self._diverged = torch.from_numpy(mask_of(faults, len(self.scenes)))
-        return self._diverged
-
-    def faults(self) -> dict[int, str]:
-        """Return why environments diverged in the last step; see ``Simulation.faults``."""
-        return self._faults
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.block_velocity``."""
+        return self._block_velocity
 
     def close(self) -> None:
         """Free the clients and end the workers; a second call does nothing."""
+        super().close()
         self._free()
 
     def movable_q(self, env: int) -> Array:
         """Return the positions of all movable joints of an environment of this process."""
-        return self._local_batches[0].movable_q(env)
+        return self.batch.movable_q(env)
 
-    def _require_open(self) -> None:
-        if not self._free.alive:
-            raise SimulationError("the simulation is closed")
-
-    def _call(
+    def _put(
         self,
-        method: str,
-        workers: Sequence[Worker],
-        args_of: Callable[[NDArray[np.int64]], tuple[Any, ...]] = lambda envs: (),
-    ) -> dict[int, str]:
-        """Call a method of the batches of workers and of this process.
+        envs: NDArray[np.int64],
+        q: Float32,
+        block_pose: Float32,
+        obstacle_poses: Float32 | None,
+    ) -> None:
+        arguments = []
+        for share in self._shares:
+            mine = np.isin(envs, share)
+            others = None if obstacle_poses is None else obstacle_poses[mine]
+            rows = np.searchsorted(share, envs[mine])
+            arguments.append((rows, q[mine], block_pose[mine], others))
+        self._call("reset", arguments)
+        self._unreset -= {*envs.tolist()}
 
-        ``args_of`` returns the arguments for a batch of some environments. Return the reason for
-        each environment that diverged. An interruption closes the simulation: it leaves answers in
-        the pipes that nobody reads.
+    def _advance(self) -> dict[int, str]:
+        if self._unreset:
+            reason = self._faults[min(self._unreset)]
+            raise SimulationError(f"{reason}; expected a reset before the next step")
+        faults = self._call("step", [(self._targets[rows],) for rows in self._rows])
+        self._unreset = set(faults)
+        return faults
+
+    def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> dict[int, str]:
+        """Call a method of the batches of this process and of workers, and read their states.
+
+        Return the reason for each environment that diverged. An interruption closes the simulation:
+        it leaves answers in the pipes that nobody reads.
         """
+        mine, *others = arguments
         try:
-            for worker in workers:
-                worker.send(method, *args_of(worker.envs))
-            work_here = partial(getattr(self._local_batches[0], method), *args_of(self._envs))
-            answers = [attempt(work_here), *(worker.receive() for worker in workers)]
+            for worker, args in zip(self.workers, others, strict=True):
+                worker.send(method, *args)
+            answers = [(getattr(self.batch, method)(*mine), self.batch.state)]
+            answers += [worker.receive() for worker in self.workers]
         except BaseException:
             self.close()
             raise
-        reasons: dict[int, str] = {}
-        for answer in answers:
-            if isinstance(answer, Exception):
-                raise answer
-            reasons |= answer or {}
-        return dict(sorted(reasons.items()))
+        found: dict[int, str] = {}
+        for envs, rows, (faults, state) in zip(self._shares, self._rows, answers, strict=True):
+            for values, of_share in zip(self._state, state, strict=True):
+                values[rows] = of_share
+            if faults:
+                found |= {int(envs[i]): reason for i, reason in faults.items()}
+        return found
 
 
 def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:
@@ -211,18 +165,6 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
         shares[lightest].append(env)
         loads[lightest] += weights[env]
     return [sorted(share) for share in shares]
-
-
-def _free(
-    workers: list[Worker],
-    local_batches: list[BulletBatch],
-    folder: tempfile.TemporaryDirectory[str],
-) -> None:
-    for worker in workers:
-        worker.end()
-    for batch in local_batches:
-        batch.close()
-    folder.cleanup()
 
 
 SIMULATOR = Simulator(

@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 import multiprocessing
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +29,6 @@ from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts
 from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets, is_within
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 from morphgen.typing import Array
-
-if TYPE_CHECKING:
-    import ctypes
-
-    SharedMemory = ctypes.Array[ctypes.c_float]
 
 try:
     with quiet():
@@ -426,30 +420,8 @@ _FROM_BULLET = [0, 1, 2, 6, 3, 4, 5]
 """Columns of a pose in morphgen's order: PyBullet's quaternions have w last."""
 Float32 = NDArray[np.float32]
 ExportedRobot = tuple[Path, Robot]  # URDF of a robot whose rigid links are merged, and that robot
-
-
-class Buffers(NamedTuple):
-    """States and targets, a row for each environment of a simulation; see ``Simulation``."""
-
-    q: Float32
-    qd: Float32
-    block_pose: Float32
-    block_velocity: Float32
-    targets: Float32
-
-
-def allocate(num_envs: int, num_joints: int) -> SharedMemory:
-    """Return memory of all processes for the buffers of n environments, filled with zeros."""
-    memory: SharedMemory = _CONTEXT.RawArray("f", num_envs * (3 * num_joints + 7 + 6))
-    return memory
-
-
-def buffers_in(memory: SharedMemory, num_envs: int) -> Buffers:
-    """Return the buffers in shared memory."""
-    num_joints = (len(memory) // num_envs - 13) // 3
-    ends = num_envs * np.cumsum([num_joints, num_joints, 7, 6])
-    parts = np.split(np.ctypeslib.as_array(memory), ends)
-    return Buffers(*(part.reshape(num_envs, -1) for part in parts))
+State = tuple[Float32, Float32, Float32, Float32]
+"""Joint positions and velocities, poses and linear velocities of blocks, a row per scene."""
 
 
 @dataclass(frozen=True)
@@ -459,8 +431,7 @@ class Share:
     scenes: Sequence[Scene]
     contacts: Contacts  # pairs of things that collide
     exported: Sequence[ExportedRobot]  # robot of each scene, as `export_robots` wrote it
-    envs: Sequence[int]  # index of each scene's environment, which is its row in all buffers
-    num_envs: int  # number of environments of all processes
+    num_joints: int  # length of the rows of joints in all processes
 
 
 _FINAL_RESPONSE = constant(1 - (1 - VELOCITY_GAIN) ** SUBSTEPS)
@@ -472,43 +443,42 @@ _MEAN_RESPONSE = constant(
 
 
 class BulletBatch:
-    """Scenes that step one after the other and write their states into buffers."""
+    """Scenes that step one after the other; ``state`` is what they are in."""
 
-    def __init__(self, share: Share, buffers: Buffers) -> None:
+    def __init__(self, share: Share) -> None:
         """Load every scene, its robot at zero."""
-        scenes = share.scenes
-        self._share, self._scenes = share, scenes
-        self._buffers, self._envs = buffers, list(share.envs)
-        self._index = {env: i for i, env in enumerate(self._envs)}
-        self._num_steps = 0
-        self._num_steps_at_reset = [0] * len(scenes)
-        self._diverged: dict[int, str] = {}
-        self._obstacle_poses: list[list[list[float]] | None] = [None] * len(scenes)
+        self._share, self._scenes = share, share.scenes
+        n = len(self._scenes)
+        self.state: State = (
+            *np.zeros((2, n, share.num_joints), np.float32),
+            np.zeros((n, 7), np.float32),
+            np.zeros((n, 3), np.float32),
+        )
+        self._diverged: set[int] = set()
+        self._obstacle_poses: list[list[list[float]] | None] = [None] * n
         self._loaded: list[BulletScene] = []
         try:
-            self._loaded.extend(map(self._load, range(len(scenes))))
+            self._loaded.extend(map(self._load, range(n)))
         except BaseException:
             self.close()
             raise
-        self._blocks = [i for i, scene in enumerate(scenes) if scene.block is not None]
-        self._block_rows = [self._envs[i] for i in self._blocks]
+        self._blocks = [i for i, scene in enumerate(self._scenes) if scene.block is not None]
         self._index_joints()
         efforts = [effort for loaded in self._loaded for effort in loaded.efforts]
-        self._forces = MotorForces([scene.robot for scene in scenes], efforts)
+        self._forces = MotorForces([scene.robot for scene in self._scenes], efforts)
 
     def _load(self, i: int) -> BulletScene:
         urdf, merged = self._share.exported[i]
         return BulletScene(self._scenes[i], urdf, merged, self._share.contacts)
 
     def _index_joints(self) -> None:
-        """Index targets and states in flat arrays of all environments' joints.
+        """Index targets and states in flat arrays of all scenes' joints.
 
         Every movable joint follows one independent joint, its leader, so its target is a product
         and a sum; a matrix product may round differently in another batch.
         """
-        width = self._buffers.q.shape[1]
-        self._flat_q, self._flat_qd = self._buffers.q.reshape(-1), self._buffers.qd.reshape(-1)
-        self._targets = self._buffers.targets.reshape(-1)
+        width = self._share.num_joints
+        self._flat_q, self._flat_qd = self.state[0].reshape(-1), self.state[1].reshape(-1)
         source: list[int] = []
         gain: list[float] = []
         offset: list[float] = []
@@ -517,70 +487,61 @@ class BulletBatch:
         independent: list[int] = []
         sink: list[int] = []
         self._spans: list[slice] = []
-        for env, scene in zip(self._envs, self._scenes, strict=True):
+        for i, scene in enumerate(self._scenes):
             robot, start = scene.robot, len(offset)
             matrix, shift = robot.mimic_map
             self._spans.append(slice(start, start + len(shift)))
             if robot.dof:
                 leader = np.abs(matrix).argmax(axis=1)  # a row has one number that is not zero
-                source.extend((env * width + leader).tolist())
+                source.extend((i * width + leader).tolist())
                 gain.extend(matrix[np.arange(len(matrix)), leader].tolist())
                 rows = robot.independent_rows
                 leaders.extend(start + row for row in np.array(rows)[leader].tolist())
             offset.extend(shift.tolist())
             fastest.extend(limited_speeds(robot))
             independent.extend(start + row for row in robot.independent_rows)
-            sink.extend(range(env * width, env * width + robot.dof))
+            sink.extend(range(i * width, i * width + robot.dof))
         self._source = consecutive(np.array(source, np.intp))
         self._sink = consecutive(np.array(sink, np.intp))
         self._gain, self._offset = np.array(gain), np.array(offset)
         self._leaders = np.array(leaders, np.intp)
         self._fastest = np.array(fastest)
         self._independent = consecutive(np.array(independent, np.intp))
-        self._positions, self._velocities = np.zeros(len(offset)), np.zeros(len(offset))
-        self._measured = np.zeros(len(offset))
+        self._positions, self._velocities, self._measured = np.zeros((3, len(offset)))
 
     def reset(
         self,
-        envs: NDArray[np.int64],
+        rows: NDArray[np.int64],
         q: Float32,
         block_pose: Float32,
         obstacle_poses: Float32 | None,
     ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
-        buffers = self._buffers
-        for row, (env, positions, pose) in enumerate(
-            zip(envs.tolist(), q, block_pose, strict=True)
-        ):
-            i = self._index[env]
+        """Put scenes at rest and clear their history; see ``Simulation.reset``."""
+        all_q, all_qd, poses, velocities = self.state
+        for row, (i, positions, pose) in enumerate(zip(rows.tolist(), q, block_pose, strict=True)):
+            scene, span = self._scenes[i], self._spans[i]
             if obstacle_poses is not None:
-                count = len(self._scenes[i].obstacles)
+                count = len(scene.obstacles)
                 self._obstacle_poses[i] = obstacle_poses[row, :count].tolist()
-            scene = self._scenes[i]
-            positions = positions[: scene.robot.dof]
-            if self._diverged.pop(env, None) is not None:
+            if i in self._diverged:
                 self._loaded[i].close()  # numbers that are not finite stay in a client
                 self._loaded[i] = self._load(i)
-            loaded, span = self._loaded[i], self._spans[i]
-            self._positions[span] = movable_positions(scene.robot, positions)
+                self._diverged.remove(i)
+            loaded = self._loaded[i]
+            self._positions[span] = movable_positions(scene.robot, positions[: scene.robot.dof])
             self._velocities[span], self._measured[span] = 0, 0
             loaded.reset(self._positions[span].tolist(), pose.tolist(), self._obstacle_poses[i])
-            buffers.q[env, : scene.robot.dof] = positions
-            buffers.qd[env] = 0
+            all_q[i], all_qd[i] = positions, 0
             if scene.block is not None:
-                buffers.block_pose[env] = np.array(loaded.block_state()[:7])[_FROM_BULLET]
-                buffers.block_velocity[env] = 0
-            self._num_steps_at_reset[i] = self._num_steps
+                poses[i] = np.array(loaded.block_state()[:7])[_FROM_BULLET]
+                velocities[i] = 0
 
-    def step(self) -> dict[int, str]:
-        """Advance the environments by one control step towards the targets in the buffers.
+    def step(self, targets: Array) -> dict[int, str]:
+        """Advance the scenes by one control step towards targets of the independent joints.
 
-        Return the reason for each environment that diverged: not finite, or ``MAX_VELOCITY``.
+        Return the state of each scene that diverged: not finite, or ``MAX_VELOCITY``.
         """
-        if self._diverged:
-            reason = next(iter(self._diverged.values()))
-            raise SimulationError(f"{reason}; expected a reset before the next step")
-        desired = self._targets[self._source] * self._gain + self._offset
+        desired = targets.reshape(-1)[self._source] * self._gain + self._offset
         ends, last = self._undisturbed(desired)
         mean = (ends - self._positions) / _PERIOD
         commanded = self._measured + (mean - self._measured) / _MEAN_RESPONSE
@@ -591,11 +552,9 @@ class BulletBatch:
         )
         forces: list[float] = (limits / _SUBSTEPS).tolist()
         states: list[tuple[float, float]] = []
-        self._num_steps += 1
         for loaded, span in zip(self._loaded, self._spans, strict=True):
             loaded.step(velocities[span], forces[span])
             states += loaded.joint_states()
-        buffers = self._buffers
         self._positions = np.array([state[0] for state in states])
         before, self._measured = self._measured, np.array([state[1] for state in states])
         expected = before + (commanded - before) * _FINAL_RESPONSE
@@ -605,20 +564,16 @@ class BulletBatch:
         is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
         if self._blocks:
             blocks = np.array([self._loaded[i].block_state() for i in self._blocks])
-            buffers.block_pose[self._block_rows] = blocks[:, _FROM_BULLET]
-            buffers.block_velocity[self._block_rows] = blocks[:, 7:]
+            self.state[2][self._blocks] = blocks[:, _FROM_BULLET]
+            self.state[3][self._blocks] = blocks[:, 7:10]
             is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
-        if not is_sane:
-            self._find_diverged()
-        return dict(self._diverged)
+        return {} if is_sane else self._find_diverged()
 
-    def movable_q(self, env: int) -> Array:
-        """Return the positions of all movable joints of an environment, mimic joints included."""
-        return self._positions[self._spans[self._index[env]]].copy()
+    def movable_q(self, i: int) -> Array:
+        """Return the positions of all movable joints of a scene, mimic joints included."""
+        return self._positions[self._spans[i]].copy()
 
-    def _undisturbed(
-        self, desired: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
         """Return positions and velocities at the end of a control step without disturbances.
 
         Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps.
@@ -634,19 +589,16 @@ class BulletBatch:
             q = q + _TIMESTEP * v
         return q[self._leaders] * self._gain + self._offset, v[self._leaders] * self._gain
 
-    def _find_diverged(self) -> None:
-        """Record the environments that diverged, with their state as the reason."""
-        buffers = self._buffers
-        for i, env in enumerate(self._envs):
-            q, qd, pose = buffers.q[env], buffers.qd[env], buffers.block_pose[env]
-            velocity, name = buffers.block_velocity[env], self._scenes[i].robot.name
+    def _find_diverged(self) -> dict[int, str]:
+        """Return the states of scenes that diverged."""
+        faults = {}
+        for i, (q, qd, pose, _) in enumerate(zip(*self.state, strict=True)):
+            block = np.array(self._loaded[i].block_state() if i in self._blocks else [0.0])
             joints = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-            if not (joints and is_within(pose, MAX_VELOCITY) and is_within(velocity, MAX_VELOCITY)):
-                steps = self._num_steps - self._num_steps_at_reset[i]
-                self._diverged[env] = (
-                    f"environment {env} ({name!r}) diverged in step {steps} after its "
-                    f"reset: q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
-                )
+            if not (joints and is_within(block, MAX_VELOCITY)):
+                faults[i] = f"q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
+        self._diverged = set(faults)
+        return faults
 
     def close(self) -> None:
         """Free every scene; a second call does nothing."""
@@ -656,33 +608,21 @@ class BulletBatch:
 
 _EXIT_CODE_WAIT = 0.5  # time for a worker whose pipe has ended to exit [s]
 _CONTEXT = multiprocessing.get_context("spawn")
-R = TypeVar("R")
-
-
-def attempt(work: Callable[[], R]) -> R | Exception:
-    """Return the result of some work, or the error that the caller of a simulation shall see."""
-    try:
-        return work()
-    except (SimulationError, ValueError) as error:
-        return error
 
 
 class Worker:
     """A process that simulates a share of the environments, and answers each call in its pipe."""
 
-    def __init__(self, number: int, share: Share, memory: SharedMemory) -> None:
+    def __init__(self, number: int, share: Share) -> None:
         """Start the process, whose first answer says that it has loaded its share."""
-        self.envs = np.array(share.envs)
         self._pipe, worker_end = _CONTEXT.Pipe()
         self.process = _CONTEXT.Process(
-            target=_serve, args=(worker_end, share, memory), name=str(number), daemon=True
+            target=_serve, args=(worker_end, share), name=str(number), daemon=True
         )
         with sigint_blocked():
             self.process.start()
         worker_end.close()  # so that the worker's death ends the pipe
-
-    def __str__(self) -> str:
-        return f"worker {self.process.name} of {len(self.envs)} environments"
+        self._size = len(share.scenes)
 
     def send(self, method: str, *args: object) -> None:
         """Call a method of the worker's ``BulletBatch``; ``receive`` returns the answer."""
@@ -691,12 +631,14 @@ class Worker:
         except OSError as error:
             raise self._death() from error
 
-    def receive(self) -> dict[int, str] | Exception | None:
-        """Wait for the answer to a call."""
+    def receive(self) -> tuple[dict[int, str] | None, State]:
+        """Wait for the answer to a call, and the state after it."""
         try:
-            answer: dict[int, str] | Exception | None = self._pipe.recv()
+            answer: tuple[dict[int, str] | None, State] | Exception = self._pipe.recv()
         except (EOFError, OSError) as error:
             raise self._death() from error
+        if isinstance(answer, Exception):
+            raise answer
         return answer
 
     def end(self) -> None:
@@ -710,27 +652,24 @@ class Worker:
         """Return the error that reports that the process is dead, with its exit code."""
         self.process.join(_EXIT_CODE_WAIT)
         return SimulationError(
-            f"{self} died (exit code {self.process.exitcode}); the simulation is closed"
+            f"worker {self.process.name} of {self._size} environments died (exit code "
+            f"{self.process.exitcode}); the simulation is closed"
         )
 
 
-def _serve(pipe: Connection, share: Share, memory: SharedMemory) -> None:
+def _serve(pipe: Connection, share: Share) -> None:
     """Answer calls until the pipe ends; the parent handles Ctrl-C and closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    batch: BulletBatch | None = None
     try:
-        answer: object = attempt(lambda: BulletBatch(share, buffers_in(memory, share.num_envs)))
-        if isinstance(answer, BulletBatch):
-            batch, answer = answer, None
+        batch = BulletBatch(share)
+        pipe.send((None, batch.state))
         while True:
-            pipe.send(answer)
             method, args = pipe.recv()
-            answer = attempt(partial(getattr(batch, method), *args))
+            pipe.send((getattr(batch, method)(*args), batch.state))
     except (EOFError, ConnectionError):
         return  # the parent has closed the pipe, or has died
+    except SimulationError as error:
+        pipe.send(error)
     except BaseException as error:
         pipe.send(SimulationError(f"a worker failed: {type(error).__name__}: {error}"))
         raise
-    finally:
-        if batch is not None:
-            batch.close()

@@ -10,14 +10,7 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
-from morphgen.tasks.sim.base import (
-    Contacts,
-    Scene,
-    Simulator,
-    is_host,
-    require_finite,
-    require_reset_shapes,
-)
+from morphgen.tasks.sim.base import Contacts, Scene, Simulation, Simulator, is_host
 from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
 from morphgen.typing import Array
 
@@ -26,7 +19,7 @@ NO_CONTACTS = Contacts(scene=False, self_collision=False)
 """The only contacts that this simulator can be asked for."""
 
 
-class KinematicSimulation:
+class KinematicSimulation(Simulation):
     """Environments whose joints follow the control law exactly; a ``Simulation``.
 
     Joints move as those of ``MujocoSimulation`` do in free space: critically damped, with the same
@@ -54,8 +47,7 @@ class KinematicSimulation:
         device: torch.device | str = "cpu",
     ) -> None:
         """Put every robot at home."""
-        if not scenes:
-            raise ValueError("there are no scenes; expected one or more")
+        super().__init__(scenes, torch.device(device))
         if contacts not in (None, NO_CONTACTS):
             raise SimulationError(
                 f"simulator 'kinematic' has no contacts: {contacts}; expected {NO_CONTACTS}"
@@ -64,11 +56,9 @@ class KinematicSimulation:
             if scene.block is not None or scene.obstacles:
                 thing = "a block" if scene.block is not None else "obstacles"
                 raise SimulationError(
-                    f"environment {env} (robot {scene.robot.name!r}): the scene has {thing}, and "
-                    "simulator 'kinematic' has no contacts; expected another simulator"
+                    f"{self._label(env)}: the scene has {thing}, and simulator 'kinematic' has no "
+                    "contacts; expected another simulator"
                 )
-        self.scenes = tuple(scenes)
-        self.device = torch.device(device)
         robots = {id(scene.robot): scene.robot for scene in scenes}
         row_of_robot = {key: row for row, key in enumerate(robots)}
         rows = np.array([row_of_robot[id(scene.robot)] for scene in scenes])
@@ -78,42 +68,34 @@ class KinematicSimulation:
         n = len(scenes)
         self.qd = torch.zeros_like(self.q)
         self.block_pose = torch.zeros(n, 7, device=self.device)
-        self.block_velocity = torch.zeros(n, 6, device=self.device)
+        self._block_velocity = torch.zeros(n, 3, device=self.device)
         self._diverged = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._on_host = is_host(self.device)
-        self._closed = False
 
-    def reset(
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Zeros; see ``Simulation.block_velocity``."""
+        return self._block_velocity
+
+    def _reset(
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
-        obstacle_poses: torch.Tensor | None = None,
+        obstacle_poses: torch.Tensor | None,
     ) -> None:
-        """Put some environments at rest; see ``Simulation.reset``. There are no obstacles."""
-        self._require_open()
-        require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, None)
         rows = mask[:, None]
         positions = torch.where(rows, torch.where(self._is_joint, q, 0.0), self.q)
         if self._on_host:
-            require_finite(self.scenes, "reset to q", positions.numpy())
+            self._require_finite("reset to q", positions.numpy())
         self.q.copy_(positions)
         self.qd.masked_fill_(rows, 0.0)
 
-    def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``.
-
-        On the CPU no environment diverges. On a GPU those do whose targets or positions are not
-        finite.
-        """
-        self._require_open()
-        if targets.shape != self.q.shape:
-            raise ValueError(
-                f"targets have shape {tuple(targets.shape)}; expected {tuple(self.q.shape)}"
-            )
+    def _step(self, targets: torch.Tensor) -> torch.Tensor:
+        """Step: only on a GPU, targets and positions that are not finite diverge."""
         targets = torch.where(self._is_joint, targets, 0.0)
         if self._on_host:
-            require_finite(self.scenes, "targets", targets.numpy())
+            self._require_finite("targets", targets.numpy())
         error = torch.clamp(targets, self._lower, self._upper) - self.q
         error = torch.clamp(error, -self._farthest, self._farthest)
         (error_to_error, velocity_to_error), (by_error, by_velocity) = CONTROL_STEP.tolist()
@@ -127,23 +109,11 @@ class KinematicSimulation:
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
         envs = torch.nonzero(self._diverged)[:, 0].tolist()
-        return {
-            env: f"environment {env} (robot {self.scenes[env].robot.name!r}): a target or position "
-            "is not finite"
-            for env in envs
-        }
-
-    def close(self) -> None:
-        """End the simulation; a second call does nothing."""
-        self._closed = True
+        return {env: f"{self._label(env)}: a target or position is not finite" for env in envs}
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy: nothing of it is elsewhere."""
         return vars(self)
-
-    def _require_open(self) -> None:
-        if self._closed:
-            raise SimulationError("the simulation is closed")
 
 
 def _joint_table(robots: Sequence[Robot]) -> Array:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,6 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.robot import Joint, Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.typing import Array
-
-if TYPE_CHECKING:
-    import torch
 
 
 def constant(value: float) -> Array:
@@ -33,34 +29,6 @@ def is_within(values: NDArray[Any], bound: float) -> bool:
     flat = values.ravel()
     # They are if the root of the sum of their squares is, which is fast to test.
     return float(flat.dot(flat)) <= bound**2 or bool(np.abs(flat).max(initial=0.0) <= bound)
-
-
-def all_finite(values: NDArray[Any]) -> bool:
-    """Return whether all values are finite."""
-    flat = values.ravel()
-    # They are if the sum of their squares is; it may also overflow.
-    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
-
-
-def mask_of(rows: Iterable[int], count: int) -> NDArray[np.bool_]:
-    """Return a mask of ``count`` rows that is set in some of them."""
-    mask = np.zeros(count, bool)
-    mask[list(rows)] = True
-    return mask
-
-
-class TensorView:
-    """View of a tensor as an array, kept while the same is passed: to make one takes 1 to 3 us."""
-
-    def __init__(self) -> None:
-        self._tensor: torch.Tensor | None = None
-        self._view: NDArray[Any] = np.zeros(0)
-
-    def __call__(self, tensor: torch.Tensor) -> NDArray[Any]:
-        """Return the view."""
-        if tensor is not self._tensor:
-            self._tensor, self._view = tensor, tensor.numpy()
-        return self._view
 
 
 LAG = 2 / BANDWIDTH + TIMESTEP * SUBSTEPS

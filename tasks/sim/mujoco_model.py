@@ -60,31 +60,9 @@ class World:
     movable_qd_at: Indices  # indices in `qvel` of the movable joints
     q_at: Indices  # indices in `qpos` of the independent joints
     qd_at: Indices  # indices in `qvel` of the independent joints
-    block: int | None  # body id of the block, if there is one
+    block_q_at: Indices  # indices in `qpos` of the block's pose, (7,), or none
+    block_qd_at: Indices  # indices in `qvel` of the block's linear velocity, (3,), or none
     obstacles: Indices  # indices in `mocap_pos` of the obstacles, which are mocap bodies
-
-    @property
-    def block_moves(self) -> bool:
-        """Whether the block has mass and is a free body; otherwise it is a mocap body."""
-        return self.block is not None and self.model.body_mocapid[self.block] < 0
-
-    def block_pose_in(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Return views of the block's position (3,) and quaternion (4,) in data of this model."""
-        if self.block_moves:
-            at = self.block_q_at
-            return data.qpos[at : at + 3], data.qpos[at + 3 : at + 7]
-        mocap = int(self.model.body_mocapid[self.block])
-        return data.mocap_pos[mocap], data.mocap_quat[mocap]
-
-    @property
-    def block_q_at(self) -> int:
-        """First index in ``qpos`` of the pose of a block that moves."""
-        return int(self.model.jnt_qposadr[self.model.body_jntadr[self.block]])
-
-    @property
-    def block_qd_at(self) -> int:
-        """First index in ``qvel`` of the velocity of a block that moves."""
-        return int(self.model.body_dofadr[self.block])
 
 
 def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
@@ -195,34 +173,40 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
         geom = _add_box(obstacles[-1], obstacle, _OBSTACLE_PRIORITY)
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
-    body = _add_block(spec, scene.block) if scene.block is not None else None
+    if scene.block is not None:
+        _add_block(spec, scene.block)
     model = spec.compile()
-    joints = {k: model.joint(robot.joints[k].name) for k in robot.movable_joints}
+
+    def at(joints: Iterable[int], attribute: str) -> Indices:
+        each = (getattr(model.joint(robot.joints[k].name), attribute)[0] for k in joints)
+        return np.array([*each], dtype=np.int64)
+
+    # The block's joint is the last one of the model.
+    pose = np.arange(7 if scene.block is not None else 0)
     return World(
         robot,
         model,
-        movable_q_at=_addresses(joints[k].qposadr for k in robot.movable_joints),
-        movable_qd_at=_addresses(joints[k].dofadr for k in robot.movable_joints),
-        q_at=_addresses(joints[k].qposadr for k in robot.independent_joints),
-        qd_at=_addresses(joints[k].dofadr for k in robot.independent_joints),
-        block=body.id if body is not None else None,
+        movable_q_at=at(robot.movable_joints, "qposadr"),
+        movable_qd_at=at(robot.movable_joints, "dofadr"),
+        q_at=at(robot.independent_joints, "qposadr"),
+        qd_at=at(robot.independent_joints, "dofadr"),
+        block_q_at=model.nq - len(pose) + pose,
+        block_qd_at=model.nv - 6 + pose[:3],
         obstacles=model.body_mocapid[[obstacle.id for obstacle in obstacles]].astype(np.int64),
     )
 
 
-def _add_block(spec: mujoco.MjSpec, block: Block) -> mujoco.MjsBody:
-    """Add the block: a free body, or a mocap body if it has no mass."""
-    body = spec.worldbody.add_body(mocap=block.mass <= 0)
-    if block.mass > 0:
-        body.add_freejoint()
-        x, y, z = (edge * edge for edge in block.size)
-        body.explicitinertial = True  # else MuJoCo computes them from the geom's density
-        body.mass = block.mass
-        body.inertia = [block.mass * total / 12 for total in (y + z, x + z, x + y)]
+def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
+    """Add the block, a free body."""
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    x, y, z = (edge * edge for edge in block.size)
+    body.explicitinertial = True  # else MuJoCo computes them from the geom's density
+    body.mass = block.mass
+    body.inertia = [block.mass * total / 12 for total in (y + z, x + z, x + y)]
     geom = _add_box(body, block, _BLOCK_PRIORITY)
     geom.contype, geom.conaffinity = _BY_SCENE, _BY_BLOCK
     geom.solimp, geom.margin = BLOCK_IMPEDANCE, BLOCK_MARGIN
-    return body
 
 
 def _add_box(body: mujoco.MjsBody, block: Block, priority: int) -> mujoco.MjsGeom:
@@ -231,7 +215,3 @@ def _add_box(body: mujoco.MjsBody, block: Block, priority: int) -> mujoco.MjsGeo
     )
     geom.friction[0] = block.friction
     return geom
-
-
-def _addresses(values: Iterable[NDArray[np.int32]]) -> Indices:
-    return np.array([int(value[0]) for value in values], dtype=np.int64)

@@ -10,38 +10,33 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from morphgen.errors import SimulationError
 from morphgen.formats.quiet import MujocoWarnings
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import (
     CONTROL_PERIOD,
     SUBSTEPS,
-    TIMESTEP,
     Contacts,
+    HostSimulation,
     Scene,
     Simulator,
-    require_finite,
-    require_reset_shapes,
 )
 from morphgen.tasks.sim.motor_law import (
     CONTROL_STEP,
     GAIN,
-    TensorView,
-    all_finite,
     clamp,
     constant,
     farthest_targets,
     is_within,
-    mask_of,
 )
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World, worlds
 from morphgen.typing import Array
 
 MAX_SPEED = 1e4  # speed above which a simulation counts as diverged [rad/s or m/s]
-_TOO_FAST = f"diverged: a velocity is not finite or beyond {MAX_SPEED:g}"
-_NO_MEMORY = "diverged: its contacts do not fit into MuJoCo's memory"
+_TOO_FAST = f"a velocity is not finite or beyond {MAX_SPEED:g}"
+_NO_MEMORY = "its contacts do not fit into MuJoCo's memory"
 _FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 
 
@@ -70,33 +65,28 @@ class MujocoState:
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
         """Prepare; ``read`` fills the tensors."""
         n, joints = len(worlds), max(world.robot.dof for world in worlds)
-        blocks = [i for i, world in enumerate(worlds) if world.block is not None]
-        poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
-        positions = [*(env_data.qpos for env_data in data), *poses]
+        positions = [env_data.qpos for env_data in data]
         velocities = [*(env_data.qvel for env_data in data), np.zeros(1)]
         warnings = [env_data.warning.number for env_data in data]
         self._numbers = GatheredArrays([*positions, *velocities, *warnings])  # one call reads all
-        begin, first = self._numbers.begin, len(positions)
-        self._begin = (begin[first : first + n + 1] - begin[first]).tolist()
-        self.velocities = self._numbers.flat[begin[first] : begin[first + n + 1]]
+        begin = self._numbers.begin
+        self._begin = (begin[n : 2 * n + 1] - begin[n]).tolist()
+        self.velocities = self._numbers.flat[begin[n] : begin[2 * n + 1]]
         """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
-        self._warnings = self._numbers.flat[begin[first + n + 1] : -1].reshape(n, -1)
+        self._warnings = self._numbers.flat[begin[2 * n + 1] : -1].reshape(n, -1)
         self._joints_at = np.full((2, n, joints), -1)
         self._pose_at = np.full((n, 7), -1)
-        self._velocity_at = np.full((n, 6), -1)
+        self._velocity_at = np.full((n, 3), -1)
         for i, world in enumerate(worlds):
             dof = world.robot.dof
             self._joints_at[0, i, :dof] = begin[i] + world.q_at
-            self._joints_at[1, i, :dof] = begin[first + i] + world.qd_at
-            if world.block_moves:
-                self._velocity_at[i] = begin[first + i] + world.block_qd_at + np.arange(6)
-        for k, i in enumerate(blocks):
-            self._pose_at[i, :3] = begin[n + 2 * k] + np.arange(3)
-            self._pose_at[i, 3:] = begin[n + 2 * k + 1] + np.arange(4)
-        self._has_blocks = bool(blocks)
+            self._joints_at[1, i, :dof] = begin[n + i] + world.qd_at
+            if len(world.block_q_at):
+                self._pose_at[i] = begin[i] + world.block_q_at
+                self._velocity_at[i] = begin[n + i] + world.block_qd_at
+        self._has_blocks = bool((self._pose_at >= 0).any())
         self._joints = np.zeros((2, n, joints), np.float32)
         self._block_pose = np.zeros((n, 7), np.float32)
-        self._exact_pose = np.zeros((n, 7))
         self.joints = np.zeros((2, n, joints))
         """Joint positions and velocities at the last ``read``, shape (2, n, J)."""
         self.q, self.qd = map(torch.from_numpy, self._joints)
@@ -104,17 +94,8 @@ class MujocoState:
 
     @property
     def block_velocity(self) -> torch.Tensor:
-        """Linear and angular velocities of the blocks in the world at the last ``read``, (n, 6)."""
-        if not self._has_blocks:
-            return torch.zeros(len(self._velocity_at), 6)
-        velocity = self._numbers.flat[self._velocity_at]
-        quaternion, angular = self._exact_pose[:, 3:], velocity[:, 3:]
-        # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
-        # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
-        w, axis = quaternion[:, :1], quaternion[:, 1:]
-        twice = 2 * np.cross(axis, angular)
-        angular[:] = angular + w * twice + np.cross(axis, twice)
-        return torch.from_numpy(velocity.astype(np.float32))
+        """Linear velocities of the blocks at the last ``read``, shape (n, 3)."""
+        return torch.from_numpy(self._numbers.flat[self._velocity_at].astype(np.float32))
 
     def read(self) -> None:
         """Update the tensors from the data."""
@@ -122,10 +103,10 @@ class MujocoState:
         self.joints = self._numbers.flat[self._joints_at]
         self._joints[:] = self.joints
         if self._has_blocks:
-            self._exact_pose = self._numbers.flat[self._pose_at]
-            quaternion = self._exact_pose[:, 3:]
+            pose = self._numbers.flat[self._pose_at]
+            quaternion = pose[:, 3:]
             quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
-            self._block_pose[:] = self._exact_pose
+            self._block_pose[:] = pose
 
     def faults(self) -> dict[int, str]:
         """Return the environments that diverged up to the last ``read``, each with the reason."""
@@ -230,11 +211,11 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_view", "_warnings", "_pool"}
+_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_seen", "_warnings", "_pool"}
 """Attributes that ``_view_data`` makes."""
 
 
-class MujocoSimulation:
+class MujocoSimulation(HostSimulation):
     """Environments in MuJoCo, on the CPU; a ``Simulation``.
 
     Every environment has its own data, which one thread steps at a time and nothing else touches:
@@ -252,31 +233,14 @@ class MujocoSimulation:
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, threads: int = 1
     ) -> None:
-        """Compile; every robot is at home, every block at its pose in the scene."""
-        if not scenes or threads < 1:
-            raise ValueError(f"{len(scenes)} scenes, {threads} threads; there must be one of each")
-        self.scenes = tuple(scenes)
-        self.device = torch.device("cpu")
+        """Compile the scenes."""
+        super().__init__(scenes)
         self._worlds = worlds(self.scenes, contacts or Contacts())
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
-        shape = len(scenes), max(world.robot.dof for world in self._worlds)
-        self._controls, self._targets = np.zeros(shape), np.zeros(shape)
-        self._has_target = np.zeros(shape, dtype=bool)
-        self._faults: dict[int, str] = {}
-        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
+        self._controls = np.zeros(self._targets.shape)
         self._helpers = threads - 1
         self._view_data()
-        for i, world in enumerate(self._worlds):
-            self._has_target[i, : world.robot.dof] = True
-            block = self.scenes[i].block
-            pose = (*block.pose.position, *block.pose.quaternion) if block is not None else ()
-            # In float32, as a reset to the values of the tensors would do.
-            self._put(
-                i, *(np.array(values, np.float32).tolist() for values in (world.robot.home, pose))
-            )
-            poses = [(*o.pose.position, *o.pose.quaternion) for o in self.scenes[i].obstacles]
-            self._put_obstacles(i, poses)
-        self._state.read()
+        self._go_home()
 
     def _view_data(self) -> None:
         """Make everything that has views of the data, and the threads."""
@@ -290,7 +254,7 @@ class MujocoSimulation:
             self._work.append(
                 (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
             )
-        self._view, self._warnings = TensorView(), MujocoWarnings()
+        self._seen, self._warnings = None, MujocoWarnings()
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -307,98 +271,55 @@ class MujocoSimulation:
     @property
     def block_velocity(self) -> torch.Tensor:
         """Velocities of the blocks; see ``Simulation.block_velocity``."""
-        self._require_open()
         return self._state.block_velocity
-
-    def reset(
-        self,
-        mask: torch.Tensor,
-        q: torch.Tensor,
-        block_pose: torch.Tensor,
-        obstacle_poses: torch.Tensor | None = None,
-    ) -> None:
-        """Put some environments at rest and clear their history; see ``Simulation.reset``."""
-        self._require_open()
-        joints = self._targets.shape[1]
-        require_reset_shapes(self.scenes, joints, mask, q, block_pose, obstacle_poses)
-        for env in np.flatnonzero(mask.numpy()).tolist():
-            dof = self._worlds[env].robot.dof
-            self._put(env, q[env, :dof].tolist(), block_pose[env].tolist())
-            if obstacle_poses is not None:
-                count = len(self._worlds[env].obstacles)
-                self._put_obstacles(env, obstacle_poses[env, :count].tolist())
-        self._state.read()
-
-    def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``.
-
-        Environments also diverge if their contacts do not fit into MuJoCo's memory.
-        """
-        self._require_open()
-        rows = self._view(targets)
-        if rows.shape != self._targets.shape:
-            raise ValueError(f"targets have shape {rows.shape}, not {self._targets.shape}")
-        np.copyto(self._targets, rows, where=self._has_target)
-        if not all_finite(self._targets):
-            require_finite(self.scenes, "targets", self._targets)
-        # Environments whose state is not finite are named below, whatever MuJoCo warns of.
-        with np.errstate(invalid="ignore", over="ignore"), self._warnings:
-            q, qd = self._state.joints
-            self._control.controls(self._targets, q, qd, self._state.velocities, out=self._controls)
-            refused = self._advance()
-            self._state.read()
-        faults = self._state.faults() | refused
-        if faults or self._faults:
-            self._faults = {env: f"{self._label(env)}: {faults[env]}" for env in sorted(faults)}
-            self._diverged = torch.from_numpy(mask_of(faults, len(self.scenes)))
-        return self._diverged
-
-    def faults(self) -> dict[int, str]:
-        """Return why environments diverged in the last step; see ``Simulation.faults``."""
-        return self._faults
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
+        super().close()
         if self._pool is not None:
             self._pool.shutdown()
-        self._pool = None
-        if self._work:
-            del self._state, self._control  # they have views of the data
-        self._work, self._data, self._worlds = [], [], []
+        self._pool, self._work = None, []
 
     def movable_q(self, env: int) -> Array:
         """Return the positions of all movable joints of an environment, mimic joints included."""
         return np.array(self._data[env].qpos[self._worlds[env].movable_q_at])
 
-    def _put(self, env: int, q: Sequence[float], pose: Sequence[float]) -> None:
-        """Put an environment's robot and block at rest at joint positions and a pose."""
-        world, data = self._worlds[env], self._data[env]
-        if not np.isfinite(q).all() or (world.block is not None and not np.isfinite(pose).all()):
-            raise ValueError(f"{self._label(env)}: reset to q {list(q)}, block {list(pose)}")
-        # mj_resetData also puts mocap bodies back: obstacles shall stay where they are.
-        obstacles = (values[world.obstacles] for values in (data.mocap_pos, data.mocap_quat))
-        positions, quaternions = obstacles
-        mujoco.mj_resetData(world.model, data)
-        data.mocap_pos[world.obstacles], data.mocap_quat[world.obstacles] = positions, quaternions
-        data.qpos[world.movable_q_at] = movable_positions(world.robot, q)
-        mujoco.mj_kinematics(world.model, data)  # these three give the inertia that controls need
-        mujoco.mj_comPos(world.model, data)
-        mujoco.mj_makeM(world.model, data)
-        if world.block is not None:
-            position, quaternion = world.block_pose_in(data)
-            position[:], quaternion[:] = pose[:3], pose[3:]
-            if mujoco.mju_normalize4(quaternion) < 0.5:  # it returns the length before
-                raise ValueError(f"{self._label(env)}: {list(pose)} is not a pose of a block")
-
-    def _put_obstacles(self, env: int, poses: Sequence[Sequence[float]]) -> None:
-        """Put the obstacles of an environment at poses."""
-        rows = np.array(poses).reshape(-1, 7)
-        at, data = self._worlds[env].obstacles, self._data[env]
-        if rows.shape != (len(at), 7) or not np.isfinite(rows).all():
-            raise ValueError(f"{self._label(env)}: reset to obstacles {rows.tolist()}")
-        data.mocap_pos[at], data.mocap_quat[at] = rows[:, :3], rows[:, 3:]
+    def _put(
+        self, envs: NDArray[np.int64], q: Array, block_pose: Array, obstacle_poses: Array | None
+    ) -> None:
+        for row, env in enumerate(envs.tolist()):
+            world, data = self._worlds[env], self._data[env]
+            # mj_resetData also puts mocap bodies back: obstacles shall stay where they are.
+            obstacles = np.hstack([data.mocap_pos, data.mocap_quat])
+            if obstacle_poses is not None:
+                obstacles[world.obstacles] = obstacle_poses[row, : len(world.obstacles)]
+            mujoco.mj_resetData(world.model, data)
+            data.mocap_pos[:], data.mocap_quat[:] = obstacles[:, :3], obstacles[:, 3:]
+            positions = q[row, : world.robot.dof].astype(np.float64)
+            data.qpos[world.movable_q_at] = movable_positions(world.robot, positions)
+            if len(world.block_q_at):
+                pose = block_pose[row].astype(np.float64)
+                if mujoco.mju_normalize4(pose[3:]) < 0.5:  # it returns the length before
+                    raise ValueError(
+                        f"{self._label(env)}: {pose.tolist()} is not a pose of a block"
+                    )
+                data.qpos[world.block_q_at] = pose
+            mujoco.mj_kinematics(world.model, data)  # these three give the inertia of controls
+            mujoco.mj_comPos(world.model, data)
+            mujoco.mj_makeM(world.model, data)
+        self._state.read()
 
     def _advance(self) -> dict[int, str]:
+        """Step; environments also diverge if their contacts do not fit into MuJoCo's memory."""
+        # Environments whose state is not finite are named below, whatever MuJoCo warns of.
+        with np.errstate(invalid="ignore", over="ignore"), self._warnings:
+            q, qd = self._state.joints
+            self._control.controls(self._targets, q, qd, self._state.velocities, out=self._controls)
+            refused = self._run_threads()
+            self._state.read()
+        return self._state.faults() | refused
+
+    def _run_threads(self) -> dict[int, str]:
         """Step all environments; return the ones that MuJoCo could not step, with its reasons."""
         work, refused = iter(self._work), dict[int, str]()
         if self._pool is None:
@@ -413,15 +334,6 @@ class MujocoSimulation:
             helper.result()
         return refused
 
-    def _require_open(self) -> None:
-        if not self._work:
-            raise SimulationError("the simulation is closed")
-
-    def _label(self, env: int) -> str:
-        steps = round(self._data[env].time / (TIMESTEP * SUBSTEPS))
-        name = self.scenes[env].robot.name
-        return f"environment {env} (robot {name!r}, {steps} steps after its reset)"
-
 
 def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
     """Step environments until none is left; several threads may share both arguments."""
@@ -431,7 +343,7 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
         try:
             mujoco.mj_step(model, data, nstep=SUBSTEPS)
         except mujoco.FatalError as error:  # its stack is full
-            refused[env] = f"diverged: MuJoCo: {str(error).splitlines()[0]}"
+            refused[env] = f"MuJoCo: {str(error).splitlines()[0]}"
 
 
 SIMULATOR = Simulator(

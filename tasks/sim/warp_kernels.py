@@ -20,7 +20,7 @@ _MAX_SPEED = wp.constant(MAX_SPEED)
 
 @wp.struct
 class Joints:
-    """Joints of a group of worlds with one structure; R rows of numbers, world w has row w % R."""
+    """Indices in a group of worlds with one structure; R rows of numbers, world w has row w % R."""
 
     env: wp.array[int]  # environment of each world
     q_at: wp.array[int]  # index in `qpos` of each independent joint
@@ -35,15 +35,8 @@ class Joints:
     compliance: wp.array2d[float]  # inverse gain of each actuator, (R, J) [rad/N m or m/N]
     farthest: wp.array2d[float]
     """Largest distance between a target and its joint, (R, J) [rad or m]."""
-
-
-@wp.struct
-class Things:
-    """Block and obstacles of a group of worlds."""
-
-    block_q_at: int  # index in `qpos` of the pose of a block that moves, or -1
-    block_qd_at: int  # index in `qvel` of the velocity of a block that moves
-    block_mocap: int  # index in `mocap_pos` of a block that does not move, or -1
+    block_q_at: int  # first index in `qpos` of the block's pose, or -1
+    block_qd_at: int  # first index in `qvel` of its linear velocity
     obstacles: wp.array[int]  # indices in `mocap_pos` of the obstacles
 
 
@@ -122,11 +115,8 @@ def controls(
 @wp.kernel
 def read_state(
     joints: Joints,
-    things: Things,
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
-    mocap_pos: wp.array2d[wp.vec3],
-    mocap_quat: wp.array2d[wp.quat],
     out_q: wp.array2d[float],
     out_qd: wp.array2d[float],
     out_pose: wp.array2d[float],
@@ -141,28 +131,13 @@ def read_state(
     for joint in range(joints.q_at.shape[0]):
         out_q[env, joint] = qpos[world, joints.q_at[joint]]
         out_qd[env, joint] = qvel[world, joints.qd_at[joint]]
-    if things.block_q_at >= 0:
-        at = things.block_q_at
-        rotation = wp.quat(
-            qpos[world, at + 4], qpos[world, at + 5], qpos[world, at + 6], qpos[world, at + 3]
-        )
-        _write_pose(
-            wp.vec3(qpos[world, at], qpos[world, at + 1], qpos[world, at + 2]),
-            rotation,
-            out_pose,
-            env,
-        )
-        at = things.block_qd_at
-        spin = wp.vec3(qvel[world, at + 3], qvel[world, at + 4], qvel[world, at + 5])
-        turned = wp.quat_rotate(wp.normalize(rotation), spin)  # from the axes of the block
-        for axis in range(3):
-            out_velocity[env, axis] = qvel[world, at + axis]
-            out_velocity[env, 3 + axis] = turned[axis]
-    if things.block_mocap >= 0:
-        # MuJoCo's quaternions are (w, x, y, z), also in arrays of Warp's quat (x, y, z, w).
-        stored = mocap_quat[world, things.block_mocap]
-        rotation = wp.quat(stored[1], stored[2], stored[3], stored[0])
-        _write_pose(mocap_pos[world, things.block_mocap], rotation, out_pose, env)
+    if joints.block_q_at >= 0:
+        sign = wp.where(qpos[world, joints.block_q_at + 3] < 0.0, -1.0, 1.0)  # qw >= 0
+        for k in range(3):
+            out_pose[env, k] = qpos[world, joints.block_q_at + k]
+            out_velocity[env, k] = qvel[world, joints.block_qd_at + k]
+        for k in range(3, 7):
+            out_pose[env, k] = sign * qpos[world, joints.block_q_at + k]
 
 
 @wp.kernel
@@ -204,22 +179,9 @@ def find_diverged(
     out_diverged[env] = wp.uint8(wp.where(bad != 0 or bits != 0, 1, 0))
 
 
-@wp.func
-def _write_pose(
-    position: wp.vec3, rotation: wp.quat, out_pose: wp.array2d[float], env: int
-) -> None:
-    """Write a pose as x, y, z, qw, qx, qy, qz with qw >= 0."""
-    sign = wp.where(rotation[3] < 0.0, -1.0, 1.0)
-    for axis in range(3):
-        out_pose[env, axis] = position[axis]
-        out_pose[env, 4 + axis] = sign * rotation[axis]
-    out_pose[env, 3] = sign * rotation[3]
-
-
 @wp.kernel
 def reset_worlds(
     joints: Joints,
-    things: Things,
     mask: wp.array[wp.uint8],
     q: wp.array2d[float],
     block_pose: wp.array2d[float],
@@ -249,24 +211,13 @@ def reset_worlds(
             offset = joints.dof_offset[world % joints.dof_offset.shape[0], dof]
             qpos[world, joints.dof_q_at[dof]] = gain * q[env, leader] + offset
     overflow[world] = 0
-    if things.block_q_at >= 0:
+    if joints.block_q_at >= 0:
         for k in range(7):
-            qpos[world, things.block_q_at + k] = block_pose[env, k]
-    if things.block_mocap >= 0:
-        _put_mocap(block_pose[env], mocap_pos, mocap_quat, world, things.block_mocap)
+            qpos[world, joints.block_q_at + k] = block_pose[env, k]
     if obstacle_poses.shape[1] > 0:
-        for k in range(things.obstacles.shape[0]):
-            _put_mocap(obstacle_poses[env, k], mocap_pos, mocap_quat, world, things.obstacles[k])
-
-
-@wp.func
-def _put_mocap(
-    pose: wp.array[float],
-    mocap_pos: wp.array2d[wp.vec3],
-    mocap_quat: wp.array2d[wp.quat],
-    world: int,
-    at: int,
-) -> None:
-    """Write a pose x, y, z, qw, qx, qy, qz into arrays of MuJoCo Warp."""
-    mocap_pos[world, at] = wp.vec3(pose[0], pose[1], pose[2])
-    mocap_quat[world, at] = wp.quat(pose[3], pose[4], pose[5], pose[6])
+        for k in range(joints.obstacles.shape[0]):
+            pose = obstacle_poses[env, k]
+            at = joints.obstacles[k]
+            mocap_pos[world, at] = wp.vec3(pose[0], pose[1], pose[2])
+            # MuJoCo's quaternions are (w, x, y, z), also in arrays of Warp's quat (x, y, z, w).
+            mocap_quat[world, at] = wp.quat(pose[3], pose[4], pose[5], pose[6])

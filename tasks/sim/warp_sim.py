@@ -25,7 +25,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 from morphgen.tasks.sim import warp_kernels as kernels
-from morphgen.tasks.sim.base import SUBSTEPS, Contacts, Scene, Simulator, require_reset_shapes
+from morphgen.tasks.sim.base import SUBSTEPS, Contacts, Scene, Simulation, Simulator
 from morphgen.tasks.sim.motor_law import farthest_targets
 from morphgen.tasks.sim.mujoco_model import World, worlds
 
@@ -140,7 +140,7 @@ def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
 
 def _same_indices(first: World, other: World) -> bool:
     """Return whether two worlds have joints, block and obstacles at the same indices."""
-    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at", "obstacles", "block")
+    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at", "obstacles", "block_q_at")
     return all(
         np.array_equal(getattr(first, name), getattr(other, name)) for name in names
     ) and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
@@ -207,7 +207,7 @@ class Group:
                 njmax=rows,
             )
             _put_static_geoms(self.data, structure.worlds, count)
-            self._joints, self._things = _joints(structure), _things(first)
+            self._joints = _joints(structure)
             self._acceleration = wp.zeros((count, model.nv), dtype=float)
             self._force = wp.zeros((count, model.nv), dtype=float)
 
@@ -254,9 +254,9 @@ class Group:
     def read(self) -> None:
         """Write the state into the buffers."""
         data, out = self.data, self._buffers
-        state = [data.qpos, data.qvel, data.mocap_pos, data.mocap_quat]
         outputs = [out[name] for name in ("q", "qd", "block_pose", "block_velocity")]
-        wp.launch(kernels.read_state, data.nworld, [self._joints, self._things, *state], outputs)
+        inputs = [self._joints, data.qpos, data.qvel]
+        wp.launch(kernels.read_state, data.nworld, inputs, outputs)
 
     def _find_diverged(self) -> None:
         """Mark the environments that diverged in the step, and count them."""
@@ -277,7 +277,7 @@ class Group:
         wp.launch(
             kernels.reset_worlds,
             data.nworld,
-            [self._joints, self._things, *wanted],
+            [self._joints, *wanted],
             [*dynamic, data.mocap_pos, data.mocap_quat, data.overflow],
         )
 
@@ -320,19 +320,11 @@ def _joints(structure: Structure) -> kernels.Joints:
     joints.farthest = _array(
         [farthest_targets(world.robot, world.robot.independent_joints) for world in rows], float
     )
+    has_block = len(first.block_q_at) > 0
+    joints.block_q_at = int(first.block_q_at[0]) if has_block else -1
+    joints.block_qd_at = int(first.block_qd_at[0]) if has_block else 0
+    joints.obstacles = _array(first.obstacles, int)
     return joints
-
-
-def _things(world: World) -> kernels.Things:
-    """Return the block and the obstacles of a structure."""
-    things = kernels.Things()
-    things.block_q_at, things.block_qd_at, things.block_mocap = -1, 0, -1
-    if world.block is not None and world.block_moves:
-        things.block_q_at, things.block_qd_at = world.block_q_at, world.block_qd_at
-    elif world.block is not None:
-        things.block_mocap = int(world.model.body_mocapid[world.block])
-    things.obstacles = _array(world.obstacles, int)
-    return things
 
 
 def _array(values: object, dtype: Callable[..., object]) -> wp.array:
@@ -341,10 +333,10 @@ def _array(values: object, dtype: Callable[..., object]) -> wp.array:
 
 
 _log = logging.getLogger(__name__)
-DIVERGED = "diverged: a target or the state is not finite, or a velocity is too large"
+DIVERGED = "a target or the state is not finite, or a velocity is too large"
 
 
-class WarpSimulation:
+class WarpSimulation(Simulation):
     """Environments in MuJoCo Warp, on a GPU or slowly on the CPU; a ``Simulation``.
 
     Environments whose models have one structure share a model with numbers for every robot, and
@@ -369,18 +361,14 @@ class WarpSimulation:
         *,
         device: torch.device | str = "cuda",
     ) -> None:
-        """Compile; every robot is at home, every block and obstacle at its pose in the scene."""
-        if not scenes:
-            raise ValueError("there are no scenes; expected one or more")
+        """Compile the scenes."""
+        super().__init__(scenes, torch.device(device))
         wp.config.log_level = wp.LOG_WARNING
-        self.scenes = tuple(scenes)
-        self.device = torch.device(device)
         compiled = worlds(self.scenes, contacts or Contacts())
         found = structures(self.scenes, compiled)
         n, joints = len(scenes), max(world.robot.dof for world in compiled)
-        most = max(len(scene.obstacles) for scene in scenes)
         shapes = dict.fromkeys(("q", "qd", "targets", "reset_q"), (n, joints))
-        shapes |= {"block_pose": (n, 7), "reset_pose": (n, 7), "block_velocity": (n, 6)}
+        shapes |= {"block_pose": (n, 7), "reset_pose": (n, 7), "block_velocity": (n, 3)}
         tensors = {name: torch.zeros(shape, device=self.device) for name, shape in shapes.items()}
         for name, shape, dtype in (
             ("counts", (len(found), 2), torch.int32),
@@ -389,30 +377,32 @@ class WarpSimulation:
             ("mask", (n,), torch.uint8),
         ):
             tensors[name] = torch.zeros(shape, dtype=dtype, device=self.device)
-        self.q, self.qd, self.counts = (tensors[name] for name in ("q", "qd", "counts"))
-        self.block_pose, self.block_velocity = tensors["block_pose"], tensors["block_velocity"]
-        self._tensors = tensors
-        self._obstacle_poses = torch.zeros(n, most, 7, device=self.device)
+        self.q, self.qd, self.block_pose = (tensors[name] for name in ("q", "qd", "block_pose"))
+        self.counts, self._tensors = tensors["counts"], tensors
+        self._obstacle_poses = torch.zeros(n, self._num_obstacles, 7, device=self.device)
         buffers = {name: wp.from_torch(tensor) for name, tensor in tensors.items()}
         name = str(buffers["q"].device)
         self._groups = [self.group_type(each, i, name, buffers) for i, each in enumerate(found)]
         with wp.ScopedDevice(name):
             self._no_poses = wp.zeros((n, 0, 7), dtype=float)
-            self._poses = wp.from_torch(self._obstacle_poses) if most else self._no_poses
+            has_obstacles = self._num_obstacles > 0
+            self._poses = wp.from_torch(self._obstacle_poses) if has_obstacles else self._no_poses
         self._streams = _Streams(name, self._groups) if self.device.type == "cuda" else None
-        self._go_home(compiled)
+        self._go_home()
         self.counts.zero_()  # capturing ran steps
 
-    def reset(
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.block_velocity``."""
+        return self._tensors["block_velocity"]
+
+    def _reset(
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
         block_pose: torch.Tensor,
-        obstacle_poses: torch.Tensor | None = None,
+        obstacle_poses: torch.Tensor | None,
     ) -> None:
-        """Put some environments at rest; see ``Simulation.reset``."""
-        self._require_open()
-        require_reset_shapes(self.scenes, self.q.shape[1], mask, q, block_pose, obstacle_poses)
         self._tensors["mask"].copy_(mask)
         self._tensors["reset_q"].copy_(q)
         self._tensors["reset_pose"].copy_(block_pose)
@@ -424,13 +414,7 @@ class WarpSimulation:
                 group.reset(poses)
                 group.read()
 
-    def step(self, targets: torch.Tensor) -> torch.Tensor:
-        """Advance all environments by one control step; see ``Simulation.step``."""
-        self._require_open()
-        if targets.shape != self.q.shape:
-            raise ValueError(
-                f"targets have shape {tuple(targets.shape)}, not {tuple(self.q.shape)}"
-            )
+    def _step(self, targets: torch.Tensor) -> torch.Tensor:
         self._tensors["targets"].copy_(targets)
         if self._streams is not None:
             self._streams.launch()
@@ -438,40 +422,27 @@ class WarpSimulation:
             with wp.ScopedDevice("cpu"):
                 for group in self._groups:
                     group.step()
-        diverged: torch.Tensor = self._tensors["diverged"].bool()
-        return diverged
+        return self._tensors["diverged"].bool()
 
     def faults(self) -> dict[int, str]:
-        """Return the environments that diverged in the last step, each with the reason."""
+        """Return why environments diverged in the last step; see ``Simulation.faults``."""
         overflow, diverged = (self._tensors[name].tolist() for name in ("overflow", "diverged"))
-        return {env: _fault(overflow[env]) for env, is_fault in enumerate(diverged) if is_fault}
+        return {
+            env: f"{self._label(env)}: diverged: {_fault(overflow[env])}"
+            for env, is_fault in enumerate(diverged)
+            if is_fault
+        }
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
+        super().close()
         self._groups, self._streams = [], None
-
-    def _go_home(self, compiled: Sequence[World]) -> None:
-        """Reset all environments to the home positions and to the poses of their scenes."""
-        buffers = (self.q, self.block_pose, self._obstacle_poses)
-        q, block, poses = (torch.zeros(buffer.shape) for buffer in buffers)
-        for env, (scene, world) in enumerate(zip(self.scenes, compiled, strict=True)):
-            q[env, : world.robot.dof] = torch.tensor(world.robot.home)
-            boxes = [] if scene.block is None else [(block[env], scene.block)]
-            for row, box in (*boxes, *zip(poses[env], scene.obstacles, strict=False)):
-                row[:] = torch.tensor((*box.pose.position, *box.pose.quaternion))
-        q, block, poses = (rows.to(self.device) for rows in (q, block, poses))
-        everything = torch.ones(len(self.scenes), dtype=torch.bool, device=self.device)
-        self.reset(everything, q, block, poses if poses.shape[1] else None)
 
     def _on_torch_stream(self) -> wp.ScopedStream | wp.ScopedDevice:
         """Return a context in which Warp launches its kernels after those of torch."""
         if self.device.type == "cpu":
             return wp.ScopedDevice("cpu")
         return wp.ScopedStream(wp.stream_from_torch(self.device), sync_enter=False)
-
-    def _require_open(self) -> None:
-        if not self._groups:
-            raise SimulationError("the simulation is closed")
 
 
 class _Streams:
@@ -511,7 +482,7 @@ def _fault(overflow: int) -> str:
     """Return why a world diverged."""
     if overflow:
         bits = OverflowType(overflow & int(OverflowType.ALL))
-        return f"diverged: its contacts do not fit into MuJoCo Warp's memory ({bits.name})"
+        return f"its contacts do not fit into MuJoCo Warp's memory ({bits.name})"
     return DIVERGED
 
 

@@ -30,7 +30,7 @@ def reset(simulation, q=None, pose=None, envs=None):
 
 def client_of(simulation, env=0):
     """The PyBullet client of an environment."""
-    return simulation._local_batches[0]._loaded[env]
+    return simulation.batch._loaded[env]
 
 
 def wander(simulation, q, steps, seed=0, size=0.03, ahead=0.0):

@@ -111,8 +111,7 @@ def in_environment(simulation, positions, robot, targets):
 
 def in_mujoco(robot, targets):
     simulation = MujocoSimulation([Scene(robot)], Contacts(False, False))
-    (world,), (data,) = simulation._worlds, simulation._data
-    return in_environment(simulation, lambda: data.qpos[world.movable_q_at], robot, targets)
+    return in_environment(simulation, lambda: simulation.movable_q(0), robot, targets)
 
 
 def in_bullet(robot, targets):
@@ -120,10 +119,7 @@ def in_bullet(robot, targets):
     from morphgen.tasks.sim.bullet import BulletSimulation
 
     simulation = BulletSimulation([Scene(robot)], Contacts(False, False))
-    home = torch.tensor([robot.home])
-    simulation.reset(torch.tensor([True]), home, torch.zeros(1, 7))
-    (batch,) = simulation._local_batches
-    return in_environment(simulation, lambda: batch._positions, robot, targets)
+    return in_environment(simulation, lambda: simulation.movable_q(0), robot, targets)
 
 
 @pytest.mark.parametrize("simulate", [in_mjcf, in_mujoco, in_bullet])

@@ -66,7 +66,9 @@ def test_divergence_leaves_no_log_and_names_the_step(tmp_path, monkeypatch):
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
     assert sim.step(home).tolist() == [True, False, True]
     name = sim.scenes[0].robot.name
-    assert re.match(rf"environment 0 \(robot '{name}', 2 steps.*beyond 10000", sim.faults()[0])
+    assert re.match(
+        rf"environment 0 \(robot '{name}'\): .* in step 2: .*beyond 10000", sim.faults()[0]
+    )
     assert list(Path(tmp_path).iterdir()) == []
 
 
@@ -182,18 +184,6 @@ def test_friction_is_that_of_the_block(friction):
     slide = GRAVITY * (math.sin(angle) - friction * math.cos(angle))
     assert travelled[0] < 1e-3
     assert travelled[1] == pytest.approx(slide / 2 * (1.5**2 - 1), rel=0.05)
-
-
-def test_spin_is_in_the_world_frame():
-    """A block that leans on an edge topples about the world's x, however it is turned itself."""
-    lean = Pose.from_xyz_rpy((0, 0, 0.15), (-0.9, 0, 0))
-    turned = lean @ Pose.from_xyz_rpy((0, 0, 0), (0, 0, math.pi / 2))
-    spins = []
-    for pose in (lean, turned):
-        sim = held(MujocoSimulation([block_scene(Block((0.2,) * 3, pose, 0.1))]), 8)
-        spins.append(sim.block_velocity[0, 3:].tolist())
-    assert abs(spins[0][0]) > 0.5
-    assert spins[1] == pytest.approx(spins[0], abs=0.02)
 
 
 def test_self_contacts_are_optional_and_respect_ignored_pairs():
