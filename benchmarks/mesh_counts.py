@@ -25,7 +25,7 @@ from tabulate import tabulate
 from morphgen.errors import MeshError
 from morphgen.model.mesh_files import read_mesh_file
 
-SUFFIXES = (".dae", ".glb", ".gltf", ".msh", ".obj", ".ply", ".stl")
+SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 
 
 def count_triangles(path: Path) -> int:
@@ -81,11 +81,6 @@ def _ply(data: bytes) -> int:
                     total += max(length - 2, 0) if name == "face" else 0
                 start += length * sizes.get(kind, 4)
     return total
-
-
-def _msh(data: bytes) -> int:
-    (*_, faces) = struct.unpack_from("<4i", data)
-    return int(faces)
 
 
 def _glb(data: bytes) -> int:
@@ -154,7 +149,6 @@ _COUNTERS = {
     ".dae": _dae,
     ".glb": _glb,
     ".gltf": _gltf,
-    ".msh": _msh,
     ".obj": _obj,
     ".ply": _ply,
     ".stl": _stl,

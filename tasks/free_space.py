@@ -55,7 +55,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
     pairs_of: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
     for a, b in sorted(pair for pair, count in counts.items() if count >= OFTEN * SAMPLES):
         chains = {*robot.joint_chain(a)} ^ {*robot.joint_chain(b)}
-        pairs_of[driving_joints(robot, chains)].append((a, b))
+        pairs_of[tuple(sorted(driving_joints(robot, chains)))].append((a, b))
     tool_joints = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
     planes = [
         _joint_plane(robot, joints, pairs)

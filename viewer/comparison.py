@@ -15,7 +15,7 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Shape
-from morphgen.model.kinematics import joint_limits
+from morphgen.model.kinematics import driving_joints, joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
@@ -35,13 +35,9 @@ def joint_roles(robot: Robot) -> list[str]:
     ``joint 1`` is the first joint on the path from the root to the tool, perhaps through a mimic
     joint; ``finger 1`` the first that does not move the tool.
     """
-    on_path: list[int] = []
+    on_path: tuple[int, ...] = ()
     if has_tool(robot):
-        row_of_joint = {k: i for i, k in enumerate(robot.movable_joints)}
-        gains, _ = robot.mimic_map
-        path = [k for k in robot.joint_chain(robot.frame(TOOL).link) if k in row_of_joint]
-        on_path = [int(column) for k in path for column in gains[row_of_joint[k]].nonzero()[0]]
-    on_path = list(dict.fromkeys(on_path))
+        on_path = driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))
     off_path = [i for i in range(robot.dof) if i not in on_path]
     roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}
     roles |= {i: f"finger {n}" for n, i in enumerate(off_path, 1)}

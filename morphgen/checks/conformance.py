@@ -23,7 +23,7 @@ from lxml import etree
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
 from morphgen.checks.quirks import REFUSALS, Quirk
-from morphgen.checks.readers import LOADERS, Loader, Reading
+from morphgen.checks.readers import LOADERS, NO_LIMITS, Loader, Reading
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.formats.description import read_description
@@ -58,13 +58,10 @@ MASS_TOLERANCE = 1e-6
 
 In addition, MuJoCo may add ``BOUND_MASS`` per link.
 """
-
-
 RELATIVE_TOLERANCE = 1e-5
 """Largest accepted relative difference of a joint's value: gains are written with 6 digits."""
 ABSOLUTE_TOLERANCE = 1e-9
 """Largest accepted difference of a joint's value near zero, in its SI unit."""
-_NO_LIMITS = (-math.inf, math.inf)
 _WITHOUT_VELOCITY = (None, 0.0, math.inf)
 """Velocity limits that loaders read where a file names none."""
 GRAVITY_TOLERANCE = 1e-6
@@ -323,8 +320,8 @@ def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | Non
     for name in shared:
         joint, read = robot.joints[robot.joint_index[name]], reading.joints[name]
         # Without limits, a loader may read none, or those that a bundle has.
-        is_open = joint.is_continuous or (joint.limits is None and read.limits == _NO_LIMITS)
-        lower, upper = _NO_LIMITS if is_open else joint.effective_limits
+        is_open = joint.is_continuous or (joint.limits is None and read.limits == NO_LIMITS)
+        lower, upper = NO_LIMITS if is_open else joint.effective_limits
         values: list[tuple[str, str, float | None, float]] = [
             ("limits", "lower limit", read.limits[0], lower),
             ("limits", "upper limit", read.limits[1], upper),
@@ -339,9 +336,9 @@ def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | Non
         if name in gains:
             gain = gains[name]
             values += [
-                ("gains", "stiffness", _or_nan(read.stiffness), gain.stiffness),
-                ("gains", "derivative gain", _or_nan(read.derivative_gain), gain.damping),
-                ("gains", "armature", _or_nan(read.armature), gain.armature),
+                ("gains", "stiffness", read.stiffness, gain.stiffness),
+                ("gains", "derivative gain", read.derivative_gain, gain.damping),
+                ("gains", "armature", read.armature, gain.armature),
             ]
         for column, quantity, value, expected in values:
             if value is not None and not _is_close(value, expected):
@@ -365,11 +362,6 @@ def _accepted_efforts(joint: Joint) -> tuple[float | None, ...]:
     if joint.effort in (None, 0.0, DEFAULT_EFFORT):
         return (None, 0.0, DEFAULT_EFFORT, math.inf)
     return (None,)
-
-
-def _or_nan(value: float | None) -> float:
-    """Return a value that is required; a missing one differs from every number."""
-    return math.nan if value is None else value
 
 
 def _is_close(a: float, b: float) -> bool:

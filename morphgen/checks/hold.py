@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.checks.home_pose import home_penetrations
-from morphgen.checks.readers import bullet_client, load_model
+from morphgen.checks.readers import NO_LIMITS, bullet_client, load_model
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF, bundle_folder, write_bundle
 from morphgen.formats.quiet import quiet
@@ -51,8 +51,6 @@ MAX_FOLLOWER_ERROR = {"prismatic": 0.005, "revolute": 0.02, "continuous": 0.02}
 [m or rad]: 5 mm are 0.02 rad at 25 cm."""
 STEP_S = 3.0  # duration within which a step must settle [s]
 SETTLED_S = 0.2  # duration for which all joints must be settled, after which a step ends [s]
-
-
 MIN_TIMESTEP = 1e-4  # smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding
 
 CHANGES: Mapping[str, Callable[[Joint], Joint]] = {
@@ -69,8 +67,7 @@ CHANGES: Mapping[str, Callable[[Joint], Joint]] = {
 class SimulatedRobot:
     """A robot in a simulator."""
 
-    period: float
-    """Time between the positions that ``run`` yields [s]."""
+    period: float  # time between the positions that ``run`` yields [s]
     run: Callable[[Array], Iterator[Array]]
     """Function of targets of the independent joints, shape (dof,) [rad or m]. It puts the robot to
     its home, at rest, drives it to the targets, and yields the positions of the movable joints,
@@ -250,9 +247,7 @@ def step_targets(robot: Robot) -> Array:
     targets = []
     for i, k in enumerate(robot.independent_joints):
         joint, home = robot.joints[k], robot.home[i]
-        lower, upper = joint.limits or (-math.inf, math.inf)
-        if joint.is_continuous:
-            lower, upper = -math.inf, math.inf
+        lower, upper = NO_LIMITS if joint.is_continuous else joint.limits or NO_LIMITS
         is_up = upper - home >= home - lower
         room = upper - home if is_up else home - lower
         size = min(STEP[joint.kind], MAX_STEP * room)

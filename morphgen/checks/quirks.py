@@ -238,9 +238,6 @@ USD_QUIRKS = (NO_QUATERNIONS, ZERO_RANGES)
 
 MIN_VALUE = 1e-14
 """Largest mass and moment of inertia that MuJoCo 4.0 takes for zero [kg or kg m^2]."""
-NO_INERTIA = "refuses <inertial> without <inertia>"
-MANY_LINKS = f"fails on robots with more than {PYBULLET_LINKS} links"
-LONG_SCALE = "refuses a mesh scale of more than three numbers"
 REFUSALS = (
     Refusal(
         "refuses moving links without mass or inertia",
@@ -258,14 +255,23 @@ REFUSALS = (
         partial(_set_inertias, is_wrong=lambda a, b, c: a <= MIN_VALUE, moment="1"),
         "must have positive eigenvalues",
     ),
-    Refusal(NO_INERTIA, _add_missing_inertia, "missing element: 'inertia'"),
-    Refusal(NO_INERTIA, _add_missing_inertia, "Cannot load URDF file"),
+    Refusal(
+        "refuses <inertial> without <inertia>",
+        _add_missing_inertia,
+        "missing element: 'inertia'|Cannot load URDF file",
+    ),
     Refusal("refuses a repeated element", _take_first, "repeated element"),
-    Refusal(LONG_SCALE, _shorten_scales, "'scale' has too much data"),
-    Refusal(LONG_SCALE, _shorten_scales, "mesh: scale: .* but 3 expected"),
+    Refusal(
+        "refuses a mesh scale of more than three numbers",
+        _shorten_scales,
+        "'scale' has too much data|mesh: scale: .* but 3 expected",
+    ),
     Refusal("refuses shapes without a size", _thicken, r"size \d must be positive"),
-    Refusal(MANY_LINKS, _drop_links, "Cannot load URDF file"),
-    Refusal(MANY_LINKS, _drop_links, "getLinkState failed"),
+    Refusal(
+        f"fails on robots with more than {PYBULLET_LINKS} links",
+        _drop_links,
+        "Cannot load URDF file|getLinkState failed",
+    ),
     Refusal(
         "refuses a joint that mimics a missing one",
         _drop_lost_mimics,

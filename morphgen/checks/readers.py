@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import yourdfpy
 
 
+NO_LIMITS = (-math.inf, math.inf)  # position limits of a joint without any [rad or m]
 DYNAMICS_SAMPLES = 20  # number of configurations in which forces and inertia are compared
 
 
@@ -44,38 +45,26 @@ DYNAMICS_SAMPLES = 20  # number of configurations in which forces and inertia ar
 class JointReading:
     """A movable joint as a loader reads it; None where the loader reads no such value."""
 
-    limits: tuple[float, float] = (-math.inf, math.inf)
-    """Lower and upper position limit, infinite without limits [rad or m]."""
-    effort: float | None = None
-    """Effort limit, infinite without one [N m or N]."""
-    velocity: float | None = None
-    """Velocity limit [rad/s or m/s]."""
-    damping: float | None = None
-    """Viscous damping [N m s/rad or N s/m]."""
-    friction: float | None = None
-    """Dry friction [N m or N]."""
-    stiffness: float | None = None
-    """Proportional gain of the joint's position actuator [N m/rad or N/m]."""
-    derivative_gain: float | None = None
-    """Derivative gain of the joint's position actuator [N m s/rad or N s/m]."""
-    armature: float | None = None
-    """Inertia that the motor adds to the joint [kg m^2 or kg]."""
+    limits: tuple[float, float] = NO_LIMITS  # lower and upper position limit [rad or m]
+    effort: float | None = None  # effort limit, infinite without one [N m or N]
+    velocity: float | None = None  # velocity limit [rad/s or m/s]
+    damping: float | None = None  # viscous damping [N m s/rad or N s/m]
+    friction: float | None = None  # dry friction [N m or N]
+    stiffness: float = math.nan  # gain of the joint's position actuator [N m/rad or N/m]
+    derivative_gain: float = math.nan  # its derivative gain [N m s/rad or N s/m]
+    armature: float = math.nan  # inertia that the motor adds to the joint [kg m^2 or kg]
 
 
 @dataclass(frozen=True)
 class Reading:
     """Robot as a loader reads it."""
 
-    joints: Mapping[str, JointReading]
-    """The movable joints by name."""
-    mass: float
-    """Total mass [kg]."""
-    T_root_frame: Array
-    """Pose of the frame in each configuration, shape (n, 4, 4)."""
+    joints: Mapping[str, JointReading]  # the movable joints by name
+    mass: float  # total mass [kg]
+    T_root_frame: Array  # pose of the frame in each configuration, shape (n, 4, 4)
     mimics: Mapping[str, Mimic] | None = field(default_factory=dict)
     """Couplings of the mimic joints by name; None if the loader ignores them."""
-    has_actuators: bool = False
-    """Whether the file has an actuator for every independent joint."""
+    has_actuators: bool = False  # whether the file has an actuator for every independent joint
     forces: Array | None = None
     """Forces that hold the weight of the fixed robot in the first ``DYNAMICS_SAMPLES``
     configurations, a column per joint in the order of ``joints`` [N m or N]; None, here and below,
@@ -97,14 +86,11 @@ movable joint, shape (n,) [rad or m], and the number n of configurations."""
 class Loader:
     """A library that reads one file of a bundle."""
 
-    name: str
-    """Name of the loader and its file."""
-    module: str
-    """Import name of the library."""
+    name: str  # name of the loader and its file
+    module: str  # import name of the library
     read: Read
     """Reads the file; raises ``FormatError`` if the library rejects it or lacks the frame."""
-    file: str
-    """The bundle's file that it reads."""
+    file: str  # the bundle's file that it reads
     quirks: tuple[Quirk, ...] = ()
     """Deviations of the loader from the URDF specification, in files of other tools."""
 
@@ -141,7 +127,7 @@ def _yourdfpy_joint(joint: yourdfpy.Joint) -> JointReading:
     limit, dynamics = joint.limit, joint.dynamics
     limited = joint.type != "continuous" and limit is not None
     return JointReading(
-        limits=(limit.lower, limit.upper) if limited else (-math.inf, math.inf),
+        limits=(limit.lower, limit.upper) if limited else NO_LIMITS,
         effort=limit.effort if limit is not None else None,
         velocity=limit.velocity if limit is not None else None,
         # yourdfpy leaves these two as text.
@@ -234,7 +220,7 @@ def _pybullet_joint(info: Sequence[float]) -> JointReading:
     """Return a joint from PyBullet's joint info, whose numbers are items 6 to 11."""
     damping, friction, lower, upper, effort, velocity = info[6:12]
     return JointReading(
-        limits=(lower, upper) if lower <= upper else (-math.inf, math.inf),
+        limits=(lower, upper) if lower <= upper else NO_LIMITS,
         effort=effort,
         velocity=velocity,
         damping=damping,
@@ -308,12 +294,9 @@ def _pinocchio_mimics(urdf: Path) -> dict[str, Mimic] | None:
 def _pinocchio_joint(model: pinocchio.Model, k: int) -> JointReading:
     """Return a joint of Pinocchio by its number; one with a cosine and a sine has no limits."""
     q, v, unlimited = model.idx_qs[k], model.idx_vs[k], model.nqs[k] > 1
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     return JointReading(
-        limits=(
-            (-math.inf, math.inf)
-            if unlimited
-            else (float(model.lowerPositionLimit[q]), float(model.upperPositionLimit[q]))
-        ),
+        limits=NO_LIMITS if unlimited else (float(lower[q]), float(upper[q])),
         effort=float(model.effortLimit[v]),
         velocity=float(model.velocityLimit[v]),
         damping=float(model.damping[v]),
@@ -402,7 +385,7 @@ def _mujoco_joint(model: mujoco.MjModel, i: int) -> JointReading:
     dof = model.jnt_dofadr[i]
     limited = bool(model.jnt_limited[i])
     reading = JointReading(
-        limits=tuple(model.jnt_range[i].tolist()) if limited else (-math.inf, math.inf),
+        limits=tuple(model.jnt_range[i].tolist()) if limited else NO_LIMITS,
         effort=float(model.jnt_actfrcrange[i, 1]) if model.jnt_actfrclimited[i] else None,
         damping=float(model.dof_damping[dof]),
         friction=float(model.dof_frictionloss[dof]),

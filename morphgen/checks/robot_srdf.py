@@ -27,16 +27,12 @@ MATRIX_SAMPLES = 10_000  # number of sampled configurations, the default of Move
 class CollisionMatrix:
     """Pairs of links whose collisions need no test, with reasons and evidence."""
 
-    reasons: dict[Pair, Reason]
-    """Reason of every pair that needs no test, the pairs sorted."""
+    reasons: dict[Pair, Reason]  # reason of every pair that needs no test, the pairs sorted
     collisions: dict[Pair, int]
     """Number of sampled configurations in which a pair collides, for pairs that collide in any."""
-    num_pairs: int
-    """Number of pairs of links with collision shapes."""
-    samples: int
-    """Number of sampled configurations."""
-    seed: int
-    """Seed of the configurations."""
+    num_pairs: int  # number of pairs of links with collision shapes
+    samples: int  # number of sampled configurations
+    seed: int  # seed of the configurations
 
 
 def collision_matrix(

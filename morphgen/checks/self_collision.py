@@ -158,8 +158,7 @@ class SelfCollisionChecker:
 class CollisionSurvey:
     """Pairs of links to ignore, and the penetrations at the home configuration."""
 
-    ignore_pairs: tuple[Pair, ...]
-    """Pairs whose contact is not a self-collision, sorted."""
+    ignore_pairs: tuple[Pair, ...]  # pairs whose contact is not a self-collision, sorted
     home_penetrations: Mapping[Pair, float]
     """Depth [m] of the pairs that penetrate at home; adjacent and known pairs are not tested."""
 

@@ -16,6 +16,7 @@ from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import (
+    driving_joints,
     forward_kinematics,
     frame_positions,
     joint_axes,
@@ -132,7 +133,7 @@ def _tool_chain(robot: Robot) -> tuple[int, ...]:
             "its working point: morphgen import FILE --tool LINK"
         )
     chain = robot.joint_chain(robot.frame(TOOL).link)
-    if not _moving(robot, chain):
+    if not driving_joints(robot, chain):
         raise BenchmarkError(
             f"robot {robot.name!r}: no joint moves its tool, which is on link "
             f"{robot.frame(TOOL).link!r}; place the frame on a link that moves"
@@ -147,17 +148,9 @@ def _tool_chain(robot: Robot) -> tuple[int, ...]:
     return chain
 
 
-def _moving(robot: Robot, chain: Sequence[int]) -> list[int]:
-    """Return the columns of q that move the joints of a chain, nearest to the root first."""
-    row = {k: i for i, k in enumerate(robot.movable_joints)}
-    gains, _ = robot.mimic_map
-    columns = [int(column) for k in chain if k in row for column in gains[row[k]].nonzero()[0]]
-    return list(dict.fromkeys(columns))
-
-
 def _configurations(robot: Robot, chain: tuple[int, ...], samples: int) -> Array:
     """Draw uniform positions of the joints that move the tool, (dof, n); zeros for others."""
-    moving = _moving(robot, chain)
+    moving = [*driving_joints(robot, chain)]
     low, high = joint_limits(robot)[moving].T[..., None]
     q = np.zeros((robot.dof, samples))
     q[moving] = low + (high - low) * np.random.default_rng(_SEED).random((len(moving), samples))

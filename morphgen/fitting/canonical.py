@@ -16,8 +16,7 @@ from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalize
 from morphgen.typing import Array
 
-Kind = Literal["box", "cylinder", "sphere"]
-"""A kind of primitive that the fitter chooses from."""
+Kind = Literal["box", "cylinder", "sphere"]  # a kind of primitive that the fitter chooses from
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
 
 _DECIMALS = 9  # decimals of rotations; fits differ beyond them from machine to machine

@@ -34,18 +34,15 @@ from morphgen.model.robot import Robot
 from morphgen.progress import report
 from morphgen.typing import Array
 
-MAX_PIECES = 16
-"""Largest number of convex pieces of one mesh."""
-MAX_SECONDS = 300
-"""Longest time that the decomposition of one mesh may take [s]."""
+MAX_PIECES = 16  # largest number of convex pieces of one mesh
+MAX_SECONDS = 300  # longest time that the decomposition of one mesh may take [s]
 MAX_DIRECT_FACES = 5_000
 """Number of triangles above which CoACD cuts a coarser remesh of the surface."""
 CONVEX_SHARE = 0.99
 """Share of its hull's volume from which a closed mesh counts as convex and stays as it is."""
 MAX_REASON = 120
 """Largest part of an error of CoACD that is shown [characters]; its assertions fill a page."""
-MIN_SHARE = 1e-5
-"""Volume of the smallest piece that is kept, relative to the hull of the mesh."""
+MIN_SHARE = 1e-5  # volume of the smallest piece that is kept, relative to the hull of the mesh
 SETTINGS = {
     "threshold": 0.05,
     "max_convex_hull": MAX_PIECES,

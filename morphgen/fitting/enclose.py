@@ -40,8 +40,7 @@ _FIRST_STEP = 0.05  # rotation of the first step of a refinement [rad]
 _MAX_POINTS = 1000  # largest number of points with which rotations are searched
 _LINK_AXES_EXCESS = 1e-5  # relative excess of volume up to which the link's own axes are preferred
 _ON_BALL = 1e-10  # relative excess of a distance below which a point counts as on the ball
-NUM_CLUSTERINGS = 3
-"""Number of partitions of a solid that are tried for each number of primitives."""
+NUM_CLUSTERINGS = 3  # number of partitions of a solid that are tried for each number of primitives
 _MAX_GROWTHS = 20
 """Largest number of times that primitives are enlarged to contain the points left outside."""
 

@@ -22,14 +22,11 @@ MAX_COVER = 0.9999
 class FitOptions:
     """Options of a fit."""
 
-    max_primitives: int = 1
-    """Largest number of primitives per link."""
-    iou: float = 0.9
-    """Intersection over union at which no further primitive is added."""
+    max_primitives: int = 1  # largest number of primitives per link
+    iou: float = 0.9  # intersection over union at which no further primitive is added
     enclose: bool = False
     """Enclose every point of the solid, instead of maximising the intersection over union."""
-    seed: int = 0
-    """Seed of the sample points and of the clusterings."""
+    seed: int = 0  # seed of the sample points and of the clusterings
     spheres: int | None = None
     """Number of spheres per link, of a fit with spheres alone; None for a fit with primitives."""
     cover: float | None = None
@@ -59,15 +56,12 @@ class FitOptions:
 class LinkFit:
     """Primitives that replace the shapes of a link, with their measured quality."""
 
-    primitives: tuple[Shape, ...]
-    """Boxes, cylinders and spheres in the link frame."""
-    single: Shape | None
-    """The single primitive of largest overlap; None if it was not searched for."""
+    primitives: tuple[Shape, ...]  # boxes, cylinders and spheres in the link frame
+    single: Shape | None  # the single primitive of largest overlap; None if it was not searched for
     solid: str
     """How the solid was made, see ``solid.Method``; ``primitives`` if the shapes were kept."""
     quality: Quality
-    seconds: float
-    """Duration of the fit [s]; 0 for a link that shares the fit of a congruent one."""
+    seconds: float  # duration of the fit [s]; 0 for a link that shares the fit of a congruent one
     decimated_from: int | None = None
     """Number of triangles before decimation; None if the mesh was not decimated."""
 

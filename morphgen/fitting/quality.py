@@ -19,8 +19,7 @@ from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Shape, Sphere, volume
 from morphgen.typing import Array
 
-SolidPrimitive = Box | Cylinder | Capsule
-"""A primitive; a sphere is a capsule of length 0."""
+SolidPrimitive = Box | Cylinder | Capsule  # a primitive; a sphere is a capsule of length 0
 _ON_SURFACE = 1e-6
 """Distance up to which a point counts as on the surface of the solid, not outside [m]."""
 _SECTIONS = 128  # number of sides of a tessellated circle, within 0.03% of its radius

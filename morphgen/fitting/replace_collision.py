@@ -31,8 +31,7 @@ from morphgen.model.robot import Link, Robot
 if TYPE_CHECKING:
     from morphgen.fitting.link_fit import FitOptions
 
-SPHERES = 8
-"""Default number of spheres per link."""
+SPHERES = 8  # default number of spheres per link
 _SPHERE_CACHE = "spheres-1"
 """Folders in the cache begin so; the number rises when the same shapes get other spheres."""
 _CACHE = f"fits-{FITTER_VERSION}"  # folder of the fits in the user's cache

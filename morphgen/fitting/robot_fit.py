@@ -36,8 +36,7 @@ from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 
-TOKEN_OPTIONS = FitOptions(max_primitives=1)
-"""Options of the primitive in a link's token."""
+TOKEN_OPTIONS = FitOptions(max_primitives=1)  # options of the primitive in a link's token
 COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
 """Options of the primitives that replace a link's collision meshes."""
 
@@ -48,8 +47,7 @@ class LinkReport:
 
     link: str
     fit: LinkFit
-    same_as: str | None = None
-    """The congruent link whose fit this link shares."""
+    same_as: str | None = None  # the congruent link whose fit this link shares
 
 
 @dataclass(frozen=True)
@@ -58,10 +56,8 @@ class FitReport:
 
     robot: str
     options: FitOptions
-    links: tuple[LinkReport, ...]
-    """Links with shapes, in the robot's order."""
-    findings: tuple[Finding, ...]
-    """Links without a primitive, and meshes that were decimated."""
+    links: tuple[LinkReport, ...]  # links with shapes, in the robot's order
+    findings: tuple[Finding, ...]  # links without a primitive, and meshes that were decimated
 
     @property
     def mean(self) -> Quality | None:

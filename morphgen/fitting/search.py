@@ -30,10 +30,8 @@ from morphgen.model.rotation import IDENTITY, normalize
 from morphgen.processes import one_torch_thread
 from morphgen.typing import Array
 
-TRIM = 0.03
-"""Share of a cloud's points outside of a guess at either end of an axis."""
-MIN_POINTS = 8
-"""Smallest number of points of a cluster."""
+TRIM = 0.03  # share of a cloud's points outside of a guess at either end of an axis
+MIN_POINTS = 8  # smallest number of points of a cluster
 _NUM_CLUSTERS = (1, 2, 3)
 """Numbers of clusters of the uncovered points, each of which may get a further primitive."""
 _MIN_HALF_EXTENT = 1e-3  # smallest half extent of a guess, relative to the solid's size
@@ -44,18 +42,14 @@ _AXES_TO_Z = (
     np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 )
 """Rotations whose z axis is the z, x and y axis."""
-COARSE_POINTS = 2**11
-"""Number of sample points of the first ascent."""
+COARSE_POINTS = 2**11  # number of sample points of the first ascent
 NEAR_POINTS, FAR_POINTS = 2**14, 2**12
 """Numbers of sample points close to the solid and further away."""
 NEAR, FAR = 0.02, 0.35
 """Margins of their boxes around the bounding box, relative to the solid's size."""
-NUM_CLUSTERINGS = 4
-"""Number of clusterings from which the search for several primitives starts."""
-NUM_REFINED = 2
-"""Number of candidates that are refined on all sample points."""
-DIGITS = 6
-"""Decimals of dimensions and positions in metres; quaternions have three more."""
+NUM_CLUSTERINGS = 4  # number of clusterings from which the search for several primitives starts
+NUM_REFINED = 2  # number of candidates that are refined on all sample points
+DIGITS = 6  # decimals of dimensions and positions in metres; quaternions have three more
 NUM_SPHERE_CLUSTERINGS = 2
 """Number of clusterings from which the search starts; more bring next to nothing."""
 EMPHASES = (6.0, 20.0, 100.0)

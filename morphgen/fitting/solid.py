@@ -34,19 +34,15 @@ outwards, vertices welded, small holes filled); open, so that the winding number
 shell whose cavity was filled; the convex hull of a mesh that encloses next to nothing."""
 METHODS: tuple[Method, ...] = ("watertight", "repaired", "winding", "filled", "hull")
 
-MAX_FACES = 200_000
-"""Number of triangles above which a mesh is decimated."""
-DECIMATED_FACES = 100_000
-"""Number of triangles after decimation."""
+MAX_FACES = 200_000  # number of triangles above which a mesh is decimated
+DECIMATED_FACES = 100_000  # number of triangles after decimation
 MIN_ENCLOSED_SHARE = 0.02
 """Share of the convex hull's volume below which an open mesh encloses nothing."""
 MAX_OPENNESS = 0.3
 """Openness below which a point is in the cavity of a shell. Half-way down a cup that is as wide as
 deep the openness is 0.15."""
-MIN_CAVITY = 0.1
-"""Volume of a cavity, relative to that of the walls, from which a shell is filled."""
-NUM_RAYS = 64
-"""Number of rays from a point that its openness is measured with."""
+MIN_CAVITY = 0.1  # volume of a cavity, relative to that of the walls, from which a shell is filled
+NUM_RAYS = 64  # number of rays from a point that its openness is measured with
 _WELD_DISTANCE = 1e-5  # distance below which vertices are welded, relative to the size of the mesh
 _NUM_PROBES = 4096  # number of sample points that measure enclosed volumes and cavities
 

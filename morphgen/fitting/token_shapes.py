@@ -37,6 +37,7 @@ from morphgen.model.geometry import (
     Primitive,
     Shape,
     Sphere,
+    half_extents,
     map_dimensions,
     scale_shape,
     volume,
@@ -182,7 +183,7 @@ def _sample(primitives: Sequence[Shape]) -> _Link:
     samples, volumes = [], []
     for shape in primitives:
         geometry, T = _primitive(shape), shape.T_link_shape.matrix
-        half = _half_extents(geometry)[:, None]
+        half = np.array(half_extents(geometry))[:, None]
         inside = cube[:, _inside(geometry, cube * half)] * half
         samples.append(_rotate(T[:3, :3], inside) + T[:3, 3:])
         volumes.append(np.full(inside.shape[1], volume(geometry) / inside.shape[1]))
@@ -250,7 +251,7 @@ def _then(values: Array, grid: Array) -> list[float]:
 def _iou(frame: _Frame, kind: Kind, parameters: Parameters) -> float:
     """Return the intersection over union with the link; 0 for a primitive without volume."""
     geometry, centre = _geometry(kind, parameters)
-    if min(_half_extents(geometry)) <= 0:
+    if min(half_extents(geometry)) <= 0:
         return 0.0
     link, inside = frame.link, _inside(geometry, frame.points - np.array(centre)[:, None])
     intersection = float(link.weights[inside].sum()) / _TOTAL_WEIGHT * link.volume
@@ -284,17 +285,6 @@ def _primitive(shape: Shape) -> Box | Cylinder | Sphere:
     if not isinstance(shape.geometry, Box | Cylinder | Sphere):
         raise TypeError(f"{shape.geometry!r} is not a box, cylinder or sphere")
     return shape.geometry
-
-
-def _half_extents(geometry: Primitive) -> Array:
-    """Return the half extents of a primitive along its own axes, shape (3,)."""
-    match geometry:
-        case Box(size):
-            return np.array(size) / 2
-        case Sphere(radius):
-            return np.full(3, radius)
-        case _:
-            return np.array([geometry.radius, geometry.radius, geometry.length / 2])
 
 
 def _inside(geometry: Primitive, points: Array) -> NDArray[np.bool_]:

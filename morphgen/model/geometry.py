@@ -18,7 +18,7 @@ from morphgen.typing import Array
 
 Rgba = tuple[float, float, float, float]
 
-MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".msh", ".obj", ".ply", ".stl")
+MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Suffixes of the mesh files that can be read, in lower case."""
 
 
@@ -179,6 +179,19 @@ def dimensions(primitive: Primitive) -> tuple[float, ...]:
             return (radius, length)
 
 
+def half_extents(primitive: Primitive) -> Vec3:
+    """Return the half extents of a primitive along its own axes [m]."""
+    match primitive:
+        case Box((x, y, z)):
+            return (x / 2, y / 2, z / 2)
+        case Sphere(radius):
+            return (radius, radius, radius)
+        case Cylinder(radius, length):
+            return (radius, radius, length / 2)
+        case Capsule(radius, length):
+            return (radius, radius, length / 2 + radius)
+
+
 def map_dimensions(function: Callable[[float], float], primitive: Primitive) -> Primitive:
     """Return the primitive whose ``dimensions`` are those of another one after a function."""
     sizes = tuple(map(function, dimensions(primitive)))
@@ -212,16 +225,12 @@ def scale_vector(vector: Vec3, factor: float) -> Vec3:
 class StoredFit:
     """Primitives fitted to a link's collision shapes; all shapes are in the link frame."""
 
-    link: str
-    """Name of the link."""
-    token: Shape
-    """The single primitive with the largest overlap, for tokens."""
+    link: str  # name of the link
+    token: Shape  # the single primitive with the largest overlap, for tokens
     collision: tuple[Shape, ...]
     """A few primitives that approximate the shapes more closely, for physics."""
-    token_iou: float
-    """Intersection over union of ``token`` with the shapes, in [0, 1]."""
-    collision_iou: float
-    """Intersection over union of ``collision`` with the shapes, in [0, 1]."""
+    token_iou: float  # intersection over union of ``token`` with the shapes, in [0, 1]
+    collision_iou: float  # intersection over union of ``collision`` with the shapes, in [0, 1]
 
     def scaled(self, factor: float) -> StoredFit:
         """Return the fit of the shapes scaled by a factor."""

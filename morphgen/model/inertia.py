@@ -22,6 +22,7 @@ from morphgen.model.geometry import (
     Primitive,
     Shape,
     Sphere,
+    half_extents,
     volume,
 )
 from morphgen.model.mesh import convex_hull, load_mesh
@@ -163,17 +164,10 @@ def _cache_key(shapes: Sequence[Shape]) -> tuple[tuple[Shape, ...], tuple[int, .
 
 def _corners(shape: Shape) -> Array:
     """Return the corners of a primitive's bounding box, or a mesh's vertices, in the link frame."""
-    match shape.geometry:
-        case Box(size):
-            corners = _CORNER_SIGNS * (np.array(size) / 2)
-        case Sphere(radius):
-            corners = _CORNER_SIGNS * radius
-        case Cylinder(radius, length):
-            corners = _CORNER_SIGNS * np.array([radius, radius, length / 2])
-        case Capsule(radius, length):
-            corners = _CORNER_SIGNS * np.array([radius, radius, length / 2 + radius])
-        case Mesh():
-            corners = np.asarray(load_mesh(shape.geometry).vertices)
+    if isinstance(shape.geometry, Mesh):
+        corners = np.asarray(load_mesh(shape.geometry).vertices)
+    else:
+        corners = _CORNER_SIGNS * half_extents(shape.geometry)
     T = shape.T_link_shape.matrix
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 

@@ -8,7 +8,7 @@ homogeneous matrices.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,11 +37,11 @@ def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Arr
     return rng.uniform(limits[:, 0], limits[:, 1], size=(n, robot.dof))
 
 
-def driving_joints(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
-    """Return the columns of ``q``, 0 to dof - 1, that move any of the given joints."""
+def driving_joints(robot: Robot, joints: Iterable[int]) -> tuple[int, ...]:
+    """Return the columns of ``q``, 0 to dof - 1, that move given joints, in their order."""
     matrix, _ = robot.mimic_map
-    rows = [i for i, k in enumerate(robot.movable_joints) if k in joints]
-    return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
+    rows = (robot.movable_rows[k] for k in joints if k in robot.movable_rows)
+    return tuple(dict.fromkeys(j for row in rows for j in np.flatnonzero(matrix[row]).tolist()))
 
 
 def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
@@ -92,7 +92,7 @@ def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     motions = joint_motions([robot.joints[k] for k in robot.movable_joints], positions)
     T_root_link = np.empty((*positions.shape[:-1], len(robot.links), 4, 4))
     T_root_link[..., 0, :, :] = np.eye(4)
-    column = {k: i for i, k in enumerate(robot.movable_joints)}
+    column = robot.movable_rows
     for k, joint in enumerate(robot.joints):
         T = T_root_link[..., robot.parents[k + 1], :, :] @ joint.T_parent_joint.matrix
         T_root_link[..., k + 1, :, :] = T @ motions[..., column[k], :, :] if k in column else T
@@ -129,25 +129,17 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
         velocity of the frame's origin, then angular velocity; mimic joints are folded into their
         leaders.
     """
-    target, positions = robot.frame(frame), movable_positions(robot, q)
-    row = {k: i for i, k in enumerate(robot.movable_joints)}
-    # Movable joints, their rows, and the constant transform before each.
-    chain, rows, fixed, T = [], [], [], np.eye(4)
-    for k in robot.joint_chain(target.link):
-        T = T @ robot.joints[k].T_parent_joint.matrix
-        if k in row:
-            chain.append(robot.joints[k])
-            rows.append(row[k])
-            fixed.append(T)
-            T = np.eye(4)
-    T_last_frame = T @ target.T_link_frame.matrix
+    positions = movable_positions(robot, q)
+    movable, T_last_frame = moving_chain(robot, frame)
+    chain = [robot.joints[k] for k, _ in movable]
+    rows = [robot.movable_rows[k] for k, _ in movable]
     if not chain:
         return (
             np.broadcast_to(T_last_frame, (*positions.shape[:-1], 4, 4)).copy(),
             np.zeros((*positions.shape[:-1], 6, robot.dof)),
         )
     slides, axes = _slides_and_axes(chain)
-    T_joints = np.array(fixed) @ joint_motions(chain, positions[..., rows])
+    T_joints = np.array([T for _, T in movable]) @ joint_motions(chain, positions[..., rows])
     for i in range(1, len(chain)):
         T_joints[..., i, :, :] = T_joints[..., i - 1, :, :] @ T_joints[..., i, :, :]
     T_root_frame = T_joints[..., -1, :, :] @ T_last_frame
@@ -159,6 +151,21 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
     gains = robot.mimic_map[0][rows]
     jacobian = np.concatenate([linear, angular], axis=-1).swapaxes(-1, -2) @ gains
     return T_root_frame, jacobian
+
+
+def moving_chain(robot: Robot, frame: str) -> tuple[list[tuple[int, Array]], Array]:
+    """Return the movable joints before a frame, root first, and the transform behind the last.
+
+    Each joint has its index and the constant transform (4, 4) from the joint before it.
+    """
+    target, T = robot.frame(frame), np.eye(4)
+    movable: list[tuple[int, Array]] = []
+    for k in robot.joint_chain(target.link):
+        T = T @ robot.joints[k].T_parent_joint.matrix
+        if robot.joints[k].is_movable:
+            movable.append((k, T))
+            T = np.eye(4)
+    return movable, T @ target.T_link_frame.matrix
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -179,7 +186,7 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
     """
     anchors, axes = joint_axes(robot, T_root_link)
     jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable_joints)))
-    column = {k: i for i, k in enumerate(robot.movable_joints)}
+    column = robot.movable_rows
     for k, joint in enumerate(robot.joints):
         jacobians[..., k + 1, :, :] = jacobians[..., robot.parents[k + 1], :, :]
         if joint.kind == "prismatic":
@@ -255,8 +262,7 @@ def _distance(robot: Robot, q: Array, frame: str) -> Array:
     the blocks of shipped push sets. Rotations use Rodrigues' formula.
     """
     positions = movable_positions(robot, q)
-    target = robot.frame(frame)
-    column = {k: i for i, k in enumerate(robot.movable_joints)}
+    target, column = robot.frame(frame), robot.movable_rows
     point = np.broadcast_to(np.array(target.T_link_frame.position), (*q.shape[:-1], 3))
     for k in reversed(robot.joint_chain(target.link)):
         joint, T = robot.joints[k], robot.joints[k].T_parent_joint.matrix
@@ -305,8 +311,7 @@ class FramePosition:
     def __init__(self, robot: Robot, frame: str = TOOL) -> None:
         """Compile the joints from the frame to the root."""
         gains, offsets = robot.mimic_map
-        row = {k: i for i, k in enumerate(robot.movable_joints)}
-        target = robot.frame(frame)
+        row, target = robot.movable_rows, robot.frame(frame)
         T_joint_next = target.T_link_frame
         motions: list[tuple[int | None, float, float, bool]] = []
         transforms: list[tuple[float, ...]] = []

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from morphgen.model.kinematics import DAMPING
+from morphgen.model.kinematics import DAMPING, moving_chain
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 
@@ -116,14 +116,11 @@ class JointTensors:
 
     T_parent_joint: torch.Tensor
     """Pose of each joint frame at position zero in the preceding frame, shape (R, K, 4, 4)."""
-    axis: torch.Tensor
-    """Unit axis in the joint frame, shape (R, K, 3)."""
-    is_prismatic: torch.Tensor
-    """Whether each joint is prismatic, shape (R, K), bool."""
+    axis: torch.Tensor  # unit axis in the joint frame, shape (R, K, 3)
+    is_prismatic: torch.Tensor  # whether each joint is prismatic, shape (R, K), bool
     gain: torch.Tensor
     """Joint positions are ``gain @ q + offset``, mimic joints included, shape (R, K, J)."""
-    offset: torch.Tensor
-    """Joint positions at q = 0 [rad or m], shape (R, K)."""
+    offset: torch.Tensor  # joint positions at q = 0 [rad or m], shape (R, K)
 
     @cached_property
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -158,10 +155,8 @@ class KinematicTree:
 
     joints: JointTensors
     """The joint that attaches each link to its parent, fixed for the root; K = L."""
-    is_link: torch.Tensor
-    """Mask of the links, False for padding, shape (R, L), bool."""
-    is_movable: torch.Tensor
-    """Mask of the links whose joint is not fixed, shape (R, L), bool."""
+    is_link: torch.Tensor  # mask of the links, False for padding, shape (R, L), bool
+    is_movable: torch.Tensor  # mask of the links whose joint is not fixed, shape (R, L), bool
     levels: tuple[tuple[torch.Tensor, torch.Tensor], ...]
     """For each depth from 1 on, the indices of the links at that depth and the columns of their
     parents within the level above, both (R, W), int64, padded with 0."""
@@ -176,10 +171,8 @@ class FrameChain:
     Chains are padded to D joints at the root. Fixed joints are merged into the next joint's pose.
     """
 
-    joints: JointTensors
-    """The joints, root first; K = D."""
-    T_joint_frame: torch.Tensor
-    """Pose of the frame in the frame of the last joint, shape (R, 4, 4)."""
+    joints: JointTensors  # the joints, root first; K = D
+    T_joint_frame: torch.Tensor  # pose of the frame in the frame of the last joint, shape (R, 4, 4)
 
 
 def compile_tree(
@@ -233,17 +226,7 @@ def compile_chain(
     device: Device = "cpu",
 ) -> FrameChain:
     """Compile robots for ``frame_jacobian``, ``frame_pose`` and ``FramePositions``."""
-    rows, ends = [], []
-    for robot in robots:
-        target = robot.frame(frame)
-        T, row = np.eye(4), []
-        for k in robot.joint_chain(target.link):
-            T = T @ robot.joints[k].T_parent_joint.matrix
-            if robot.joints[k].is_movable:
-                row.append((k, T))
-                T = np.eye(4)
-        rows.append(row)
-        ends.append(T @ target.T_link_frame.matrix)
+    rows, ends = zip(*(moving_chain(robot, frame) for robot in robots), strict=True)
     depth = max(1, *map(len, rows))
     joints = _joint_tensors(robots, rows, depth, dtype, device, pad_front=True)
     return FrameChain(joints, torch.from_numpy(np.array(ends)).to(device, dtype))
@@ -372,14 +355,13 @@ def _joint_tensors(
     gain, offset = np.zeros((*size, max(robot.dof for robot in robots))), np.zeros(size)
     for r, (robot, row) in enumerate(zip(robots, rows, strict=True)):
         matrix, shift = robot.mimic_map
-        mimic_row = {k: i for i, k in enumerate(robot.movable_joints)}
         for i, (k, T_parent_joint) in enumerate(row, length - len(row) if pad_front else 0):
             T[r, i] = T_parent_joint
-            if k in mimic_row:
+            if k in robot.movable_rows:
                 axis[r, i] = robot.joints[k].unit_axis
                 prismatic[r, i] = robot.joints[k].kind == "prismatic"
-                gain[r, i, : robot.dof] = matrix[mimic_row[k]]
-                offset[r, i] = shift[mimic_row[k]]
+                gain[r, i, : robot.dof] = matrix[robot.movable_rows[k]]
+                offset[r, i] = shift[robot.movable_rows[k]]
     T_all, axes, gains, offsets = (
         torch.from_numpy(values).to(device, dtype) for values in (T, axis, gain, offset)
     )

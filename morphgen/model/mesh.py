@@ -40,7 +40,7 @@ def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
     the normals pointing outwards. The result is cached until the file changes; treat it as
     read-only.
     """
-    return _scaled(str(mesh.path.absolute()), _stamp(mesh.path), mesh.scale, mesh.part)
+    return _scaled(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
 
 
 def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
@@ -86,7 +86,7 @@ def left_out(path: Path) -> tuple[str, ...]:
 
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
     """Return the convex hull of a mesh [m]; cached, so treat it as read-only."""
-    return _hull(str(mesh.path.absolute()), _stamp(mesh.path), mesh.scale, mesh.part)
+    return _hull(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
 
 
 def is_flat(points: Array) -> bool:
@@ -98,27 +98,24 @@ def is_flat(points: Array) -> bool:
 
 
 @lru_cache(maxsize=512)
-def _hull(
-    path: str, stamp: tuple[int, int], scale: tuple[float, ...], part: int | None
-) -> trimesh.Trimesh:
+def _hull(mesh: Mesh, stamp: tuple[int, int]) -> trimesh.Trimesh:
     import trimesh  # here and below, because commands that read no mesh should start quickly
 
-    vertices = _scaled(path, stamp, scale, part).vertices
+    vertices = _scaled(mesh, stamp).vertices
     if is_flat(vertices):
-        raise MeshError(f"{path}: is flat, so it has no convex hull")
+        raise MeshError(f"{mesh.path}: is flat, so it has no convex hull")
     result: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
     return result
 
 
 @lru_cache(maxsize=512)
-def _scaled(
-    path: str, stamp: tuple[int, int], scale: tuple[float, ...], part: int | None
-) -> trimesh.Trimesh:
+def _scaled(mesh: Mesh, _stamp: tuple[int, int]) -> trimesh.Trimesh:
     import trimesh
 
+    path, scale, part = mesh.path, mesh.scale, mesh.part
     if len(scale) != 3 or not all(math.isfinite(s) and s != 0 for s in scale):
         raise MeshError(f"{path}: scale {scale} is not three finite numbers other than zero")
-    parts = _content(Path(path)).parts
+    parts = _content(path).parts
     if part is not None:
         if not 0 <= part < len(parts):
             raise MeshError(f"{path}: no part {part}; valid: 0 to {len(parts) - 1}")

@@ -35,58 +35,6 @@ from morphgen.model.scene_files import (
 )
 from morphgen.typing import Array
 
-MAX_HULL_VERTICES = 500_000
-"""Number of vertices of the largest file without triangles that is read: its hull takes seconds."""
-_FLAT = 1e-6
-"""Thickness of a flat point cloud, relative to its size: the precision of 32-bit floats."""
-_HEADER = 16  # size of the four counts [bytes]
-_ROW_SIZES = (12, 12, 8, 12)
-"""Size of a vertex, a normal, a texture coordinate and a triangle [bytes]."""
-
-
-def _read_msh(data: bytes, files: FolderResolver) -> list[MeshPart]:
-    """Read a ``.msh`` file, MuJoCo's legacy binary format.
-
-    Nothing is allocated before the counts agree with the file's size. Normals and texture
-    coordinates are left out. Without triangles, the faces are those of the convex hull, as in
-    MuJoCo.
-    """
-    del files
-    if len(data) < _HEADER:
-        raise ValueError(f"{len(data)} bytes; expected a header of {_HEADER}")
-    counts = [int(count) for count in np.frombuffer(data, "<i4", 4)]
-    vertices, normals, coordinates, triangles = counts
-    if vertices < 4 or min(counts) < 0 or not {normals, coordinates} <= {0, vertices}:
-        raise ValueError(
-            f"its header counts {vertices} vertices, {normals} normals, {coordinates} texture "
-            f"coordinates and {triangles} triangles; expected at least 4 vertices, and as many "
-            "normals and texture coordinates as vertices or none"
-        )
-    sizes = [count * size for count, size in zip(counts, _ROW_SIZES, strict=True)]
-    if len(data) != _HEADER + sum(sizes):
-        raise ValueError(
-            f"{len(data)} bytes; its header counts {vertices} vertices and {triangles} triangles, "
-            f"which take {_HEADER + sum(sizes)}"
-        )
-    points = np.frombuffer(data, "<f4", 3 * vertices, _HEADER).reshape(-1, 3).astype(np.float64)
-    if not np.isfinite(points).all():
-        raise ValueError("a vertex is not finite")
-    if not triangles:
-        if vertices > MAX_HULL_VERTICES:
-            raise ValueError(
-                f"{vertices} vertices without triangles; at most {MAX_HULL_VERTICES} are read"
-            )
-        if np.linalg.matrix_rank(points - points.mean(axis=0), rtol=_FLAT) < 3:
-            raise ValueError("has no triangles, and its vertices are flat")
-        return _parts(trimesh.convex.convex_hull(points))
-    faces = np.frombuffer(data, "<i4", 3 * triangles, len(data) - sizes[-1]).reshape(-1, 3)
-    if faces.min() < 0 or faces.max() >= vertices:
-        raise ValueError(
-            f"a triangle has the vertex {faces.min() if faces.min() < 0 else faces.max()}; "
-            f"expected 0 to {vertices - 1}"
-        )
-    return _parts(trimesh.Trimesh(points, faces.astype(np.int64), process=False))
-
 
 def _parts(mesh: trimesh.Trimesh) -> list[MeshPart]:
     require_faces(len(mesh.faces))
@@ -301,8 +249,6 @@ def _uniform_rows(
     return rows if all((column == column[0]).all() for column in lengths) else None
 
 
-_MAX_STRIPS = 100_000
-"""Number of triangle strips of the largest PLY file that is read: each takes 13 us."""
 _Rows = NDArray[Any] | Sequence[NDArray[Any]]
 """Lists of a PLY file: an array with a row for each, or an array for each."""
 
@@ -313,13 +259,12 @@ def _ply_parts(
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
     polygons: _Rows = face.get("vertex_indices", face.get("vertex_index", ()))
     for name, count in counts.items():
-        if count and name not in ("vertex", "face", "tristrips"):
+        if count and name not in ("vertex", "face"):
             files.left_out.append(f"{count} elements {name!r}")
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("holds no vertex with x, y and z")
     vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
-    strips: _Rows = columns.get("tristrips", {}).get("vertex_indices", ())
-    triangles = np.concatenate([*_fans(polygons, files), *_strips(strips)])
+    triangles = np.concatenate([np.empty((0, 3), np.int64), *_fans(polygons, files)])
     require_faces(len(triangles))
     if not len(triangles):
         raise ValueError(f"holds {len(vertices)} vertices and no triangle")
@@ -353,22 +298,6 @@ def _fans(polygons: _Rows, files: FolderResolver) -> Iterator[NDArray[np.int64]]
         yield from (corners[:, [0, k, k + 1]] for k in range(1, size - 1))
         if size < 3:
             files.left_out.append(f"{len(corners)} faces of {size} vertices")
-
-
-def _strips(strips: _Rows) -> Iterator[NDArray[np.int64]]:
-    """Yield the triangles of strips; in each, -1 begins another one."""
-    yield np.empty((0, 3), np.int64)
-    if len(strips) > _MAX_STRIPS:
-        raise ValueError(f"{len(strips)} strips of triangles; at most {_MAX_STRIPS} are read")
-    for strip in strips:
-        corners = np.asarray(strip, dtype=np.int64)
-        # A triangle is turned if its place in its own strip is odd.
-        places = np.arange(len(corners))
-        begins = np.maximum.accumulate(np.where(corners < 0, places + 1, 0))
-        triangles = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
-        odd = (places - begins)[:-2] % 2 == 1
-        triangles[odd] = triangles[odd, ::-1]
-        yield triangles[(triangles >= 0).all(axis=1)]
 
 
 def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
@@ -499,7 +428,6 @@ _READERS: dict[str, Callable[[bytes, FolderResolver], list[MeshPart]]] = {
     ".dae": read_dae,
     ".glb": read_glb,
     ".gltf": read_gltf,
-    ".msh": _read_msh,
     ".obj": _read_obj,
     ".ply": _read_ply,
     ".stl": _read_stl,

@@ -269,6 +269,11 @@ class Robot:
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_movable)
 
     @cached_property
+    def movable_rows(self) -> dict[int, int]:
+        """Place of every movable joint among the movable ones, by its index."""
+        return {k: row for row, k in enumerate(self.movable_joints)}
+
+    @cached_property
     def independent_joints(self) -> tuple[int, ...]:
         """Indices of the joints that are neither fixed nor mimic joints, in the order of ``q``."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_independent)
@@ -276,7 +281,7 @@ class Robot:
     @cached_property
     def independent_rows(self) -> list[int]:
         """Places of the independent joints among the movable ones, shape (dof,)."""
-        return [self.movable_joints.index(k) for k in self.independent_joints]
+        return [self.movable_rows[k] for k in self.independent_joints]
 
     @cached_property
     def mimic_map(self) -> tuple[Array, Array]:

@@ -86,10 +86,9 @@ def read_picture(source: bytes | Path) -> Image.Image:
                 return picture.copy()
     except UnidentifiedImageError as error:
         raise ValueError(f"not a picture; expected {', '.join(_PICTURE_FORMATS)}") from error
-    except (
-        *(OSError, SyntaxError, LookupError, ArithmeticError, RuntimeError, TypeError, MemoryError),
-        *(struct.error, Image.DecompressionBombError),
-    ) as error:
+    except ValueError:
+        raise
+    except UNREADABLE as error:
         raise ValueError(f"a broken picture: {error}") from error
 
 
@@ -587,8 +586,7 @@ def _tag(element: etree._Element) -> str:
 def _remove(root: etree._Element, tag: str) -> int:
     elements = [*root.iter(f"{{*}}{tag}")]
     for element in elements:
-        parent = element.getparent()
-        if parent is not None:
+        if (parent := element.getparent()) is not None:
             parent.remove(element)
     return len(elements)
 
@@ -717,17 +715,14 @@ _PRIMITIVE_TAGS = tuple(f"{{*}}{tag}" for tag in _COLLADA_PRIMITIVES)
 
 def _primitive_size(primitive: etree._Element) -> Counter[str]:
     """Return the number of triangles of a primitive, and 1 as the number of their sets."""
-    offsets = [int(i.get("offset", "0")) for i in primitive.iterchildren("{*}input")]
-    width = max(offsets, default=0) + 1
-    tag = _tag(primitive)
-    if tag == "polylist":
-        corners = parse_numbers(primitive.findtext("{*}vcount") or "", np.int32)
+    if _tag(primitive) == "polylist":
+        corners = parse_numbers(primitive.findtext("{*}vcount") or "", np.int32).astype(np.int64)
         if (corners < 0).any():
             raise ValueError("a polygon with a negative number of corners")
-        total = int(np.maximum(corners.astype(np.int64) - 2, 0).sum())
-        return Counter(triangles=total, sets=1)
-    total = 0
-    for indices in primitive.iterchildren("{*}p"):
-        count = len(parse_numbers(indices.text or "", np.int32)) // width
-        total += count // 3 if tag == "triangles" else max(count - 2, 0)
-    return Counter(triangles=total, sets=1)
+    else:
+        offsets = [int(i.get("offset", "0")) for i in primitive.iterchildren("{*}input")]
+        texts = (indices.text or "" for indices in primitive.iterchildren("{*}p"))
+        counts = [len(parse_numbers(text, np.int32)) for text in texts]
+        corners = np.array(counts, np.int64) // (max(offsets, default=0) + 1)
+    triangles = corners // 3 if _tag(primitive) == "triangles" else np.maximum(corners - 2, 0)
+    return Counter(triangles=int(triangles.sum()), sets=1)

@@ -1,18 +1,13 @@
 """Shapes of an MJCF without a mesh file have the shape and the mass that MuJoCo gives them."""
 
-import struct
-from importlib.resources import files
-
 import mujoco
 import numpy as np
 import pytest
 import trimesh
 
 from helpers.mjcf import inertia_in_mujoco, read, write
-from morphgen.errors import MeshError
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.mjcf.read import read_mjcf
-from morphgen.model import mesh_files as msh_files
 from morphgen.model.geometry import Mesh, Sphere
 from morphgen.model.mesh import convex_hull, load_mesh
 
@@ -119,60 +114,6 @@ def test_the_same_vertices_have_the_same_file(tmp_path, cache):
     first, second = (read(tmp_path / folder, content) for folder in "ab")
     assert first.root == second.root
     assert len([*cache.rglob("*.stl")]) == 1
-
-
-def test_a_legacy_binary_mesh_is_read_as_by_mujoco(tmp_path):
-    msh = files("mujoco") / "testdata" / "abdomen_1_body.msh"
-    (tmp_path / "abdomen.msh").write_bytes(msh.read_bytes())
-    path = write(
-        tmp_path,
-        """<asset><mesh file="abdomen.msh" scale="0.5 1 2"/></asset><worldbody><body name="a">
-        <geom type="mesh" mesh="abdomen" pos="0.1 0.2 0.3" euler="10 20 30"/></body></worldbody>""",
-    )
-    robot = read_mjcf(path)
-    assert_as_in_mujoco(robot, path)
-    assert len(load_mesh(robot.root.collisions[0].geometry).faces) == 1458
-
-
-def msh(vertices=4, normals=0, coordinates=0, triangles=4, *, points=None, faces=None):
-    """Return a tetrahedron whose header has the given counts."""
-    points = [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1] if points is None else points
-    faces = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3] if faces is None else faces
-    header = struct.pack("<4i", vertices, normals, coordinates, triangles)
-    return header + struct.pack(f"<{len(points)}f{len(faces)}i", *points, *faces)
-
-
-def test_a_legacy_binary_mesh_without_triangles_is_its_hull(tmp_path, monkeypatch):
-    (tmp_path / "m.msh").write_bytes(msh(triangles=0, faces=[]))
-    assert load_mesh(Mesh(tmp_path / "m.msh")).volume == pytest.approx(1 / 6)
-    monkeypatch.setattr(msh_files, "MAX_HULL_VERTICES", 3)
-    (tmp_path / "n.msh").write_bytes(msh(triangles=0, faces=[]))
-    with pytest.raises(MeshError, match="4 vertices without triangles; at most 3 are read"):
-        load_mesh(Mesh(tmp_path / "n.msh"))
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        (b"", "the file is empty"),
-        (msh(vertices=3), "its header counts 3 vertices"),
-        (msh(normals=3), "its header counts 4 vertices, 3 normals"),
-        (msh(coordinates=-4), "-4 texture coordinates"),
-        (msh(triangles=-1), "-1 triangles"),
-        (msh(vertices=2**31 - 1, triangles=2**31 - 1), "112 bytes; its header counts 2147483647 "),
-        (msh() + b"\0", "113 bytes; .* which take 112"),
-        (msh(faces=[0, 2, 1, 0, 1, 4, 0, 3, 2, 1, 2, 3]), "vertex 4; expected 0 to 3"),
-        (msh(faces=[0, 2, 1, 0, 1, -1, 0, 3, 2, 1, 2, 3]), "vertex -1; expected 0 to 3"),
-        (msh(points=[float("nan")] * 12), "a vertex is not finite"),
-        (msh(triangles=0, faces=[], points=[0, 0, 0, 1, 0, 0.3, 0, 1, 0, 1, 1, 0.3]), "are flat"),
-        (b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n", "its header counts 1936018724 vertices"),
-    ],
-)
-def test_an_invalid_legacy_binary_mesh_is_refused(content, why, tmp_path):
-    (tmp_path / "m.msh").write_bytes(content)
-    with pytest.raises(MeshError, match=why) as error:
-        load_mesh(Mesh(tmp_path / "m.msh"))
-    assert str(tmp_path / "m.msh") in str(error.value)
 
 
 def test_an_ellipsoid_is_a_convex_mesh_of_its_volume_and_keeps_its_mass(tmp_path):

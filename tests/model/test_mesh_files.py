@@ -143,8 +143,6 @@ SKIN = """<library_controllers><controller id="c"><skin source="#g">
          "f 1/1 2/1 4/1\nf 1 4/1 3//1\nf 2/1/1 3 4\n"),
         ("lists.ply", ply([*PLY_POINTS, "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"],
                           PLY_VERTICES, "element face 4", PLY_LIST)),
-        ("strip.ply", ply([*PLY_POINTS, "7 0 2 1 3 -1 0 3", "7 0 1 3 -1 0 3 2"],
-                          PLY_VERTICES, "element tristrips 2", PLY_LIST)),
         ("gltf.gltf", gltf()),
         ("polylist.dae", dae_with(f'<polylist count="4">{INPUT}<vcount>3 3 3 3</vcount>'
                                   "<p>0 2 1 0 1 3 0 3 2 1 2 3</p></polylist>")),
@@ -168,6 +166,8 @@ def test_every_form_of_a_tetrahedron_is_read_whole(name, content, tmp_path):
         (["5 0 1 2 3 0", "2 0 1"], ["element face 2", PLY_LIST], 3, ("1 faces of 2 vertices",)),
         (["3 0 1 2", "0 1"], ["element face 1", PLY_LIST, "element edge 1\nproperty int vertex1\n"
          "property int vertex2"], 1, ("1 elements 'edge'",)),
+        (["3 0 1 2", "4 0 1 2 3"], ["element face 1", PLY_LIST, "element tristrips 1", PLY_LIST], 1,
+         ("1 elements 'tristrips'",)),
         (["3 0 1 2"], ["comment TextureFile a.png", "element face 1", PLY_LIST], 1,
          ("texture 'a.png'",)),
     ],
@@ -427,11 +427,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "list.ply": (
         ply([*PLY_POINTS, "1000000000 0 1 2"], PLY_VERTICES, "element face 1", PLY_LIST),
         "a list of 1000000000 entries",
-    ),
-    "strips.ply": (
-        ply([*PLY_POINTS, *["3 0 1 2"] * 100_001], PLY_VERTICES, "element tristrips 100001",
-            PLY_LIST),
-        "100001 strips of triangles; at most 100000",
     ),
     "less.ply": (ply([], PLY_VERTICES.replace("4", "-4")), "counts -4 of element 'vertex'"),
     "face.obj": ("v 0 0 0\nf" + " 1" * 40_000 + "\n", "a line has more than 65536 characters"),
