@@ -96,14 +96,9 @@ class Candidates:
 
     @staticmethod
     def stack(blocks: list[Candidates], axis: int = 0) -> Candidates:
-        """Concatenate candidates with the same number of primitives."""
+        """Concatenate candidates, or with ``axis=1`` the primitives of every candidate i."""
         arrays = zip(*(vars(candidates).values() for candidates in blocks), strict=True)
         return Candidates(*(np.concatenate(array, axis=axis) for array in arrays))
-
-    @staticmethod
-    def join(blocks: list[Candidates]) -> Candidates:
-        """Concatenate primitives: candidate i of the result has those of every candidate i."""
-        return Candidates.stack(blocks, axis=1)
 
 
 def ascend(
@@ -174,11 +169,6 @@ def overlaps(candidates: Candidates, cloud: Cloud) -> Array:
 def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
     """Return which points (m, 3) are inside any primitive of each candidate, shape (n, m)."""
     return np.asarray((_distances(candidates, points) <= 0).any(dim=1).numpy())
-
-
-def distances(candidates: Candidates, points: Array) -> Array:
-    """Return the signed distances of points (m, 3) to the union of each candidate, shape (n, m)."""
-    return np.asarray(_distances(candidates, points).amin(dim=1).double().numpy())
 
 
 @torch.no_grad()
@@ -276,7 +266,7 @@ def by_pieces(cloud: Cloud, k: int, seeds: list[int]) -> Candidates | None:
         _, label = kmeans2(inside.points, k, minit="++", seed=seed, iter=10)
         if np.bincount(label, minlength=k).min() >= MIN_POINTS:
             pieces = (inside.take(label == j) for j in range(k))
-            rows.append(Candidates.join([_best_of_each_kind(piece, outside) for piece in pieces]))
+            rows.append(Candidates.stack([_best_of_each_kind(p, outside) for p in pieces], axis=1))
     return Candidates.stack(rows) if rows else None
 
 
@@ -295,7 +285,8 @@ def by_growth(fewer: Candidates, cloud: Cloud, seed: int) -> Candidates | None:
         for j in range(n):
             if np.count_nonzero(label == j) >= MIN_POINTS:
                 more = _best_of_each_kind(missed.take(label == j), outside)
-                rows.append(Candidates.join([fewer.take(np.zeros(len(more.kinds), int)), more]))
+                repeated = fewer.take(np.zeros(len(more.kinds), int))
+                rows.append(Candidates.stack([repeated, more], axis=1))
     return Candidates.stack(rows) if rows else None
 
 
@@ -493,7 +484,7 @@ def _covering(cloud: Cloud, candidates: Candidates, cover: float | None) -> Cand
     if cover is None:
         return candidates
     share = 1 - (1 - cover) * (1 - RESERVE)
-    away = distances(candidates, cloud.points[cloud.inside])
+    away = _distances(candidates, cloud.points[cloud.inside]).amin(dim=1).double().numpy()
     order = np.argsort(away, axis=1)
     weights = cloud.weights[cloud.inside]
     last = np.argmax(np.cumsum(weights[order], axis=1) / weights.sum() >= share, axis=1)

@@ -57,30 +57,26 @@ def rename(
     robot: Robot, links: Mapping[str, str] | None = None, joints: Mapping[str, str] | None = None
 ) -> Robot:
     """Return a robot whose links and joints have new names, given by their old ones."""
-    link_names, joint_names = links or {}, joints or {}
-
-    def new_link(name: str) -> str:
-        return link_names.get(name, name)
-
-    def new_joint(name: str) -> str:
-        return joint_names.get(name, name)
-
+    new_link = {link.name: link.name for link in robot.links} | dict(links or {})
+    new_joint = {joint.name: joint.name for joint in robot.joints} | dict(joints or {})
     return replace(
         robot,
-        links=tuple(replace(link, name=new_link(link.name)) for link in robot.links),
+        links=tuple(replace(link, name=new_link[link.name]) for link in robot.links),
         joints=tuple(
             replace(
                 joint,
-                name=new_joint(joint.name),
-                parent=new_link(joint.parent),
-                child=new_link(joint.child),
-                mimic=joint.mimic and replace(joint.mimic, joint=new_joint(joint.mimic.joint)),
+                name=new_joint[joint.name],
+                parent=new_link[joint.parent],
+                child=new_link[joint.child],
+                mimic=joint.mimic and replace(joint.mimic, joint=new_joint[joint.mimic.joint]),
             )
             for joint in robot.joints
         ),
-        frames=tuple(replace(frame, link=new_link(frame.link)) for frame in robot.frames),
+        frames=tuple(replace(frame, link=new_link[frame.link]) for frame in robot.frames),
         ignore_pairs=tuple(
-            sorted(sorted_pair(new_link(a), new_link(b)) for a, b in robot.ignore_pairs)
+            sorted(
+                sorted_pair(new_link.get(a, a), new_link.get(b, b)) for a, b in robot.ignore_pairs
+            )
         ),
     )
 
