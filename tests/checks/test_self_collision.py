@@ -1,14 +1,13 @@
 """Self-collision tests and pairs to ignore."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
 
-from helpers.robots import arm
+from helpers.robots import arm, chain
 from morphgen.checks.self_collision import (
     PENETRATION,
     SelfCollisionChecker,
@@ -39,16 +38,6 @@ def slides(*offsets):
     )
     balls = (ball(f"ball{i}") for i in range(len(offsets)))
     return Robot("slides", (Link("root"), *balls), joints, home=(0.0,) * len(offsets))
-
-
-def chain(*links, kind="revolute"):
-    """A chain of links on joints, 0.3 m apart."""
-    joints = tuple(
-        Joint(f"to_{child.name}", kind, parent.name, child.name, Pose((0, 0, 0.3)), (0, 1, 0))
-        for parent, child in pairwise(links)
-    )
-    home = (0.0,) * sum(joint.is_independent for joint in joints)
-    return Robot("chain", links, joints, home=home)
 
 
 def test_a_margin_counts_gaps_as_negative_depths():

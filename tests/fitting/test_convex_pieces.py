@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 import morphgen
+from helpers.robots import chain
 from morphgen.errors import FitError, MeshError
 from morphgen.fitting import convex_pieces as module
 from morphgen.fitting.convex_pieces import MAX_PIECES, as_convex, decompose
@@ -17,7 +18,7 @@ from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.fits import shapes_key
 from morphgen.model.geometry import Box, Mesh, Pose, Shape, StoredFit
 from morphgen.model.inertia import link_frame_mesh
-from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.robot import Link
 
 pytest.importorskip("coacd")
 
@@ -45,12 +46,8 @@ def robot_of(*meshes, scale=1.0):
     """Return a chain of links with one mesh each and revolute joints."""
     scaled = (dataclasses.replace(mesh, scale=(scale,) * 3) for mesh in meshes)
     shapes = (Shape(mesh, Pose((0.1 * scale, 0.0, 0.0))) for mesh in scaled)
-    links = tuple(Link(f"l{i}", collisions=(shape,)) for i, shape in enumerate(shapes))
-    joints = tuple(
-        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", Pose((0.0, 0.2, 0.0)), axis=(0, 1, 0))
-        for i in range(len(meshes) - 1)
-    )
-    return Robot("brackets", links, joints, home=(0.0,) * len(joints))
+    links = (Link(f"l{i}", collisions=(shape,)) for i, shape in enumerate(shapes))
+    return chain(*links, step=(0.0, 0.2, 0.0))
 
 
 def test_pieces_cover_a_concave_mesh_and_leave_its_notch_free(bracket):

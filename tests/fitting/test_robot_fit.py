@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 import morphgen
+from helpers.robots import chain
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.cli import main
 from morphgen.errors import FitError, FormatError
@@ -35,7 +36,7 @@ from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Mesh, Pose, Shape, Sphere, StoredFit
-from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.robot import Link
 
 LIBRARY = default_library()
 
@@ -47,12 +48,8 @@ def mesh_shape(folder, mesh, name="part.stl", pose=IDENTITY, scale=(1.0, 1.0, 1.
 
 def arm(*links):
     """Return a chain of links with the given collision shapes and revolute joints."""
-    made = tuple(Link(f"l{i}", None, (), tuple(shapes)) for i, shapes in enumerate(links))
-    joints = tuple(
-        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", Pose((0.0, 0.0, 0.5)), axis=(0, 0, 1))
-        for i in range(len(made) - 1)
-    )
-    return Robot("arm", made, joints, home=(0.0,) * len(joints))
+    named = (Link(f"l{i}", None, (), tuple(shapes)) for i, shapes in enumerate(links))
+    return chain(*named, step=(0.0, 0.0, 0.5), axis=(0, 0, 1))
 
 
 @pytest.fixture

@@ -76,7 +76,7 @@ def test_a_rotated_primitive_is_recovered(geometry):
     assert score == pytest.approx(quality(solid, [shape]).iou, abs=0.015)
 
 
-@pytest.mark.parametrize("size", [0.01, 10.0])
+@pytest.mark.parametrize("size", [0.01, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_size_or_position(size):
     box = Box((0.5 * size, 0.8 * size, size))
     far = Pose((3.0, -2.0, 1.0), TILTED.quaternion)
@@ -86,7 +86,7 @@ def test_the_result_does_not_depend_on_size_or_position(size):
     assert quality(solid, [shape]).iou > 0.97
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_thin_plate_is_recovered(seed):
     """Volume of a primitive outside the sampled region must count as an error."""
     shape, score, solid = fitted(Box((0.3, 0.2, 0.006)), Pose(), seed)

@@ -46,7 +46,7 @@ def test_balls_are_found_again():
     np.testing.assert_allclose(spheres_of(found.shapes), sorted(BALLS), atol=1.5e-3)
 
 
-@pytest.mark.parametrize("share", [0.98, 0.995])
+@pytest.mark.parametrize("share", [pytest.param(0.98, marks=pytest.mark.slow), 0.995])
 def test_spheres_cover_the_share_of_a_box_that_they_must(share):
     fit = fit_shapes([Shape(Box(BOX))], FitOptions(spheres=8, cover=share))
     spheres = spheres_of(fit.primitives)

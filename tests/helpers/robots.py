@@ -1,6 +1,7 @@
 """Small robots that tests build in code."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
@@ -57,6 +58,16 @@ def arm() -> Robot:
     )
     tool = Frame("tool", "slider", Pose.from_xyz_rpy((0.0, 0.0, 0.28), (0.0, 0.3, 0.0)))
     return Robot("arm", links, joints, (tool,), home=(0.4, 0.5, 0.01, 0.02))
+
+
+def chain(*links: Link, kind="revolute", step=(0.0, 0.0, 0.3), axis=(0.0, 1.0, 0.0)) -> Robot:
+    """A chain of links on joints of one kind, each a step away from the one before."""
+    joints = tuple(
+        Joint(child.name, kind, parent.name, child.name, Pose(step), axis)
+        for parent, child in pairwise(links)
+    )
+    home = (0.0,) * sum(joint.is_independent for joint in joints)
+    return Robot("chain", links, joints, home=home)
 
 
 def finger(mass: float = 2.0) -> Robot:
