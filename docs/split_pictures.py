@@ -1,4 +1,4 @@
-"""Draw the similarity of all robots of the paper's scenarios: docs/images/splits/{heatmap,map}.png.
+"""Draw the similarity of all robots of the paper's scenarios: docs/images/splits/map.png.
 
     python docs/split_pictures.py [--measure tree]
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from morphgen.benchmark.figures import MapPanel, Panel, heatmap_png, map_png
+from morphgen.benchmark.figures import MapPanel, map_png
 from morphgen.encoding.similarity import (
     MEASURES,
     classical_mds,
@@ -48,15 +48,12 @@ def main() -> int:
         robot = compose_member(member, library)
         robots_features.append(features(robot, token_shapes(robot, library.folders)))
     names = [robot.name for robot in robots_features]
-    measure = MEASURES[args.measure]
     values = similarity_matrix(robots_features, args.measure)
-    title = f"{args.measure}: {measure.meaning}"
+    title = f"{args.measure}: {MEASURES[args.measure].meaning}"
     args.out.mkdir(parents=True, exist_ok=True)
-    heat = heatmap_png(names, [Panel(title, values, measure.larger_is_more_alike)])
-    (args.out / "heatmap.png").write_bytes(heat)
     points = classical_mds(to_distances(values, args.measure))
     (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, points)]))
-    print(f"{len(names)} robots: {args.out}/heatmap.png, {args.out}/map.png")
+    print(f"{len(names)} robots: {args.out}/map.png")
     return 0
 
 
